@@ -1,0 +1,58 @@
+# Two commands are all it takes: `make quickstart` and `make test`. Each sets up what it needs.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.ONESHELL:
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+RUN ?= runs/quickstart
+GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
+
+.PHONY: quickstart test lint format clean
+
+quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
+	$(BIN)/cosfly run quickstart --out $(RUN)
+
+test: lint  ## Everything that must hold
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build *.egg-info
+
+# The system's part: Python with venv, and the GL libraries of the renderer. Installed where we may, named where we may not.
+$(VENV)/bin/python:
+	@python=$$(for p in python3.13 python3.12 python3.11 python3 python; do
+	  if $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then echo $$p; break; fi; done)
+	if [ -z "$$python" ]; then echo "error: no Python 3.11 or newer; install one, then run make again" >&2; exit 1; fi
+	missing=""
+	$$python -c 'import ensurepip, venv' 2>/dev/null || missing="python3-venv"
+	libraries=$$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)
+	dri=$$(ls -d /usr/lib/*/dri /usr/lib/dri /usr/lib64/dri 2>/dev/null | head -n 1)
+	if ! grep -q 'libEGL\.so\.1' <<<"$$libraries" || ! grep -q 'libGL\.so\.1' <<<"$$libraries" || [ -z "$$dri" ]; then
+	  missing="$$missing $(GL_PACKAGES)"; fi
+	if [ -n "$$missing" ]; then
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing >/dev/null
+	  else
+	    echo "warning: system packages are missing; install them with: sudo apt-get install $$missing" >&2
+	  fi
+	fi
+	$$python -m venv $(VENV)
+	$(BIN)/python -m pip install -q --upgrade pip
+
+$(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q -e .
+	touch $@
+
+$(VENV)/.installed-dev: pyproject.toml tests/constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q -c tests/constraints.txt -e '.[dev]'
+	touch $@ $(VENV)/.installed

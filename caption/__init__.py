@@ -1,0 +1,1 @@
+"""Chain-of-Cause captions: windows, teachers, verification against the geometry, repair, two languages."""

@@ -1,0 +1,5 @@
+"""`python -m cosfly`."""
+
+from cosfly.cli import main
+
+main()

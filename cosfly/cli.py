@@ -1,0 +1,427 @@
+"""The command line: one command per stage. The only place with log handlers, tables on the terminal and exit codes.
+
+Nothing heavy is imported before a command runs, so that `cosfly --help` is instant.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosfly import __version__
+from cosfly.errors import CosflyError, InputError
+
+if TYPE_CHECKING:
+    from cosfly.pipeline import RunConfig, StageResult
+
+app = typer.Typer(
+    help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class ResumeMode(StrEnum):
+    never = "never"
+    if_same = "if-same"
+    force = "force"
+
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with the settings of a run.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", "-s", metavar="A.B=C", help="Override one setting; may be repeated.")
+]
+Seed = Annotated[int | None, typer.Option(help="Seed; every random choice derives from it.")]
+Workers = Annotated[int | None, typer.Option(help="Worker processes; 0 takes one per core.")]
+ResumeOption = Annotated[
+    ResumeMode,
+    typer.Option(
+        help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
+    ),
+]
+MapOption = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
+]
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"cosfly {__version__}")
+        raise typer.Exit
+    from cosfly.console import set_up_logging
+
+    set_up_logging(verbose)
+
+
+def main() -> None:
+    """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
+    try:
+        app()
+    except CosflyError as error:
+        _fail(str(error), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted; finished work is kept: run the same command again to continue", 130)
+
+
+def _fail(message: str, status: int) -> None:
+    typer.echo(f"error: {message}", err=True)
+    sys.stderr.flush()
+    sys.exit(status)
+
+
+def _settings(
+    config: Path | None, overrides: list[str] | None, seed: int | None = None, workers: int | None = None
+) -> RunConfig:
+    """Resolve the settings: defaults, file, --set, then the plain options."""
+    from cosfly.config import load
+    from cosfly.pipeline import RunConfig
+
+    extra = [f"{name}={value}" for name, value in (("seed", seed), ("workers", workers)) if value is not None]
+    return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+
+
+def _config_path(config: Path | None) -> Path | None:
+    """A path, or the bare name of a configuration that ships with cosfly."""
+    from cosfly.config import shipped
+
+    if config is not None and not config.exists() and config.suffix == "" and len(config.parts) == 1:
+        packaged = shipped(f"{config}.yaml")
+        if packaged.exists():
+            return packaged
+    return config
+
+
+def _spread(cfg: RunConfig) -> int:
+    from cosfly.pipeline import num_workers
+
+    return num_workers(cfg.workers)
+
+
+def _data(data: Path | None) -> Path:
+    """The playback tree: given, or that of the run folder one stands in."""
+    if data is not None:
+        return data
+    for candidate in (Path("render"), Path()):
+        if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
+            return candidate
+    raise InputError(
+        "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
+    )
+
+
+# --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def run(
+    config: Annotated[
+        Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, simworld, delft.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Run folder; by default runs/<name>.")] = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Make a data set from a configuration: all stages in order. Run it again to continue."""
+    from cosfly import pipeline
+
+    cfg = _settings(config, overrides, seed, workers)
+    out = out or Path("runs") / cfg.name
+    results = pipeline.run(cfg, out, resume=resume.value)
+    _closing_table(results, out)
+
+
+def _closing_table(results: list[StageResult], out: Path) -> None:
+    from rich.table import Table
+
+    from cosfly.console import console
+
+    table = Table(title=f"What was made in {out}", title_justify="left")
+    for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
+        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
+    for result in results:
+        counts = result.manifest["counts"]
+        reasons = (", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed"))
+        seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
+        table.add_row(
+            result.stage, f"{counts['kept']} of {counts['input']}", *reasons, seconds, os.path.relpath(result.product)
+        )
+    console.print(table)
+    for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/README.md"):
+        console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)
+
+
+# --- stages 1-4 -------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def maps(
+    out: Annotated[Path, typer.Option(help="Output folder.")],
+    source: Annotated[
+        str | None, typer.Option(help="synthetic, simworld or cityjson; short for --set maps.source=...")
+    ] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 1: make boxes_3d.json from a map source."""
+    import cosfly.maps
+
+    cfg = _settings(config, [*(overrides or []), *([f"maps.source={source}"] if source else [])], seed)
+    typer.echo(cosfly.maps.run(cfg.maps, out, seed=cfg.seed, resume=resume.value))
+
+
+@app.command()
+def simplify(
+    map_: MapOption,
+    out: Annotated[Path, typer.Option(help="Output folder.")],
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
+    import cosfly.simplify
+
+    cfg = _settings(config, overrides)
+    typer.echo(cosfly.simplify.run(cfg.simplify, map_, out, resume=resume.value))
+
+
+@app.command()
+def pedestrians(
+    map_: MapOption,
+    out: Annotated[Path, typer.Option(help="Output folder.")],
+    roi: Annotated[Path | None, typer.Option(help="Region of interest: roi_polygon.json.")] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 3: walks of 50-100 m on the simplified map, path.json."""
+    import cosfly.pedestrians
+
+    cfg = _settings(config, overrides, seed, workers)
+    spread = {"workers": _spread(cfg), "resume": resume.value}
+    typer.echo(cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **spread))
+
+
+plan_app = typer.Typer(invoke_without_command=True, help="Step 4: a drone flight for every walk, drone_trace.json.")
+app.add_typer(plan_app, name="plan")
+
+
+@plan_app.callback()
+def plan(
+    map_: MapOption,
+    paths: Annotated[Path, typer.Option(help="Walks: path.json.")],
+    out: Annotated[Path, typer.Option(help="Output folder.")],
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 4: a drone flight for every walk, drone_trace.json."""
+    import cosfly.planners
+
+    cfg = _settings(config, overrides, seed, workers)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    typer.echo(cosfly.planners.run(cfg.plan, map_, paths, out, seed=cfg.seed, **spread))
+
+
+# --- stages 5-7 -------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def render(
+    map_: MapOption,
+    simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
+    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
+    out: Annotated[Path, typer.Option(help="Output folder, the playback tree.")],
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
+    import cosfly.render
+
+    cfg = _settings(config, overrides, seed, workers)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    typer.echo(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **spread))
+
+
+@app.command()
+def gallery(
+    out: Annotated[Path, typer.Option(help="Folder for contact_sheet.png and preview.gif.")],
+    data: DataOption = None,
+) -> None:
+    """A contact sheet and a preview GIF of a playback tree."""
+    from cosfly.gallery import contact_sheet, preview_gif
+
+    tree = _data(data)
+    out.mkdir(parents=True, exist_ok=True)
+    contact_sheet(tree, out / "contact_sheet.png")
+    preview_gif(tree, out / "preview.gif")
+    typer.echo(out)
+
+
+@app.command()
+def inspect(
+    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
+    out: Annotated[Path, typer.Option(help="Output folder.")],
+    data: DataOption = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
+    import cosfly.qc
+
+    cfg = _settings(config, overrides, None, workers)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    typer.echo(cosfly.qc.run(cfg.inspect, traces, _data(data), out, **spread))
+
+
+caption_app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
+app.add_typer(caption_app, name="caption")
+
+
+@caption_app.callback()
+def caption(
+    context: typer.Context,
+    teacher: Annotated[
+        str | None, typer.Option(help="rules, or the URL of an OpenAI-compatible endpoint. [default: rules]")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
+    data: DataOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")
+    ] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
+    if context.invoked_subcommand is not None:
+        return
+    import caption.regenerate
+
+    chosen = {"caption.teacher": teacher, "caption.model": model}
+    extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
+    cfg = _settings(config, [*(overrides or []), *extra], seed, workers)
+    tree = _data(data)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    target = out or tree.resolve().parent / "caption"
+    typer.echo(caption.regenerate.run(cfg.caption, tree, target, seed=cfg.seed, **spread))
+
+
+# --- release ----------------------------------------------------------------------------------------------------------
+
+release_app = typer.Typer(
+    no_args_is_help=True, help="Package captions and frames as a data set that opens with one line."
+)
+app.add_typer(release_app, name="release")
+
+
+@release_app.command("build")
+def release_build(
+    captions: Annotated[Path, typer.Option(help="captions.jsonl")],
+    inspected: Annotated[Path, typer.Option("--inspect", help="inspect.json")],
+    out: Annotated[Path, typer.Option(help="Release folder.")],
+    data: DataOption = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Select frames, join captions, write parquet, data-set card and checksums."""
+    import release.package
+
+    cfg = _settings(config, overrides, None, workers)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    typer.echo(release.package.run(cfg.release, _data(data), captions, inspected, out, **spread))
+
+
+@release_app.command("verify")
+def release_verify(folder: Annotated[Path, typer.Argument(help="Release folder.")]) -> None:
+    """Check structure, checksums, every number of the card, and re-projection. Exit 1 if anything is wrong."""
+    import release.validate
+
+    report = release.validate.verify(folder)
+    typer.echo(str(report))
+    if not report.is_ok:
+        raise typer.Exit(1)
+
+
+# --- students ---------------------------------------------------------------------------------------------------------
+
+distill_app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set, LoRA, inference, evaluation.")
+app.add_typer(distill_app, name="distill")
+
+
+# --- this installation ------------------------------------------------------------------------------------------------
+
+config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
+app.add_typer(config_app, name="config")
+
+
+@config_app.command("check")
+def config_check(
+    config: Annotated[Path, typer.Argument(help="YAML file, or the name of one that ships.")],
+    overrides: Overrides = None,
+) -> None:
+    """Check a configuration without running it; reports all problems at once."""
+    _settings(config, overrides)
+    typer.echo(f"{config}: ok")
+
+
+@config_app.command("show")
+def config_show(
+    config: Annotated[
+        Path | None, typer.Argument(help="YAML file, or the name of one that ships; none: the defaults.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the resolved configuration: every setting with its value."""
+    import yaml
+
+    cfg = _settings(config, overrides)
+    typer.echo(yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True), nl=False)
+
+
+@app.command()
+def doctor(
+    teacher: Annotated[str | None, typer.Option(help="URL of an endpoint to ask as well.")] = None,
+    out: Annotated[Path, typer.Option(help="Where runs will be written.")] = Path("runs"),
+) -> None:
+    """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
+    from rich.table import Table
+
+    from cosfly import doctor as examination
+    from cosfly.console import console
+
+    checks = examination.examine(out, teacher)
+    table = Table(show_header=False, box=None)
+    for check in checks:
+        color = {"ok": "green", "missing": "red", "optional": "yellow"}[check.state]
+        table.add_row(check.name, f"[{color}]{check.state}[/]", check.detail)
+    console.print(table)
+    if any(check.state == "missing" for check in checks):
+        raise typer.Exit(1)

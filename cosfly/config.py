@@ -1,0 +1,118 @@
+"""Settings: YAML and `--set a.b=c` into strict pydantic models, with all problems reported at once."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cosfly.errors import ConfigError, nearest
+
+
+class Config(BaseModel):
+    """Base of every stage's settings: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+C = TypeVar("C", bound=BaseModel)
+
+
+def read_yaml(path: Path) -> dict:
+    """Read a YAML mapping with the safe loader.
+
+    Raises:
+        ConfigError: it is missing, not YAML, or not a mapping.
+    """
+    try:
+        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            "cannot read the configuration", where=path, got=error.strerror, fix="check the path"
+        ) from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError("the configuration is not valid YAML", where=path, got=str(error)) from None
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise ConfigError(
+            "the configuration is not a mapping", where=path, got=type(value).__name__, expected="key: value lines"
+        )
+    return value
+
+
+def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
+    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
+    data = _copy(data)
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not key:
+            raise ConfigError(
+                "not an assignment", where="--set", got=override, expected="key=value, for instance plan.seed=3"
+            )
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError("the value is not valid YAML", where=f"--set {key}", got=str(error)) from None
+        node = data
+        *parents, last = key.split(".")
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise ConfigError("not a group of settings", where=f"--set {key}", got=parent)
+        node[last] = value
+    return data
+
+
+def _copy(value: Any) -> Any:
+    return {key: _copy(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def build(model: type[C], data: dict, source: str | Path) -> C:
+    """Make a model from plain data.
+
+    Raises:
+        ConfigError: names every problem, and for an unknown key the nearest known one.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        problems = [_problem(model, detail) for detail in error.errors()]
+        raise ConfigError(
+            "; ".join(problems), where=source, fix=f"{len(problems)} to mend" if len(problems) > 1 else None
+        ) from None
+
+
+def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:
+    """Defaults, then the file, then the overrides."""
+    data = apply_overrides(read_yaml(path) if path else {}, overrides)
+    return build(model, data, path or "--set")
+
+
+def _problem(model: type[BaseModel], detail: Any) -> str:
+    field = ".".join(str(part) for part in detail["loc"]) or "settings"
+    if detail["type"] == "extra_forbidden":
+        *parents, last = detail["loc"]
+        return f"{field}: unknown setting{nearest(str(last), _known(model, parents))}"
+    got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
+    return f"{field}: {detail['msg']}{got}"
+
+
+def _known(model: Any, parents: Iterable[Any]) -> list[str]:
+    """Names of the settings of the group at `parents`."""
+    for parent in parents:
+        field = getattr(model, "model_fields", {}).get(parent)
+        if field is None:
+            continue  # the tag of a union, or a position in a list
+        kinds = [field.annotation, *get_args(field.annotation)]
+        model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+    return list(getattr(model, "model_fields", {}))
+
+
+def shipped(name: str) -> Path:
+    """Give the path of a file that ships in `configs/`, wherever cosfly is installed."""
+    return Path(str(importlib.resources.files("cosfly_configs") / name))

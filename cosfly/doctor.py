@@ -1,0 +1,119 @@
+"""`cosfly doctor`: what works on this machine, and what to do about what does not."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import httpx
+
+from cosfly.errors import EnvironmentMissing
+
+State = Literal["ok", "missing", "optional"]
+
+OPTIONAL_PACKAGES = {
+    "torch": "students",
+    "transformers": "students",
+    "peft": "students",
+    "bert_score": "evaluation of students",
+    "datasets": "opening the release as a user would",
+    "vllm": "a teacher in this process",
+    "pyrender": "the second renderer",
+}
+EXTRA_OF = {"vllm": "vllm", "pyrender": "pyrender"}  # the others come with "distill"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the table; `optional` means: not there, and the main job does not need it."""
+
+    name: str
+    state: State
+    detail: str
+
+
+def examine(folder: Path, teacher: str | None = None) -> list[Check]:
+    """Look at everything. `missing` in any check means that the main job cannot run here."""
+    checks = [_python(), _memory(), _disk(folder), _gl(), _gpu(), *(_package(name) for name in OPTIONAL_PACKAGES)]
+    if teacher is not None:
+        checks.append(_endpoint(teacher))
+    return checks
+
+
+def _python() -> Check:
+    return Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
+
+
+def _memory() -> Check:
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {total:.0f} GiB memory")
+
+
+def _disk(folder: Path) -> Check:
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free / 2**30
+    # A 1280x720 frame takes about 5 MB, nearly all of it float32 depth.
+    detail = f"{free:.1f} GiB free at {folder.resolve()}, room for about {int(free * 200):,} frames of 1280x720"
+    return Check("disk", "ok" if free > 5 else "missing", detail)
+
+
+def _gl() -> Check:
+    from cosfly.render.gl_backend import gl_report
+
+    try:
+        return Check("GL (renderer)", "ok", gl_report())
+    except EnvironmentMissing as error:
+        return Check("GL (renderer)", "missing", str(error))
+
+
+def _gpu() -> Check:
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return Check("GPU", "optional", "no nvidia-smi: frames are rendered on the CPU, students train on the CPU")
+    try:
+        query = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+        found = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
+    except subprocess.TimeoutExpired:
+        return Check("GPU", "optional", "nvidia-smi does not answer")
+    if found.returncode != 0:
+        return Check("GPU", "optional", f"nvidia-smi failed: {found.stdout.strip() or found.stderr.strip()}"[:120])
+    return Check("GPU", "ok", "; ".join(found.stdout.strip().splitlines()))
+
+
+def _package(name: str) -> Check:
+    if importlib.util.find_spec(name) is None:
+        extra = EXTRA_OF.get(name, "distill")
+        return Check(name, "optional", f'not installed; for {OPTIONAL_PACKAGES[name]}: pip install "cosfly[{extra}]"')
+    return Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
+
+
+def _endpoint(url: str) -> Check:
+    """Ask an OpenAI-compatible server for its models. The key comes from the environment and is not shown."""
+    key = os.environ.get("COSFLY_API_KEY")
+    base = httpx.URL(url)
+    shown = str(base.copy_with(userinfo=b"", query=None))
+    path = base.path.rstrip("/").removesuffix("/chat/completions").removesuffix("/v1")
+    try:
+        answer = httpx.get(
+            base.copy_with(path=f"{path}/v1/models"),
+            headers={"Authorization": f"Bearer {key}"} if key else {},
+            timeout=10,
+        )
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        return Check("endpoint", "missing", f"{shown}: {type(error).__name__}: {error}")
+    if answer.status_code != 200:
+        hint = "; set COSFLY_API_KEY" if answer.status_code in (401, 403) and not key else ""
+        return Check("endpoint", "missing", f"{shown}: HTTP {answer.status_code} for /v1/models{hint}")
+    try:
+        models = [str(model["id"]) for model in answer.json()["data"]]
+    except (ValueError, KeyError, TypeError):
+        return Check("endpoint", "missing", f"{shown}: answers, but not as an OpenAI-compatible server")
+    return Check("endpoint", "ok", f"{shown}: {', '.join(models) or 'no models'}")

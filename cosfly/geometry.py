@@ -1,0 +1,123 @@
+"""Frames, poses and projection: the one place where the project's convention for space stands.
+
+World: right-handed, metres, +x East, +y North, +z up. Files carry degrees, kernels take radians and say so in the name.
+`yaw` is counter-clockwise from +x, `pitch` positive nose-up, `roll` positive right-side-down;
+rotation = Rz(yaw) @ Ry(-pitch) @ Rx(roll) on a body frame x forward, y left, z up.
+Cameras are OpenCV cameras (x right, y down, z forward) and depth is z-depth.
+
+CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_*` below is that change, its own inverse.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def rotation_matrix(pitch_rad: float, yaw_rad: float, roll_rad: float) -> np.ndarray:
+    """Give world_from_body, (3, 3) float64."""
+    return rotation_matrices(np.array([[pitch_rad, yaw_rad, roll_rad]]))[0]
+
+
+def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
+    """Give world_from_body for many rotations.
+
+    Args:
+        rotations_rad: (n, 3) pitch, yaw, roll.
+    Returns:
+        (n, 3, 3) float64.
+    """
+    pitch, yaw, roll = np.asarray(rotations_rad, dtype=np.float64).T
+    cp, sp, cy, sy, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    # Rz(yaw) @ Ry(-pitch) @ Rx(roll), written out.
+    return np.stack(
+        [
+            np.stack([cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr], axis=-1),
+            np.stack([sy * cp, cy * cr - sy * sp * sr, -cy * sr - sy * sp * cr], axis=-1),
+            np.stack([sp, cp * sr, cp * cr], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
+    """Half sizes of the axis-aligned boxes round rotated boxes.
+
+    Args:
+        half_extents: (n, 3) m; rotations_deg: (n, 3) pitch, yaw, roll.
+    Returns:
+        (n, 3) m. Exact for unrotated boxes and quarter turns up to rounding.
+    """
+    turns = np.abs(rotation_matrices(np.radians(rotations_deg)))
+    turns[turns < 1e-12] = 0.0  # cos(90 deg) is 6e-17: do not let it widen a box
+    return np.einsum("nij,nj->ni", turns, half_extents)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give (pitch_rad, yaw_rad) that point the body's x axis from eye to target; works on (..., 3) arrays."""
+    d = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
+    return np.arctan2(d[..., 2], np.hypot(d[..., 0], d[..., 1])), np.arctan2(d[..., 1], d[..., 0])
+
+
+def focal_px(width_px: int, fov_deg: float) -> float:
+    """Focal length in pixels of a horizontal field of view (eq:focal)."""
+    return width_px / (2.0 * np.tan(np.radians(fov_deg) / 2.0))
+
+
+def intrinsic_matrix(width_px: int, height_px: int, fov_deg: float) -> np.ndarray:
+    """Give K, (3, 3), square pixels, principal point in the middle (app:zoom)."""
+    f = focal_px(width_px, fov_deg)
+    return np.array([[f, 0.0, width_px / 2.0], [0.0, f, height_px / 2.0], [0.0, 0.0, 1.0]])
+
+
+def world_from_camera(position_m: np.ndarray, rotation_deg: np.ndarray) -> np.ndarray:
+    """Give the (4, 4) transform of a camera at a body pose.
+
+    Args:
+        position_m: (3,); rotation_deg: (3,) pitch, yaw, roll.
+    """
+    pitch, yaw, roll = np.radians(rotation_deg)
+    transform = np.eye(4)
+    transform[:3, :3] = rotation_matrix(pitch, yaw, roll) @ BODY_FROM_CAMERA
+    transform[:3, 3] = position_m
+    return transform
+
+
+def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points.
+
+    Args:
+        points_m: (n, 3) world; camera_pose: (4, 4) world_from_camera; intrinsic: (3, 3).
+    Returns:
+        uv (n, 2) px and z (n,) m. Points with z <= 0 lie behind the camera: their uv is NaN.
+    """
+    in_camera = (np.asarray(points_m, dtype=np.float64) - camera_pose[:3, 3]) @ camera_pose[:3, :3]
+    z = in_camera[:, 2]
+    uv = np.full((len(in_camera), 2), np.nan)
+    front = z > 0
+    homogeneous = in_camera[front] @ intrinsic.T
+    uv[front] = homogeneous[:, :2] / homogeneous[:, 2:]
+    return uv, z
+
+
+def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0.0) -> np.ndarray:
+    """Give the eight corners of a box that is turned about z, (8, 3)."""
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
+    return signs * half_extents @ rotation_matrix(0.0, yaw_rad, 0.0).T + center
+
+
+def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
+    """Bring angles to [-180, 180)."""
+    return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
+
+
+def mirror_positions(positions_m: np.ndarray) -> np.ndarray:
+    """Change (..., 3) positions between right-handed and CARLA axes: y changes sign."""
+    return np.asarray(positions_m, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+
+
+def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
+    """Change (..., 3) pitch, yaw, roll between right-handed and CARLA axes: yaw changes sign."""
+    return np.asarray(rotations_deg, dtype=np.float64) * np.array([1.0, -1.0, 1.0])

@@ -1,0 +1,131 @@
+"""The stages in order, inside one run folder: `cosfly run`. Resumes where it stopped."""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+from pydantic import Field
+
+import caption.regenerate
+import cosfly
+import cosfly.maps
+import cosfly.pedestrians
+import cosfly.planners
+import cosfly.qc
+import cosfly.render
+import cosfly.simplify
+import release.package
+from caption.schema import CaptionConfig
+from cosfly.config import Config
+from cosfly.gallery import contact_sheet, preview_gif
+from cosfly.maps import MapsConfig
+from cosfly.pedestrians import PedestriansConfig
+from cosfly.planners import PlanConfig
+from cosfly.qc import InspectConfig
+from cosfly.render import RenderConfig
+from cosfly.simplify import SimplifyConfig
+from cosfly.store import Resume, StageFolder, read_json, write_bytes, write_json
+from release.package import ReleaseConfig
+
+log = logging.getLogger(__name__)
+
+
+class RunConfig(Config):
+    """Everything that `cosfly run` needs; each stage's settings stand with the stage."""
+
+    name: str = Field("run", description="name of the run, for people")
+    seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
+    workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
+    roi: Path | None = Field(
+        None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
+    )
+    maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
+    simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
+    pedestrians: PedestriansConfig = Field(default_factory=PedestriansConfig, description="step 3")
+    plan: PlanConfig = Field(default_factory=PlanConfig, description="step 4")
+    render: RenderConfig = Field(default_factory=RenderConfig, description="step 5")
+    inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
+    caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
+    release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """One row of the closing table."""
+
+    stage: str
+    product: Path
+    manifest: dict
+    was_complete: bool
+
+
+def num_workers(setting: int) -> int:
+    return setting or len(os.sched_getaffinity(0))
+
+
+def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
+    """Make a data set: reads what the configuration names, writes one folder per stage below `out`.
+
+    Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
+    and `summary.json` in the run folder.
+    """
+    seed, workers = cfg.seed, num_workers(cfg.workers)
+    _save_run(cfg, out)
+    spread = {"workers": workers, "resume": resume}
+    boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
+    paths, traces = out / "pedestrians/path.json", out / "plan/drone_trace.json"
+    tree, inspected, captions = out / "render", out / "inspect/inspect.json", out / "caption/captions.jsonl"
+
+    stages: list[tuple[str, Path, Callable[[Path], Path]]] = [
+        ("maps", boxes, lambda to: cosfly.maps.run(cfg.maps, to, seed=seed, resume=resume)),
+        ("simplify", simplified, lambda to: cosfly.simplify.run(cfg.simplify, boxes, to, resume=resume)),
+        (
+            "pedestrians",
+            paths,
+            lambda to: cosfly.pedestrians.run(cfg.pedestrians, simplified, to, seed=seed, roi=cfg.roi, **spread),
+        ),
+        ("plan", traces, lambda to: cosfly.planners.run(cfg.plan, simplified, paths, to, seed=seed, **spread)),
+        ("render", tree, lambda to: cosfly.render.run(cfg.render, boxes, simplified, traces, to, seed=seed, **spread)),
+        ("inspect", inspected, lambda to: cosfly.qc.run(cfg.inspect, traces, tree, to, **spread)),
+        ("caption", captions, lambda to: caption.regenerate.run(cfg.caption, tree, to, seed=seed, **spread)),
+        (
+            "release",
+            out / "release",
+            lambda to: release.package.run(cfg.release, tree, captions, inspected, to, **spread),
+        ),
+    ]
+    results = []
+    for number, (stage, product, work) in enumerate(stages, 1):
+        was_complete = (out / stage / "manifest.json").exists()
+        log.info("[%d/%d] %s%s", number, len(stages), stage, ": already complete" if was_complete else "")
+        work(out / stage)
+        results.append(StageResult(stage, product, StageFolder(out / stage, stage, True).manifest(), was_complete))
+    contact_sheet(tree, out / "contact_sheet.png")
+    preview_gif(tree, out / "preview.gif")
+    _save_summary(results, out)
+    return results
+
+
+def _save_run(cfg: RunConfig, out: Path) -> None:
+    """Write `run.yaml`: the resolved configuration, which runs as it is."""
+    header = f"# cosfly {cosfly.__version__}, Python {platform.python_version()}, {platform.platform()}\n"
+    text = header + yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    write_bytes(out / "run.yaml", text.encode())
+
+
+def _save_summary(results: list[StageResult], out: Path) -> None:
+    """Write `summary.json`: counts, seconds and peak memory. A resumed run adds to the peak of the one before."""
+    path = out / "summary.json"
+    before = read_json(path).get("peak_memory_mb", 0) if path.exists() else 0
+    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
+    peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
+    rows = [{"stage": r.stage, "counts": r.manifest["counts"], "seconds": r.manifest["seconds"]} for r in results]
+    write_json(path, {"stages": rows, "peak_memory_mb": round(max(before, peak_mb), 1)})

@@ -1,0 +1,221 @@
+"""Items to work, on this machine: a process pool with resume, progress, a tally that adds up and a record per failure.
+
+`run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and a *worker factory*: a
+module-level function that is called once in each worker process with `factory_args` and returns the function that does one
+item. Load maps and open GL contexts in the factory. The same signature fits an actor pool on other machines.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import logging.handlers
+import multiprocessing
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cosfly.console import progress_bar
+from cosfly.errors import CosflyError
+from cosfly.store import StageFolder, Tally, dump_json, write_bytes
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Item:
+    """One unit of work. `item_id` is unique within the stage and stable between runs."""
+
+    item_id: str
+    payload: Any = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an item that did not fail: `result` is JSON-able, `drop_reason` is None for a kept item."""
+
+    result: dict = field(default_factory=dict)
+    drop_reason: str | None = None
+
+
+Work = Callable[[Item], Outcome]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """All outcomes of a stage, in the order of the items."""
+
+    records: list[dict]  # {"id", "status": kept | dropped | failed, "result" | "reason" ...}
+    tally: Tally
+
+    def results(self) -> Iterator[tuple[str, dict]]:
+        """Yield (item id, result) of the kept items."""
+        for record in self.records:
+            if record["status"] == "kept":
+                yield record["id"], record["result"]
+
+
+def rng_for(seed: int, stage: str, item_id: str) -> np.random.Generator:
+    """Give the random generator of one item: independent of worker count, order and resumption."""
+    digest = hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
+
+
+def run_items(
+    stage: StageFolder,
+    items: Sequence[Item],
+    factory: Callable[..., Work],
+    factory_args: tuple = (),
+    *,
+    workers: int = 1,
+    label: str | None = None,
+) -> Finished:
+    """Do all items that the stage's journal does not hold yet.
+
+    An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage, and
+    what was finished stays. A worker that dies (out of memory, kill) costs only its item, after one more try of its own.
+    On a later run kept and dropped items are taken from the journal and failed ones are tried again.
+
+    Args:
+        factory: module-level function; `factory(*factory_args)` returns the work function, once in each process.
+        workers: processes; 1 works in this process.
+    Returns:
+        Records and tally, in the order of `items` whatever the order of work.
+    """
+    ids = [item.item_id for item in items]
+    assert len(set(ids)) == len(ids), "item ids must be unique"
+    with stage.journal as journal:
+        known = set(ids)
+        records = {r["id"]: r for r in journal.read() if r["id"] in known and r["status"] != "failed"}
+        todo = [item for item in items if item.item_id not in records]
+        if records:
+            log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
+        with progress_bar(label or stage.stage, total=len(items), done=len(records)) as advance:
+            for record in _outcomes(todo, factory, factory_args, workers):
+                records[record["id"]] = record
+                journal.append(record)
+                if record["status"] == "failed":
+                    log.error("%s: %s: %s", stage.stage, record["id"], record["message"])
+                advance(1)
+    ordered = [records[item_id] for item_id in ids]
+    return Finished(ordered, _tally(stage, ordered))
+
+
+def _tally(stage: StageFolder, records: list[dict]) -> Tally:
+    tally = Tally(num_input=len(records))
+    failures = []
+    for record in records:
+        if record["status"] == "kept":
+            tally.kept += 1
+        elif record["status"] == "dropped":
+            tally.dropped[record["reason"]] = tally.dropped.get(record["reason"], 0) + 1
+        else:
+            tally.failed[record["code"]] = tally.failed.get(record["code"], 0) + 1
+            failures.append({key: record[key] for key in ("id", "code", "message")})
+    write_bytes(stage.path / "failures.jsonl", "".join(dump_json(f) + "\n" for f in failures).encode())
+    tally.check()
+    return tally
+
+
+def _outcomes(items: list[Item], factory: Callable, factory_args: tuple, workers: int) -> Iterator[dict]:
+    if workers <= 1 or len(items) <= 1:
+        work = factory(*factory_args) if items else None
+        for item in items:
+            yield _attempt(work, item)
+        return
+    suspects: list[Item] = []  # in flight when a worker died: each gets one more try, alone
+    yield from _pooled(items, factory, factory_args, workers, suspects)
+    for item in suspects:
+        again: list[Item] = []
+        yield from _pooled([item], factory, factory_args, 1, again)
+        if again:
+            message = f"{item.item_id}: its worker process died twice; it may need more memory than there is"
+            yield {"id": item.item_id, "status": "failed", "code": "worker_died", "message": message}
+
+
+def _pooled(
+    items: list[Item], factory: Callable, factory_args: tuple, workers: int, suspects: list[Item]
+) -> Iterator[dict]:
+    """Run items on a pool; those in flight when a worker died are put into `suspects`, the others run on a new pool."""
+    context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
+    waiting = list(reversed(items))
+    logs = context.Queue()
+    listener = logging.handlers.QueueListener(logs, *logging.getLogger().handlers, respect_handler_level=True)
+    listener.start()
+    try:
+        while waiting:
+            pool = ProcessPoolExecutor(
+                min(workers, len(waiting)),
+                context,
+                _start_worker,
+                (factory, factory_args, logs, logging.getLogger().level),
+            )
+            running: dict[Future, Item] = {}
+            try:
+                while waiting or running:
+                    while waiting and len(running) < 2 * workers:  # a short queue keeps every worker fed
+                        running[pool.submit(_attempt_in_worker, waiting[-1])] = waiting[-1]
+                        waiting.pop()
+                    done, _ = wait(running, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        record = future.result()  # raises a fatal CosflyError, or BrokenProcessPool
+                        del running[future]
+                        yield record
+            except BrokenProcessPool:
+                suspects.extend(running.values())
+                log.warning("a worker process died; its items get one more try")
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+    finally:
+        listener.stop()
+
+
+_work: Work | None = None  # this worker process's function
+_start_error: CosflyError | None = None
+
+
+def _start_worker(factory: Callable, factory_args: tuple, logs: Any, level: int) -> None:
+    global _work, _start_error
+    root = logging.getLogger()
+    root.handlers = [logging.handlers.QueueHandler(logs)]
+    root.setLevel(level)
+    try:
+        _work = factory(*factory_args)
+    except CosflyError as error:
+        _start_error = error  # raised by the first item: an error in an initializer would only break the pool
+
+
+def _attempt_in_worker(item: Item) -> dict:
+    if _start_error is not None:
+        raise _start_error
+    return _attempt(_work, item)
+
+
+def _attempt(work: Work | None, item: Item) -> dict:
+    """Do one item and give its record. Only a fatal error gets out."""
+    assert work is not None
+    start_s = time.monotonic()
+    try:
+        outcome = work(item)
+    except CosflyError as error:
+        if error.fatal:
+            raise
+        return {"id": item.item_id, "status": "failed", "code": error.code, "message": str(error)}
+    except Exception as error:  # the item boundary: a bug in one item must not lose the others
+        log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
+        return {"id": item.item_id, "status": "failed", "code": "bug", "message": f"{type(error).__name__}: {error}"}
+    record: dict[str, Any] = {
+        "id": item.item_id,
+        "status": "kept" if outcome.drop_reason is None else "dropped",
+        "result": outcome.result,
+    }
+    if outcome.drop_reason is not None:
+        record["reason"] = outcome.drop_reason
+    record["seconds"] = round(time.monotonic() - start_s, 3)
+    return record

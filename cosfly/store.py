@@ -1,0 +1,489 @@
+"""Files that are never half written: atomic writes, checksummed journals, stage folders.
+
+A stage folder tells its own story: `stage.json` is written first (settings, inputs, seed, code version), `items.jsonl` grows
+while items are finished, `failures.jsonl` and `manifest.json` are written last. A manifest means: complete.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import logging
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import cosfly
+from cosfly.errors import InputError, ResumeError, StorageError, VerifyError
+
+log = logging.getLogger(__name__)
+
+Resume = Literal["never", "if-same", "force"]
+
+STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
+
+
+# --- bytes and JSON ---------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Turn a full or read-only disk into a StorageError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (
+            errno.ENOSPC,
+            errno.EDQUOT,
+            errno.EROFS,
+            errno.EACCES,
+            errno.EPERM,
+            errno.ENOTDIR,
+            errno.EIO,
+        ):
+            raise StorageError(
+                "cannot write",
+                where=path,
+                got=error.strerror,
+                fix="free some space or choose another --out, then run the same command again: finished work is kept",
+            ) from error
+        raise
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it, so that a kill leaves either the old file or the new one."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with open(partial, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def dump_json(value: Any, *, indent: int | None = None) -> str:
+    """Give JSON text; NaN and infinity are an error, never a value."""
+    separators = (",", ":") if indent is None else None
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
+
+
+def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
+    write_bytes(path, (dump_json(value, indent=indent) + "\n").encode())
+
+
+def _no_constants(text: str) -> float:
+    raise ValueError(f"{text} is not a number that a file may hold")
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Read JSON text; NaN and infinity are an error."""
+    return json.loads(text, parse_constant=_no_constants)
+
+
+def read_json(path: Path, *, what: str = "file") -> Any:
+    """Read a JSON file.
+
+    Raises:
+        InputError: it is missing, unreadable or not JSON.
+    """
+    try:
+        return parse_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"cannot read the {what}", where=path, got=error.strerror, fix="check the path") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
+
+
+def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
+    """Check that a JSON value is an object of the wanted schema and major version."""
+    if not isinstance(value, dict):
+        raise InputError(
+            "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"
+        )
+    if value.get("schema") != schema:
+        raise InputError(
+            "not the expected kind of file",
+            where=f"{path}: schema",
+            got=repr(value.get("schema")),
+            expected=repr(schema),
+        )
+    found = value.get("schema_version")
+    if str(found).split(".")[0] != version.split(".")[0]:
+        raise InputError("unknown version", where=f"{path}: schema_version", got=repr(found), expected=repr(version))
+    return value
+
+
+def sha256_bytes(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: Path) -> str:
+    """Give the hex digest of a file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError("cannot read the file", where=path, got=error.strerror, fix="check the path") from None
+
+
+def fingerprint(path: Path) -> str:
+    """Give one digest for an input: a file's bytes, a finished stage's products, or a playback tree's trajectory files."""
+    if path.is_file():
+        return sha256_file(path)
+    if not path.is_dir():
+        raise InputError(
+            "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
+        )
+    manifest = path / "manifest.json"
+    if manifest.is_file():
+        return sha256_bytes(dump_json(read_json(manifest).get("outputs", [])).encode())
+    digest = hashlib.sha256()
+    for file in sorted(path.rglob("trajectory.json")):
+        digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
+    return digest.hexdigest()
+
+
+# --- journals ---------------------------------------------------------------------------------------------------------
+
+
+class Journal:
+    """An append-only JSON-lines file whose every line carries its own checksum.
+
+    A line is on disk before `append` returns. A line that a kill cut short, or that was damaged, is skipped by `read` and
+    counted in `num_damaged`; what stood in it is done again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.num_damaged = 0
+        self._file: Any = None
+        self._lock = threading.Lock()
+
+    def read(self) -> Iterator[dict]:
+        """Yield the records in order, damaged lines left out."""
+        self.num_damaged = 0
+        if not self.path.exists():
+            return
+        with open(self.path, "rb") as file:
+            for line in file:
+                try:
+                    digest, body = line.rstrip(b"\n").split(b" ", 1)
+                    if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
+                        raise ValueError
+                    record = parse_json(body)
+                except (ValueError, UnicodeDecodeError):
+                    self.num_damaged += 1
+                    continue
+                yield record
+
+    def append(self, record: dict, *, sync: bool = True) -> None:
+        """Add a record and, unless told otherwise, wait until it is on the disk."""
+        body = dump_json(record).encode()
+        line = sha256_bytes(body)[:16].encode() + b" " + body + b"\n"
+        with self._lock, storage_errors(self.path):
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                _cut_torn_line(self.path)
+                self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
+            self._file.write(line)
+            self._file.flush()
+            if sync:
+                os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _cut_torn_line(path: Path) -> None:
+    """Take off the line that a kill cut short: a reader skips it, so it must not come back to life when more is written."""
+    if not path.exists():
+        return
+    with open(path, "r+b") as file:
+        end = file.seek(0, os.SEEK_END)
+        keep, block = end, 65536
+        while keep > 0:
+            start = max(0, keep - block)
+            file.seek(start)
+            newline = file.read(keep - start).rfind(b"\n")
+            if newline >= 0:
+                keep = start + newline + 1
+                break
+            keep = start
+        if keep < end:
+            file.truncate(keep)
+
+
+# --- stage folders ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Tally:
+    """What became of a stage's items. kept + dropped + failed + unfinished = input, always."""
+
+    num_input: int = 0
+    kept: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    failed: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def num_dropped(self) -> int:
+        return sum(self.dropped.values())
+
+    @property
+    def num_failed(self) -> int:
+        return sum(self.failed.values())
+
+    def check(self) -> None:
+        """Assert that nothing was lost: a tally that does not add up is a bug of ours, not of the input."""
+        total = self.kept + self.num_dropped + self.num_failed
+        assert total == self.num_input, f"{total} outcomes for {self.num_input} items: {self}"
+
+    def as_dict(self) -> dict:
+        return {
+            "input": self.num_input,
+            "kept": self.kept,
+            "dropped": dict(sorted(self.dropped.items())),
+            "failed": dict(sorted(self.failed.items())),
+        }
+
+    def __str__(self) -> str:
+        text = f"{self.kept} kept"
+        for word, reasons in (("dropped", self.dropped), ("failed", self.failed)):
+            if reasons:
+                listed = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+                text += f", {sum(reasons.values())} {word} ({listed})"
+        return f"{text} of {self.num_input}"
+
+
+class StageFolder:
+    """One stage's output folder, opened for one set of settings and inputs.
+
+    `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings and
+    inputs, `is_complete` is true and the stage has nothing to do.
+    """
+
+    def __init__(self, path: Path, stage: str, is_complete: bool) -> None:
+        self.path, self.stage, self.is_complete = path, stage, is_complete
+        self.started_s = time.monotonic()
+
+    @classmethod
+    def open(
+        cls, out: Path, stage: str, *, config: dict, inputs: dict[str, Path], seed: int, resume: Resume = "if-same"
+    ) -> StageFolder:
+        """Start or continue a stage.
+
+        Args:
+            config: the stage's resolved settings, JSON-able.
+            inputs: name -> file or folder that the stage reads.
+            resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed;
+                `force` continues with the finished items in spite of a difference, which stays on record.
+        Raises:
+            ResumeError: the folder holds work that may not be continued; names what differs.
+        """
+        record = {
+            "schema": STAGE_SCHEMA,
+            "schema_version": VERSION,
+            "stage": stage,
+            "config": config,
+            "seed": seed,
+            "inputs": {name: {"path": str(path), "sha256": fingerprint(path)} for name, path in sorted(inputs.items())},
+            "code_version": cosfly.__version__,
+        }
+        stage_file, manifest_file = out / "stage.json", out / "manifest.json"
+        if out.exists() and not out.is_dir():
+            raise StorageError("the output folder is a file", where=out, fix="choose another --out")
+        if stage_file.exists():
+            found = check_schema(read_json(stage_file), STAGE_SCHEMA, VERSION, stage_file)
+            if resume == "never":
+                raise ResumeError(
+                    "the folder already holds work", where=out, fix="choose another --out, or --resume if-same"
+                )
+            differences = _differences(found, record)
+            if differences and resume == "if-same":
+                raise ResumeError(
+                    "the folder holds work made with other settings or inputs",
+                    where=out,
+                    got="; ".join(differences),
+                    fix="choose another --out, restore the setting, or --resume force to keep the finished items all the same",
+                )
+            if differences:
+                record["resumed_with_other"] = [*found.get("resumed_with_other", []), *differences]
+                manifest_file.unlink(missing_ok=True)
+            elif "resumed_with_other" in found:
+                record["resumed_with_other"] = found["resumed_with_other"]
+            if found.get("code_version") != record["code_version"]:
+                log.warning(
+                    "%s: continued by version %s, begun by %s", out, record["code_version"], found.get("code_version")
+                )
+        elif out.is_dir() and any(out.iterdir()):
+            raise ResumeError(
+                "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
+            )
+        is_complete = manifest_file.exists()
+        if is_complete:
+            _check_outputs_exist(out, check_schema(read_json(manifest_file), MANIFEST_SCHEMA, VERSION, manifest_file))
+        else:
+            write_json(stage_file, record)
+            remove_partials(out)
+        return cls(out, stage, is_complete)
+
+    @property
+    def journal(self) -> Journal:
+        return Journal(self.path / "items.jsonl")
+
+    def finish(self, outputs: Iterable[Path], tally: Tally, **extra: Any) -> None:
+        """Write the manifest: the stage is complete.
+
+        Args:
+            outputs: files inside the folder; of a folder with many files, give its checksum file.
+            extra: further JSON-able facts for the manifest, for instance counts.
+        """
+        tally.check()
+        listed = [
+            {"path": str(path.relative_to(self.path)), "bytes": path.stat().st_size, "sha256": sha256_file(path)}
+            for path in sorted(outputs)
+        ]
+        seconds = round(time.monotonic() - self.started_s, 3)
+        manifest = {
+            "schema": MANIFEST_SCHEMA,
+            "schema_version": VERSION,
+            "stage": self.stage,
+            "outputs": listed,
+            "counts": tally.as_dict(),
+            **extra,
+            "seconds": seconds,
+        }
+        write_json(self.path / "manifest.json", manifest)
+        log.info("%s: %s, %.1f s", self.stage, tally, seconds)
+
+    def manifest(self) -> dict:
+        """Read the manifest of a complete stage."""
+        return check_schema(
+            read_json(self.path / "manifest.json"), MANIFEST_SCHEMA, VERSION, self.path / "manifest.json"
+        )
+
+
+def _differences(found: dict, wanted: dict) -> list[str]:
+    """Say which settings, inputs or seed differ, one phrase each."""
+    before, after = _flat(found.get("config", {})), _flat(wanted["config"])
+    changed = [
+        f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
+        for key in sorted(before.keys() | after.keys())
+        if before.get(key) != after.get(key)
+    ]
+    if found.get("seed") != wanted["seed"]:
+        changed.append(f"seed was {found.get('seed')}, is {wanted['seed']}")
+    for name in sorted(found.get("inputs", {}).keys() | wanted["inputs"].keys()):
+        old, new = found.get("inputs", {}).get(name, {}), wanted["inputs"].get(name, {})
+        if old.get("sha256") != new.get("sha256"):
+            changed.append(f"the input {name} ({new.get('path', 'none')}) has changed")
+    return changed
+
+
+def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(config, dict) or not config:
+        return {prefix: config}
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        flat.update(_flat(value, f"{prefix}.{key}" if prefix else str(key)))
+    return flat
+
+
+def _check_outputs_exist(out: Path, manifest: dict) -> None:
+    for entry in manifest.get("outputs", []):
+        path = inside(out, entry["path"])
+        if not path.is_file() or path.stat().st_size != entry["bytes"]:
+            raise VerifyError(
+                "the manifest calls this stage complete, but a product is missing or has another size",
+                where=path,
+                expected=f"{entry['bytes']} bytes",
+                fix=f"remove {out} and run the stage again",
+            )
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove what a kill left under temporary names."""
+    for path in sorted(folder.rglob(".*.partial"), reverse=True):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def inside(root: Path, name: str) -> Path:
+    """Join a name from a file to a root.
+
+    Raises:
+        InputError: the name leads out of the root.
+    """
+    path = (root / name).resolve()
+    if not path.is_relative_to(root.resolve()):
+        raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
+    return path
+
+
+# --- folders of many files --------------------------------------------------------------------------------------------
+
+CHECKSUMS = "checksums.sha256"
+
+
+def write_checksums(folder: Path, digests: dict[str, str]) -> None:
+    """Write `checksums.sha256` (the format of sha256sum) for files named relative to the folder."""
+    lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
+    write_bytes(folder / CHECKSUMS, lines.encode())
+
+
+def read_checksums(folder: Path) -> dict[str, str]:
+    """Read `checksums.sha256`: relative name -> hex digest."""
+    path = folder / CHECKSUMS
+    digests: dict[str, str] = {}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError("cannot read the checksums", where=path, got=error.strerror) from None
+    for number, line in enumerate(lines, 1):
+        digest, _, name = line.partition("  ")
+        if len(digest) != 64 or not name:
+            raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
+        digests[str(inside(folder, name).relative_to(folder.resolve()))] = digest
+    return digests
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Fill a folder under a temporary name; rename it when the block ends without an error."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with storage_errors(path):
+        partial.mkdir(parents=True)
+        try:
+            yield partial
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(partial, path)

@@ -1,0 +1,1 @@
+"""Students: training set, LoRA training, inference and evaluation."""

@@ -1,0 +1,1 @@
+"""The published data set: selection, packaging, card, verification."""

@@ -1,0 +1,271 @@
+"""Small playback trees for tests: a walking person, a drone that follows, and every file of every frame.
+
+Images are painted by a plain NumPy ray caster (a ground plane, some boxes, the person), so the pictures, depths, ids, boxes
+and visibilities agree with the poses in `trajectory.json`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, world_from_camera
+from cosfly.playback import SKY_DEPTH_M, Camera, Flight, frame_name, write_flight
+from cosfly.schema import DT_S, KINDS, PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.store import write_json
+
+PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
+FIRST_SECOND = 1_776_047_127
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Boxes that stand on the ground: centers, half_extents (k, 3) m; colors (k, 3) uint8 RGB; kinds, ids (k,)."""
+
+    centers: np.ndarray
+    half_extents: np.ndarray
+    colors: np.ndarray
+    kinds: np.ndarray
+    ids: np.ndarray
+
+
+def make_playback_tree(
+    root: Path,
+    num_flights: int = 2,
+    num_points: int = 24,
+    seed: int = 0,
+    *,
+    width_px: int = 64,
+    height_px: int = 36,
+    towns: tuple[str, ...] = ("Town01",),
+    with_images: bool = True,
+    with_augmented: bool = True,
+) -> Path:
+    """Write a playback tree and give its root.
+
+    Args:
+        num_flights: trajectories; each has `ORI` and, unless told otherwise, `aug_001`.
+        num_points: frames of each flight, DT_S apart.
+        towns: the trajectories take turns.
+        with_images: False writes `trajectory.json` only.
+    """
+    for index in range(num_flights):
+        town = towns[index % len(towns)]
+        for variant in ("ORI", "aug_001") if with_augmented else ("ORI",):
+            flight, scene = make_flight(
+                num_points,
+                seed=seed + index,
+                town=town,
+                trajectory=f"trajectory_{FIRST_SECOND + 1000 * index}",
+                variant=variant,
+                width_px=width_px,
+                height_px=height_px,
+            )
+            folder = root / town / flight.trajectory / variant
+            write_flight(folder, flight)
+            if with_images:
+                for i in range(num_points):
+                    _write_frame(folder / frame_name(i), flight, scene, i)
+    return root
+
+
+def make_flight(
+    num_points: int = 24,
+    *,
+    seed: int = 0,
+    town: str = "Town01",
+    trajectory: str = f"trajectory_{FIRST_SECOND}",
+    variant: str = "ORI",
+    width_px: int = 64,
+    height_px: int = 36,
+) -> tuple[Flight, Scene]:
+    """Make a flight behind a walking person (turns, stops, climbs, some occlusion) and the scene round it."""
+    rng = np.random.default_rng([seed, 77])
+    targets = _walk(num_points, rng)
+    positions, rotations = _follow(targets, rng)
+    scene = _scene(targets, positions, rng)
+    zero = np.zeros((num_points, 3))
+    drone_offsets, rotation_offsets, is_perturbed = zero, zero.copy(), np.zeros(num_points, dtype=bool)
+    if variant != "ORI":
+        noise = np.random.default_rng([seed, 78])
+        drone_offsets = noise.uniform(-0.4, 0.4, (num_points, 3))
+        rotation_offsets = noise.uniform(-1.5, 1.5, (num_points, 3))
+        is_perturbed = np.ones(num_points, dtype=bool)
+    positions, rotations = positions + drone_offsets, rotations + rotation_offsets
+    camera = Camera(width_px, height_px, intrinsic_matrix(width_px, height_px, 60.0))
+    views = [_annotate(scene, targets[i], positions[i], rotations[i], camera) for i in range(num_points)]
+    bbox = np.array([view[0] for view in views])
+    visibility = np.array([view[3] for view in views])
+    flight = Flight(
+        town=town,
+        trajectory=trajectory,
+        variant=variant,
+        camera=camera,
+        time_s=np.arange(num_points) * DT_S,
+        positions_m=positions,
+        rotations_deg=rotations,
+        targets_m=targets,
+        target_in_view=~np.isnan(bbox[:, 0]),
+        target_visible=visibility >= 0.3,
+        target_depth_m=np.array([view[2] for view in views]),
+        target_uv=np.array([view[1] for view in views]),
+        target_bbox=bbox,
+        visibility=visibility,
+        is_perturbed=is_perturbed,
+        drone_offsets_m=drone_offsets,
+        rotation_offsets_deg=rotation_offsets,
+        target_offsets_m=zero.copy(),
+        source={
+            "path_index": seed,
+            "scenario_id": f"specimen_{seed}",
+            "scenario_name": "specimen",
+            "algorithm": "muco",
+        },
+        is_original=variant == "ORI",
+    )
+    return flight, scene
+
+
+def _walk(num_points: int, rng: np.random.Generator) -> np.ndarray:
+    """Hip positions (n, 3): straight legs, turns to both sides, a stop, a faster leg."""
+    heading, position = rng.uniform(-np.pi, np.pi), np.array([0.0, 0.0, TARGET_HEIGHT_M])
+    positions, turn_rad, speed_mps, left = [], 0.0, 1.2, 0
+    for _ in range(num_points):
+        positions.append(position.copy())
+        if left == 0:
+            left = int(rng.integers(4, 8))
+            turn_rad = float(rng.choice([0.0, 0.25, -0.25, 0.1, -0.1]))
+            speed_mps = float(rng.choice([1.2, 1.2, 1.6, 0.7, 0.0], p=[0.4, 0.2, 0.2, 0.1, 0.1]))
+        left -= 1
+        heading += turn_rad
+        position += np.array([np.cos(heading), np.sin(heading), 0.0]) * speed_mps * DT_S
+    return np.array(positions)
+
+
+def _follow(targets: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Drone positions (n, 3) and rotations (n, 3) deg: some 12 m behind and 8 m above, with a lag, looking at the person."""
+    n = len(targets)
+    bearing = rng.uniform(-np.pi, np.pi)
+    altitude = 8.0 + 1.5 * np.sin(np.arange(n) * 0.35 + rng.uniform(0.0, 6.0))
+    position = targets[0] + np.array([12.0 * np.cos(bearing), 12.0 * np.sin(bearing), altitude[0]])
+    positions, rotations, yaw = [], [], None
+    for i in range(n):
+        away = position[:2] - targets[i, :2]
+        wanted = targets[i, :2] + 12.0 * away / np.linalg.norm(away)
+        position = np.append(position[:2] + 0.5 * (wanted - position[:2]), altitude[i])
+        pitch_rad, yaw_rad = look_at(position, targets[i])
+        # The camera turns by 70 % of the way per step, so a turning person drifts off the middle.
+        yaw = yaw_rad if yaw is None else yaw + 0.7 * ((yaw_rad - yaw + np.pi) % (2 * np.pi) - np.pi)
+        positions.append(position.copy())
+        rotations.append([np.degrees(pitch_rad), np.degrees(yaw), 0.0])
+    return np.array(positions), np.array(rotations)
+
+
+def _scene(targets: np.ndarray, positions: np.ndarray, rng: np.random.Generator) -> Scene:
+    """A few buildings beside the walk and one wall that hides the person for some frames in the middle of the flight."""
+    centers, halves, colors, kinds = [], [], [], []
+    for _ in range(6):
+        angle, distance_m = rng.uniform(-np.pi, np.pi), rng.uniform(25.0, 45.0)
+        half = np.array([rng.uniform(3.0, 7.0), rng.uniform(3.0, 7.0), rng.uniform(3.0, 9.0)])
+        middle = targets[len(targets) // 2]
+        centers.append([middle[0] + distance_m * np.cos(angle), middle[1] + distance_m * np.sin(angle), half[2]])
+        halves.append(half)
+        colors.append(rng.integers(90, 200, 3))
+        kinds.append(KINDS["Buildings"])
+    k = int(0.6 * len(targets))
+    between = targets[k, :2] + 0.12 * (positions[k, :2] - targets[k, :2])
+    centers.append([*between, 1.5])
+    halves.append(np.array([0.6, 0.6, 1.5]))
+    colors.append(np.array([120, 110, 100]))
+    kinds.append(KINDS["Walls"])
+    ids = np.arange(1, len(centers) + 1)
+    return Scene(np.array(centers), np.array(halves), np.array(colors, np.uint8), np.array(kinds), ids)
+
+
+def _annotate(scene: Scene, target: np.ndarray, position: np.ndarray, rotation: np.ndarray, camera: Camera) -> tuple:
+    """Give bbox (4,), uv (2,), z-depth and visibility of the person; NaN where out of view."""
+    pose = world_from_camera(position, rotation)
+    uv, depth = project(target[None], pose, camera.intrinsic)
+    corners, _ = project(box_corners(target, np.array(PERSON_HALF_EXTENTS_M)), pose, camera.intrinsic)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    size = np.array([camera.width_px, camera.height_px])
+    if not (np.isfinite(corners).all() and (high > 0).all() and (low < size).all()):
+        return np.full(4, np.nan), np.full(2, np.nan), float(depth[0]), 0.0
+    box = np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)])
+    return box, uv[0], float(depth[0]), _visible_share(scene, target, position)
+
+
+def _visible_share(scene: Scene, target: np.ndarray, position: np.ndarray) -> float:
+    """Share of points along the body's axis that no box hides from the drone."""
+    points = target + np.linspace(-0.8, 0.8, 9)[:, None] * np.array([0.0, 0.0, 1.0])
+    directions = points - position
+    near, far = _slabs(scene.centers, scene.half_extents, position, directions)
+    hidden = ((near <= far) & (near > 0) & (near < 1)).any(axis=1)
+    return float(1.0 - hidden.mean())
+
+
+def _slabs(centers: np.ndarray, halves: np.ndarray, origin: np.ndarray, directions: np.ndarray) -> tuple:
+    """Entry and exit parameters (n, k) of n rays and k boxes."""
+    safe = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+    one = ((centers - halves)[None] - origin) / safe[:, None]
+    two = ((centers + halves)[None] - origin) / safe[:, None]
+    return np.minimum(one, two).max(axis=2), np.maximum(one, two).min(axis=2)
+
+
+def paint(scene: Scene, flight: Flight, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Give rgb (h, w, 3) uint8, depth (h, w) float32, semantic kinds (h, w) and ids (h, w) of one frame."""
+    camera = flight.camera
+    h, w = camera.height_px, camera.width_px
+    u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(h * w)], axis=1) @ np.linalg.inv(camera.intrinsic).T
+    pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
+    directions = rays @ pose[:3, :3].T  # camera z is 1, so the parameter along the ray is the z-depth
+    origin = pose[:3, 3]
+    centers = np.vstack([scene.centers, flight.targets_m[i]])
+    halves = np.vstack([scene.half_extents, PERSON_HALF_EXTENTS_M])
+    colors = np.vstack([scene.colors, [200, 40, 40]])
+    kinds = np.append(scene.kinds, KINDS["Pedestrians"])
+    ids = np.append(scene.ids, PERSON_ID)
+    near, far = _slabs(centers, halves, origin, directions)
+    near = np.where((near <= far) & (near > 0), near, np.inf)
+    with np.errstate(divide="ignore"):
+        ground = np.where(directions[:, 2] < 0, -origin[2] / directions[:, 2], np.inf)
+    hit, first = near.min(axis=1), near.argmin(axis=1)
+    on_box = hit < ground
+    depth = np.minimum(hit, ground)
+    is_sky = depth > SKY_DEPTH_M
+    points = origin + directions * np.where(is_sky, 0.0, depth)[:, None]
+    checks = (np.floor(points[:, 0] / 2) + np.floor(points[:, 1] / 2)) % 2
+    rgb = np.where(checks[:, None] == 0, [96, 110, 90], [110, 122, 100])
+    rgb = np.where(on_box[:, None], colors[first], rgb)
+    rgb = np.where(is_sky[:, None], [150, 180, 220], rgb)
+    semantic = np.where(is_sky, KINDS["Sky"], np.where(on_box, kinds[first], KINDS["Terrain"]))
+    instance = np.where(on_box & ~is_sky, ids[first], 0)
+    depth = np.where(is_sky, SKY_DEPTH_M, depth).astype(np.float32)
+    return (
+        rgb.reshape(h, w, 3).astype(np.uint8),
+        depth.reshape(h, w),
+        semantic.reshape(h, w).astype(np.uint8),
+        instance.reshape(h, w).astype(np.uint16),
+    )
+
+
+def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
+    rgb, depth, semantic, instance = paint(scene, flight, i)
+    folder.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(folder / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    np.save(folder / "depth.npy", depth)
+    # OpenCV writes B, G, R: id high byte, id low byte, semantic tag.
+    coded = np.stack([(instance >> 8).astype(np.uint8), (instance & 255).astype(np.uint8), semantic], axis=-1)
+    cv2.imwrite(str(folder / "instance.png"), coded)
+    meta = {
+        "schema": "cosfly.frame",
+        "schema_version": "1.0",
+        "index": i,
+        "visibility": float(flight.visibility[i]),
+        "target_id": PERSON_ID,
+    }
+    write_json(folder / "meta.json", meta)

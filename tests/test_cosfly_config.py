@@ -1,0 +1,76 @@
+"""Settings: strict, all problems at once, the nearest name."""
+
+import pytest
+from pydantic import Field
+
+from cosfly.config import Config, apply_overrides, load, shipped
+from cosfly.errors import ConfigError
+
+
+class Inner(Config):
+    altitude_m: float = Field(20.0, gt=0, description="")
+
+
+class Outer(Config):
+    seed: int = Field(0, description="")
+    plan: Inner = Field(default_factory=Inner, description="")
+
+
+def test_defaults_then_file_then_overrides(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("seed: 3\nplan: {altitude_m: 30}\n")
+    assert load(Outer, None).plan.altitude_m == 20.0
+    assert load(Outer, file).plan.altitude_m == 30.0
+    assert load(Outer, file, ["plan.altitude_m=40"]) == Outer(seed=3, plan=Inner(altitude_m=40))
+
+
+def test_all_problems_at_once_with_the_nearest_name(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("sed: 3\nplan: {altitud_m: 30, altitude_m: -1}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(Outer, file)
+    text = str(caught.value)
+    for words in (
+        "did you mean 'seed'",
+        "plan.altitud_m: unknown setting (did you mean 'altitude_m'?)",
+        "greater than 0",
+        "3 to mend",
+        "c.yaml",
+    ):
+        assert words in text
+
+
+@pytest.mark.parametrize("override", ["novalue", "=3", "seed=[", "seed.x=1"])
+def test_bad_overrides(override):
+    with pytest.raises(ConfigError):
+        load(Outer, None, [override])
+
+
+def test_overrides_do_not_touch_their_input():
+    data = {"plan": {"altitude_m": 1}}
+    assert apply_overrides(data, ["plan.altitude_m=2"]) == {"plan": {"altitude_m": 2}}
+    assert data == {"plan": {"altitude_m": 1}}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1, 2]", "not a mapping"),
+        ("a: [", "not valid YAML"),
+        ("a: !!python/object/apply:os.system ['x']", "not valid YAML"),
+    ],
+)
+def test_bad_files(tmp_path, text, words):
+    file = tmp_path / "c.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        load(Outer, file)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml.*No such file"):
+        load(Outer, tmp_path / "nowhere.yaml")
+
+
+def test_shipped_files_are_found():
+    assert shipped("__init__.py").exists()

@@ -1,0 +1,104 @@
+"""The project's one convention for space."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from cosfly.geometry import (
+    axis_aligned_half_extents,
+    box_corners,
+    focal_px,
+    intrinsic_matrix,
+    look_at,
+    mirror_positions,
+    mirror_rotations,
+    project,
+    rotation_matrix,
+    world_from_camera,
+    wrap_deg,
+)
+
+angles = st.floats(-180, 180)
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "yaw_deg", "roll_deg", "body", "world"),
+    [
+        (0, 0, 0, (1, 0, 0), (1, 0, 0)),
+        (0, 90, 0, (1, 0, 0), (0, 1, 0)),  # yaw is counter-clockwise: forward turns from east to north
+        (90, 0, 0, (1, 0, 0), (0, 0, 1)),  # pitch is nose-up
+        (0, 0, 90, (0, 1, 0), (0, 0, 1)),  # roll is right-side-down: left goes up
+        (-45, 90, 0, (1, 0, 0), (0, np.sqrt(0.5), -np.sqrt(0.5))),
+    ],
+)
+def test_rotation_table(pitch_deg, yaw_deg, roll_deg, body, world):
+    matrix = rotation_matrix(*np.radians([pitch_deg, yaw_deg, roll_deg]))
+    assert_allclose(matrix @ body, world, atol=1e-12)
+
+
+@given(angles, angles, angles)
+def test_rotation_is_the_stated_product(pitch, yaw, roll):
+    p, y, r = np.radians([pitch, yaw, roll])
+    rz = np.array([[np.cos(y), -np.sin(y), 0], [np.sin(y), np.cos(y), 0], [0, 0, 1]])
+    ry = np.array([[np.cos(-p), 0, np.sin(-p)], [0, 1, 0], [-np.sin(-p), 0, np.cos(-p)]])
+    rx = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
+    assert_allclose(rotation_matrix(p, y, r), rz @ ry @ rx, atol=1e-12)
+
+
+@given(angles, st.floats(-89, 89))
+def test_look_at_puts_the_target_in_the_middle(yaw, pitch):
+    eye = np.array([3.0, -2.0, 25.0])
+    target = eye + 17.0 * rotation_matrix(np.radians(pitch), np.radians(yaw), 0.0)[:, 0]
+    pitch_rad, yaw_rad = look_at(eye, target)
+    pose = world_from_camera(eye, np.degrees([pitch_rad, yaw_rad, 0.0]))
+    uv, z = project(target[None], pose, intrinsic_matrix(1280, 720, 90))
+    assert_allclose(uv[0], (640, 360), atol=1e-6)
+    assert_allclose(z[0], 17.0)
+
+
+def test_image_axes():
+    """A point to the left is left in the image, a higher point is higher, and behind is nowhere."""
+    pose = world_from_camera(np.zeros(3), np.zeros(3))  # looks east
+    uv, z = project(np.array([[10.0, 1, 0], [10, 0, 1], [-10, 0, 0]]), pose, intrinsic_matrix(1280, 720, 90))
+    assert uv[0, 0] < 640
+    assert uv[1, 1] < 360
+    assert np.isnan(uv[2]).all()
+    assert z[2] == -10
+
+
+@pytest.mark.parametrize(("fov_deg", "focal"), [(90, 640.0), (60, 1108.51), (30, 2388.51), (110, 448.13)])
+def test_focal_length_follows_the_formula(fov_deg, focal):
+    assert_allclose(focal_px(1280, fov_deg), focal, atol=0.01)
+
+
+def test_axis_aligned_extents():
+    turned = axis_aligned_half_extents(np.array([[2.0, 1.0, 3.0]] * 2), np.array([[0, 90.0, 0], [0, 45.0, 0]]))
+    assert turned[0].tolist() == [1.0, 2.0, 3.0]  # a quarter turn is exact
+    assert_allclose(turned[1, :2], 3 / np.sqrt(2))
+
+
+@given(angles, angles, angles)
+def test_axis_aligned_extents_enclose_the_corners(pitch, yaw, roll):
+    half = np.array([2.0, 1.0, 3.0])
+    corners = box_corners(np.zeros(3), half) @ rotation_matrix(*np.radians([pitch, yaw, roll])).T
+    enclosing = axis_aligned_half_extents(half[None], np.array([[pitch, yaw, roll]]))[0]
+    assert_allclose(np.abs(corners).max(axis=0), enclosing, atol=1e-9)
+
+
+def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
+    """A scene mirrored with its camera is the mirror picture of the scene: nothing else changes at the door."""
+    point, eye, rotation = np.array([12.0, 5.0, 1.0]), np.array([0.0, 1.0, 20.0]), np.array([-40.0, 25.0, 0.0])
+    assert_allclose(mirror_positions(mirror_positions(point)), point)
+    assert_allclose(mirror_rotations(mirror_rotations(rotation)), rotation)
+    k = intrinsic_matrix(1280, 720, 90)
+    uv, z = project(point[None], world_from_camera(eye, rotation), k)
+    mirrored = world_from_camera(mirror_positions(eye), mirror_rotations(rotation))
+    uv_mirrored, z_mirrored = project(mirror_positions(point)[None], mirrored, k)
+    assert_allclose(z, z_mirrored)
+    assert_allclose(uv_mirrored, [[1280 - uv[0, 0], uv[0, 1]]])
+
+
+def test_wrap():
+    assert wrap_deg(np.array([180.0, -180.0, 541.0])).tolist() == [-180.0, -180.0, -179.0]

@@ -1,0 +1,220 @@
+"""The playback tree: strict and tolerant reading, axes at the door, unknown keys in a round trip."""
+
+import copy
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from cosfly.errors import InputError
+from cosfly.geometry import project, world_from_camera
+from cosfly.playback import (
+    COLUMNS,
+    find_flights,
+    read_depth,
+    read_flight,
+    read_instance,
+    read_meta,
+    read_rgb,
+    sample_id,
+    write_flight,
+)
+from specimens import PERSON_ID, make_playback_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=6)
+
+
+@pytest.fixture
+def clean(tree):
+    return find_flights(tree)[0]
+
+
+def rewrite(folder, target, change):
+    """Copy a trajectory file to another flight folder, changed."""
+    value = json.loads((folder / "trajectory.json").read_text())
+    change(value)
+    new = target / "Town01" / folder.parent.name / folder.name
+    new.mkdir(parents=True, exist_ok=True)
+    (new / "trajectory.json").write_text(json.dumps(value))
+    return new
+
+
+def test_what_we_write_is_strictly_valid(tree):
+    for folder in find_flights(tree):
+        flight = read_flight(folder, strict=True)
+        assert flight.issues == ()
+        assert flight.missing_frames() == []
+
+
+def test_axes_are_carlas_on_disk_and_right_handed_in_memory(clean):
+    flight = read_flight(clean)
+    raw = json.loads((clean / "trajectory.json").read_text())
+    pose = raw["points"][2]["drone_pose"]
+    assert_allclose(flight.positions_m[2], [pose["x"], -pose["y"], pose["z"]])
+    assert_allclose(flight.rotations_deg[2], [pose["pitch"], -pose["yaw"], pose["roll"]])
+    assert raw["coordinates"]["handedness"] == "left"
+
+
+def test_poses_and_pictures_agree(tree):
+    """Re-projection self-test: pose, intrinsics and target give the stored pixel; the person is there in the mask."""
+    seen = 0
+    for folder in find_flights(tree):
+        flight = read_flight(folder)
+        for i in np.flatnonzero(flight.target_visible):
+            uv, z = project(
+                flight.targets_m[i][None],
+                world_from_camera(flight.positions_m[i], flight.rotations_deg[i]),
+                flight.camera.intrinsic,
+            )
+            assert_allclose(uv[0], flight.target_uv[i], atol=1e-6)
+            assert_allclose(z[0], flight.target_depth_m[i], atol=1e-6)
+            kinds, ids = read_instance(flight.frame_folder(i))
+            rows, columns = np.nonzero(ids == PERSON_ID)
+            assert set(kinds[rows, columns].tolist()) == {12}
+            assert abs(columns.mean() - uv[0, 0]) < 4
+            assert abs(rows.mean() - uv[0, 1]) < 4
+            seen += 1
+    assert seen > 3
+
+
+def test_round_trip_keeps_unknown_keys_and_numbers(clean, tmp_path):
+    def change(value):
+        value["from_the_future"] = {"a": [1, 2, None]}
+        value["points"][1]["sensor_7"] = "x"
+        value["points"][1]["target"]["bone_count"] = 31
+        value["points"][2]["target"]["bbox_2d"] = [1, 2, 3, 4]  # the older list form
+
+    folder = rewrite(clean, tmp_path / "a", change)
+    first = json.loads((folder / "trajectory.json").read_text())
+    flight = read_flight(folder)
+    assert flight.target_bbox[2].tolist() == [1, 2, 3, 4]
+    target = tmp_path / "b" / "Town01" / folder.parent.name / folder.name
+    target.mkdir(parents=True)
+    write_flight(target, flight)
+    assert json.loads((target / "trajectory.json").read_text()) == first
+    again = read_flight(target)
+    for name in COLUMNS:
+        assert_array_equal(getattr(again, name), getattr(flight, name))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: v.update(schema="x"), "schema.*'x'"),
+        (lambda v: v.update(schema_version="6.9.0"), "schema_version"),
+        (lambda v: v.update(trace_dir="other"), "trace_dir"),
+        (lambda v: v["points"][3].update(index=7), r"points\[3\].index"),
+        (lambda v: v["points"][2]["nav_waypoint"].update(t1_world=[0, 0, 0]), r"points\[2\].nav_waypoint"),
+        (lambda v: v["points"][-1]["nav_waypoint"].update(t1_world=[0, 0, 0]), "null at the last point"),
+        (lambda v: v["points"][4]["timing"].update(trace_timestamp=9), "steps of"),
+        (lambda v: v["points"][4].pop("target"), "target.*missing"),
+    ],
+)
+def test_strict_raises_and_tolerant_notes(clean, tmp_path, change, words):
+    if "steps" in words:  # keep time increasing: only the step is wrong
+
+        def change(v):
+            v["points"][-1]["timing"]["trace_timestamp"] += 3
+
+    folder = rewrite(clean, tmp_path, change)
+    with pytest.raises(InputError, match=words):
+        read_flight(folder, strict=True)
+    flight = read_flight(folder, strict=False)
+    assert any(__import__("re").search(words, issue) for issue in flight.issues)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: v.update(points=[]), "no points"),
+        (lambda v: v["points"][1]["drone_pose"].update(x="a"), r"points\[1\].drone_pose.x"),
+        (lambda v: v["points"][1]["drone_pose"].pop("yaw"), r"points\[1\].drone_pose.yaw"),
+        (lambda v: v["points"][1]["timing"].update(trace_timestamp=-5), "time does not increase"),
+        (lambda v: v["camera"].update(intrinsic=[[1, 0], [0, 1]]), "intrinsic"),
+        (lambda v: v.pop("camera"), "camera"),
+    ],
+)
+def test_what_even_the_tolerant_reader_refuses(clean, tmp_path, change, words):
+    folder = rewrite(clean, tmp_path, change)
+    for strict in (True, False):
+        with pytest.raises(InputError, match=words):
+            read_flight(folder, strict=strict)
+
+
+def test_older_names_are_read_tolerantly(clean, tmp_path):
+    def change(value):
+        value["waypoints"] = value.pop("points")
+        for point in value["waypoints"]:
+            point["timing"] = {"timestamp": point["timing"]["trace_timestamp"]}
+            for name in ("pitch", "roll"):
+                point["drone_pose"].pop(name)
+
+    flight = read_flight(rewrite(clean, tmp_path, change), strict=False)
+    assert len(flight) == 6
+    assert (flight.rotations_deg[:, 0] == 0).all()
+
+
+def test_the_known_answer_of_the_public_release(clean, tmp_path):
+    """trajectory_1777083733: points 0 to 1 differ by (-3.123, -2.072, -1.600) m/s (CARLA axes) and -3.13 deg over 0.5 s."""
+
+    def change(value):
+        first, second = (p["drone_pose"] for p in value["points"][:2])
+        second.update(
+            {k: first[k] + 0.5 * v for k, v in zip("xyz", (-3.123, -2.072, -1.600), strict=True)},
+            yaw=first["yaw"] - 3.13,
+        )
+
+    flight = read_flight(rewrite(clean, tmp_path, change), strict=False)
+    assert_allclose((flight.positions_m[1] - flight.positions_m[0]) / 0.5, [-3.123, 2.072, -1.600])
+    assert_allclose(flight.rotations_deg[1, 1] - flight.rotations_deg[0, 1], 3.13)  # a turn to the left
+
+
+def test_truncated_keeps_the_chosen_points(clean, tmp_path):
+    flight = read_flight(clean)
+    short = flight.truncated(np.array([0, 2, 4]))
+    assert short.time_s.tolist() == flight.time_s[[0, 2, 4]].tolist()
+    folder = tmp_path / "Town01" / flight.trajectory / "ORI"
+    folder.mkdir(parents=True)
+    write_flight(folder, replace(short, raw=copy.deepcopy(short.raw)))
+    assert len(read_flight(folder, strict=False)) == 3
+
+
+def test_names():
+    assert sample_id("trajectory_1776047127_ORI", 4) == "trajectory_1776047127_ORI_frame_00004"
+
+
+def test_not_a_tree(tmp_path):
+    with pytest.raises(InputError, match=r"no trajectory\.json"):
+        find_flights(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        find_flights(tmp_path / "nowhere")
+
+
+def test_damaged_frames_are_named(clean, tmp_path):
+    frame = tmp_path / "frame_00000"
+    frame.mkdir()
+    for read, name in (
+        (read_rgb, "rgb.png"),
+        (read_instance, "instance.png"),
+        (read_depth, "depth.npy"),
+        (read_meta, "meta.json"),
+    ):
+        with pytest.raises(InputError, match=name):
+            read(frame)
+        (frame / name).write_bytes(b"not what it should be")
+        with pytest.raises(InputError, match=name):
+            read(frame)
+    np.save(frame / "depth.npy", np.array([{"code": "object arrays need pickle"}]), allow_pickle=True)
+    with pytest.raises(InputError, match=r"depth\.npy"):
+        read_depth(frame)
+    np.save(frame / "depth.npy", np.zeros((2, 2)))
+    with pytest.raises(InputError, match="float64"):
+        read_depth(frame)
+    cv2.imwrite(str(frame / "rgb.png"), np.full((2, 3, 4), (10, 20, 30, 255), np.uint8))
+    assert read_rgb(frame)[0, 0].tolist() == [30, 20, 10]  # alpha is left out, channels are RGB

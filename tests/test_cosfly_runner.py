@@ -1,0 +1,148 @@
+"""Items to work: resume, tally, failures, dying workers."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from cosfly.errors import InputError, StorageError
+from cosfly.runner import Item, Outcome, rng_for, run_items
+from cosfly.store import Journal, StageFolder, dump_json
+
+
+def make_worker(log: Path):
+    """A stand-in stage: the payload says what happens; every call leaves a line."""
+
+    def work(item: Item) -> Outcome:
+        with open(log, "a") as file:
+            file.write(item.item_id + "\n")
+        action, value = item.payload
+        if action == "drop":
+            return Outcome(drop_reason=value)
+        if action == "fail":
+            raise InputError("broken", where=item.item_id, got=value)
+        if action == "bug":
+            raise KeyError(value)
+        if action == "full":
+            raise StorageError("disk full", where="there")
+        if action == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Outcome({"square": value**2, "draw": float(rng_for(1, "demo", item.item_id).random())})
+
+    return work
+
+
+def _stage(path: Path) -> StageFolder:
+    return StageFolder.open(path, "demo", config={}, inputs={}, seed=0)
+
+
+def _items(*payloads):
+    return [Item(f"i{k}", payload) for k, payload in enumerate(payloads)]
+
+
+MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"), ("drop", "short"))
+
+
+def test_everything_is_counted(tmp_path):
+    finished = run_items(_stage(tmp_path / "s"), _items(*MIXED), make_worker, (tmp_path / "log",))
+    assert finished.tally.as_dict() == {
+        "input": 6,
+        "kept": 2,
+        "dropped": {"short": 2},
+        "failed": {"bug": 1, "input": 1},
+    }
+    assert [item_id for item_id, _ in finished.results()] == ["i0", "i3"]
+    failures = (tmp_path / "s/failures.jsonl").read_text()
+    assert "got x" in failures
+    assert "KeyError" in failures
+
+
+def test_worker_count_does_not_matter(tmp_path):
+    def products(workers: int):
+        stage = _stage(tmp_path / f"s{workers}")
+        finished = run_items(stage, _items(*MIXED), make_worker, (tmp_path / "log",), workers=workers)
+        return dump_json([{k: v for k, v in r.items() if k != "seconds"} for r in finished.records]), finished.tally
+
+    assert products(1) == products(2)
+
+
+def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
+    stage, log = _stage(tmp_path / "s"), tmp_path / "log"
+    first = run_items(stage, _items(*MIXED), make_worker, (log,))
+    log.unlink()
+    second = run_items(stage, _items(*MIXED), make_worker, (log,))
+    assert log.read_text().split() == ["i2", "i4"]
+    assert second.tally == first.tally
+
+
+def test_a_dying_worker_costs_only_its_item(tmp_path):
+    payloads = [("keep", k) for k in range(5)]
+    payloads[2] = ("die", 0)
+    finished = run_items(_stage(tmp_path / "s"), _items(*payloads), make_worker, (tmp_path / "log",), workers=2)
+    assert finished.tally.as_dict() == {"input": 5, "kept": 4, "dropped": {}, "failed": {"worker_died": 1}}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_fatal_error_stops_and_keeps_what_was_done(tmp_path, workers):
+    stage = _stage(tmp_path / "s")
+    items = _items(("keep", 1), ("keep", 2), *[("full", 0)] * 4)
+    with pytest.raises(StorageError, match="disk full"):
+        run_items(stage, items, make_worker, (tmp_path / "log",), workers=workers)
+    assert all(r["status"] == "kept" for r in stage.journal.read())
+
+
+def make_broken_worker():
+    raise InputError("no such map", where="map.json")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_in_the_factory_is_the_stages_error(tmp_path, workers):
+    with pytest.raises(InputError, match="no such map"):
+        run_items(_stage(tmp_path / "s"), _items(("keep", 1), ("keep", 2)), make_broken_worker, workers=workers)
+
+
+def test_rng_depends_on_all_three_and_zero_is_a_seed():
+    draws = {rng_for(*key).random() for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}
+    assert len(draws) == 4
+    assert rng_for(0, "a", "x").random() == rng_for(0, "a", "x").random()
+
+
+def make_slow_worker():
+    def work(item: Item) -> Outcome:
+        time.sleep(0.05)
+        return Outcome({"value": item.payload})
+
+    return work
+
+
+def test_kill_and_resume(tmp_path):
+    """kill -9 in the middle: the second run does the rest, and the outcome is that of an undisturbed run."""
+    program = textwrap.dedent(
+        f"""
+        import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from pathlib import Path
+        from test_cosfly_runner import _stage, make_slow_worker
+        from cosfly.runner import Item, run_items
+        run_items(_stage(Path({str(tmp_path / "s")!r})), [Item(str(k), k) for k in range(60)], make_slow_worker)
+        """
+    )
+    child = subprocess.Popen([sys.executable, "-c", program])
+    journal = Journal(tmp_path / "s/items.jsonl")
+    deadline_s = time.monotonic() + 60
+    while sum(1 for _ in journal.read()) < 5:
+        assert child.poll() is None
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    child.kill()
+    child.wait()
+    done = {r["id"] for r in journal.read()}
+    assert 5 <= len(done) < 60
+    items = [Item(str(k), k) for k in range(60)]
+    finished = run_items(_stage(tmp_path / "s"), items, make_slow_worker)
+    assert [r["result"]["value"] for r in finished.records] == list(range(60))
+    assert sum(1 for _ in journal.read()) == 60  # nothing was done twice

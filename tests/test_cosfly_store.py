@@ -1,0 +1,172 @@
+"""Files that are never half written."""
+
+import errno
+import os
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly import store
+from cosfly.errors import InputError, ResumeError, StorageError, VerifyError
+from cosfly.store import Journal, StageFolder, Tally, inside, read_json, write_bytes, write_json
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    write_json(path, {"old": 1})
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match=r"a\.json.*No space left.*free some space"):
+        write_json(path, {"new": 2})
+    assert read_json(path) == {"old": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]  # no litter
+
+
+def test_nan_is_never_a_value(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    (tmp_path / "b.json").write_text('{"x": NaN}')
+    with pytest.raises(InputError, match=r"b\.json.*NaN"):
+        read_json(tmp_path / "b.json")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000])
+def test_malformed_json_is_one_line(tmp_path, text):
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_json(path, what="map")
+    assert "x.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_names_stay_inside(tmp_path):
+    assert inside(tmp_path, "a/b") == tmp_path.resolve() / "a/b"
+    for name in ("../x", "/etc/passwd", "a/../../x"):
+        with pytest.raises(InputError, match="leads out"):
+            inside(tmp_path, name)
+
+
+@given(st.lists(st.dictionaries(st.text(max_size=5), st.text(max_size=20), max_size=3), max_size=6), st.data())
+def test_a_journal_cut_anywhere_keeps_its_whole_lines(tmp_path_factory, records, data):
+    path = tmp_path_factory.mktemp("journal") / "j.jsonl"
+    with Journal(path) as journal:
+        for record in records:
+            journal.append(record, sync=False)
+    whole = path.read_bytes() if records else b""
+    cut = data.draw(st.integers(0, len(whole)))
+    path.write_bytes(whole[:cut])
+    expected = records[: whole[:cut].count(b"\n")]
+    assert list(Journal(path).read()) == expected
+    with Journal(path) as journal:  # and it can be continued
+        journal.append({"next": 1})
+    assert list(Journal(path).read()) == [*expected, {"next": 1}]
+
+
+def test_a_damaged_line_is_counted(tmp_path):
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        for i in range(3):
+            journal.append({"i": i})
+    text = path.read_bytes().replace(b'{"i":1}', b'{"i":7}')
+    path.write_bytes(text)
+    journal = Journal(path)
+    assert list(journal.read()) == [{"i": 0}, {"i": 2}]
+    assert journal.num_damaged == 1
+
+
+def test_a_tally_that_does_not_add_up_is_a_bug():
+    Tally(3, 1, {"short": 1}, {"input": 1}).check()
+    with pytest.raises(AssertionError, match="2 outcomes for 3 items"):
+        Tally(3, 1, {"short": 1}, {}).check()
+
+
+def _open(out, **changes):
+    arguments = {"config": {"a": {"b": 1}}, "inputs": {}, "seed": 0, **changes}
+    return StageFolder.open(out, "demo", **arguments)
+
+
+def test_stage_life(tmp_path):
+    source, out = tmp_path / "in.json", tmp_path / "out"
+    write_json(source, {"x": 1})
+    stage = _open(out, inputs={"map": source})
+    assert not stage.is_complete
+    write_json(out / "product.json", {"y": 2})
+    stage.finish([out / "product.json"], Tally(1, 1), extra_fact=7)
+    again = _open(out, inputs={"map": source})
+    assert again.is_complete
+    assert again.manifest()["extra_fact"] == 7
+    assert again.manifest()["counts"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"config": {"a": {"b": 2}}}, "a.b was 1, is 2"),
+        ({"seed": 5}, "seed was 0, is 5"),
+        ({"config": {"a": {}}}, "a.b was 1"),
+    ],
+)
+def test_other_settings_are_named(tmp_path, changes, words):
+    _open(tmp_path / "out")
+    with pytest.raises(ResumeError, match=words):
+        _open(tmp_path / "out", **changes)
+    forced = _open(tmp_path / "out", **changes, resume="force")
+    assert words in str(read_json(forced.path / "stage.json")["resumed_with_other"])
+    with pytest.raises(ResumeError, match="already holds work"):
+        _open(tmp_path / "out", **changes, resume="never")
+
+
+def test_a_changed_input_is_named(tmp_path):
+    source = tmp_path / "in.json"
+    write_json(source, 1)
+    _open(tmp_path / "out", inputs={"map": source})
+    write_json(source, 2)
+    with pytest.raises(ResumeError, match="the input map"):
+        _open(tmp_path / "out", inputs={"map": source})
+
+
+def test_foreign_files_are_not_touched(tmp_path):
+    (tmp_path / "thesis.txt").write_text("x")
+    with pytest.raises(ResumeError, match="not cosfly's"):
+        _open(tmp_path)
+
+
+def test_a_missing_product_of_a_complete_stage_is_found(tmp_path):
+    stage = _open(tmp_path / "out")
+    write_json(stage.path / "product.json", 1)
+    stage.finish([stage.path / "product.json"], Tally())
+    (stage.path / "product.json").unlink()
+    with pytest.raises(VerifyError, match=r"product\.json"):
+        _open(tmp_path / "out")
+
+
+def test_partials_of_a_kill_are_swept(tmp_path):
+    stage = _open(tmp_path / "out")
+    (stage.path / ".x.json.1.partial").write_text("half")
+    (stage.path / ".flight.1.partial").mkdir()
+    _open(tmp_path / "out")
+    assert sorted(p.name for p in stage.path.iterdir()) == ["stage.json"]
+
+
+def test_atomic_folder(tmp_path):
+    with pytest.raises(ZeroDivisionError), store.atomic_folder(tmp_path / "f") as partial:
+        write_bytes(partial / "a", bytes(1 // 0))
+    assert list(tmp_path.iterdir()) == []
+    with store.atomic_folder(tmp_path / "f") as partial:
+        write_bytes(partial / "a", b"1")
+        assert not (tmp_path / "f").exists()
+    assert (tmp_path / "f/a").read_bytes() == b"1"
+
+
+def test_checksums_round_trip(tmp_path):
+    digests = {"b/c.txt": "0" * 64, "a.txt": "f" * 64}
+    store.write_checksums(tmp_path, digests)
+    assert store.read_checksums(tmp_path) == digests
+    (tmp_path / store.CHECKSUMS).write_text(f"{'0' * 64}  ../../evil\n")
+    with pytest.raises(InputError, match="leads out"):
+        store.read_checksums(tmp_path)
