@@ -1,0 +1,176 @@
+"""The shortest way over a grid of free cells: exact A* with octile costs and no corner cutting.
+
+A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3). Path costs are
+kept as two whole numbers, straight and diagonal steps, so that equal costs compare as equal whatever the order of
+the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+SQRT2 = math.sqrt(2.0)
+
+# Directions 0-3 straight, 4-7 diagonal.
+_STEP_X = np.array([1, 0, -1, 0, 1, -1, -1, 1], dtype=np.int64)
+_STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
+
+_UNSEEN, _OPEN, _CLOSED = 0, 1, 2
+
+
+def find_route(free: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
+    """Find a cheapest route between two cells.
+
+    Args:
+        free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
+    Returns:
+        (k, 2) int64 cells from start to goal, both included (k is 1 if they are the same); None if there is no route.
+    Raises:
+        ValueError: `free` is not a contiguous array of bool, or an end lies off the grid or on a cell that is not free.
+    """
+    if free.ndim != 2 or free.dtype != np.bool_ or not free.flags.c_contiguous:
+        raise ValueError("free must be a contiguous two-dimensional array of bool")
+    num_y, num_x = free.shape
+    for name, (x, y) in (("start", start), ("goal", goal)):
+        if not (0 <= x < num_x and 0 <= y < num_y):
+            raise ValueError(f"{name} {(int(x), int(y))} lies off the grid of {num_x} x {num_y} cells")
+        if not free[y, x]:
+            raise ValueError(f"{name} {(int(x), int(y))} is not a free cell")
+    # Zeroed pages come from the system untouched, so a search pays for the cells it sees and not for the grid.
+    state = np.zeros(free.size, dtype=np.uint8)
+    steps = np.empty((free.size, 2), dtype=np.int32)
+    from_direction = np.empty(free.size, dtype=np.int8)
+    origin, target = int(start[1]) * num_x + int(start[0]), int(goal[1]) * num_x + int(goal[0])
+    if not _search(free, origin, target, state, steps, from_direction):
+        return None
+    return _trace_back(from_direction, num_x, origin, target)
+
+
+def route_cost(cells: np.ndarray) -> float:
+    """Give the octile cost of a route of neighbouring cells, (k, 2), in cell widths."""
+    is_diagonal = (np.diff(cells, axis=0) != 0).all(axis=1)
+    num_diagonal = int(np.count_nonzero(is_diagonal))
+    return len(is_diagonal) - num_diagonal + num_diagonal * SQRT2
+
+
+@numba.njit(cache=True)
+def _search(free, origin, target, state, steps, from_direction):  # pragma: no cover (compiled)
+    """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2)."""
+    num_y, num_x = free.shape
+    target_x, target_y = target % num_x, target // num_x
+    heap_key = np.empty(
+        (1024, 2), dtype=np.float64
+    )  # estimated total cost, then cost still to go: depth first in a tie
+    heap_cell = np.empty(1024, dtype=np.int64)
+    size = 0
+
+    state[origin] = _OPEN
+    steps[origin, 0] = steps[origin, 1] = 0
+    from_direction[origin] = -1
+    heap_key, heap_cell, size = _push(heap_key, heap_cell, size, 0.0, 0.0, origin)
+    while size > 0:
+        cell = heap_cell[0]
+        size = _pop(heap_key, heap_cell, size)
+        if state[cell] == _CLOSED:
+            continue  # a dearer entry of a cell that was improved since
+        state[cell] = _CLOSED
+        if cell == target:
+            return True
+        x, y = cell % num_x, cell // num_x
+        for direction in range(8):
+            next_x, next_y = x + _STEP_X[direction], y + _STEP_Y[direction]
+            if next_x < 0 or next_y < 0 or next_x >= num_x or next_y >= num_y or not free[next_y, next_x]:
+                continue
+            if direction >= 4 and not (free[y, next_x] and free[next_y, x]):
+                continue
+            neighbour = next_y * num_x + next_x
+            if state[neighbour] == _CLOSED:
+                continue
+            straight = steps[cell, 0] + (1 if direction < 4 else 0)
+            diagonal = steps[cell, 1] + (1 if direction >= 4 else 0)
+            if state[neighbour] == _OPEN:
+                known = steps[neighbour, 0] + steps[neighbour, 1] * SQRT2
+                if straight + diagonal * SQRT2 >= known:
+                    continue
+            state[neighbour] = _OPEN
+            steps[neighbour, 0], steps[neighbour, 1] = straight, diagonal
+            from_direction[neighbour] = direction
+            apart_x, apart_y = abs(target_x - next_x), abs(target_y - next_y)
+            left_diagonal = min(apart_x, apart_y)
+            left_straight = max(apart_x, apart_y) - left_diagonal
+            total = (straight + left_straight) + (diagonal + left_diagonal) * SQRT2
+            to_go = left_straight + left_diagonal * SQRT2
+            heap_key, heap_cell, size = _push(heap_key, heap_cell, size, total, to_go, neighbour)
+    return False
+
+
+@numba.njit(cache=True)
+def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (compiled)
+    """Add an entry to the heap, growing it when full; gives the arrays and the new size."""
+    if size == len(heap_cell):
+        grown_key, grown_cell = np.empty((2 * size, 2)), np.empty(2 * size, dtype=np.int64)
+        for k in range(size):
+            grown_key[k, 0], grown_key[k, 1], grown_cell[k] = heap_key[k, 0], heap_key[k, 1], heap_cell[k]
+        heap_key, heap_cell = grown_key, grown_cell
+    place = size
+    while place > 0:
+        parent = (place - 1) // 2
+        if not _is_before(total, to_go, heap_key[parent, 0], heap_key[parent, 1]):
+            break
+        _move(heap_key, heap_cell, parent, place)
+        place = parent
+    heap_key[place, 0], heap_key[place, 1], heap_cell[place] = total, to_go, cell
+    return heap_key, heap_cell, size + 1
+
+
+@numba.njit(cache=True)
+def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
+    """Remove the first entry of the heap; gives the new size."""
+    size -= 1
+    total, to_go, cell = heap_key[size, 0], heap_key[size, 1], heap_cell[size]
+    place = 0
+    while True:
+        child = 2 * place + 1
+        if child >= size:
+            break
+        other = child + 1
+        if other < size and _is_before(heap_key[other, 0], heap_key[other, 1], heap_key[child, 0], heap_key[child, 1]):
+            child = other
+        if not _is_before(heap_key[child, 0], heap_key[child, 1], total, to_go):
+            break
+        _move(heap_key, heap_cell, child, place)
+        place = child
+    heap_key[place, 0], heap_key[place, 1], heap_cell[place] = total, to_go, cell
+    return size
+
+
+@numba.njit(cache=True)
+def _move(heap_key, heap_cell, source, place):  # pragma: no cover (compiled)
+    heap_key[place, 0], heap_key[place, 1] = heap_key[source, 0], heap_key[source, 1]
+    heap_cell[place] = heap_cell[source]
+
+
+@numba.njit(cache=True)
+def _is_before(total, to_go, other_total, other_to_go):  # pragma: no cover (compiled)
+    return total < other_total or (total == other_total and to_go < other_to_go)
+
+
+@numba.njit(cache=True)
+def _trace_back(from_direction, num_x, origin, target):  # pragma: no cover (compiled)
+    """Follow the directions from the target to the origin; gives the cells in walking order, (k, 2)."""
+    count, cell = 1, target
+    while cell != origin:
+        direction = from_direction[cell]
+        cell -= _STEP_Y[direction] * num_x + _STEP_X[direction]
+        count += 1
+    cells = np.empty((count, 2), dtype=np.int64)
+    cell = target
+    for k in range(count - 1, -1, -1):
+        cells[k, 0], cells[k, 1] = cell % num_x, cell // num_x
+        if k > 0:
+            direction = from_direction[cell]
+            cell -= _STEP_Y[direction] * num_x + _STEP_X[direction]
+    return cells

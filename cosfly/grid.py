@@ -1,0 +1,345 @@
+"""The ground as cells: which ones a person can stand on, and which of those hang together.
+
+Boxes become occupied cells (Step 3 of the paper), occupied cells grow by a safety radius, a region of interest cuts out
+what is left, and connected parts of it are labelled. Nothing here samples or searches; see pedestrians.py and astar.py.
+Arrays are indexed [y_index, x_index]; cell (x_index, y_index) covers one square of `resolution_m`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import cv2
+import numba
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.geometry import rotation_matrices
+from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, Roi
+
+RESOLUTION_M = 0.5  # tab:ped_params
+HUMAN_HEIGHT_M = 2.0  # tab:ped_params
+TOUCH_M = 1e-6  # maps are written to a micrometre: a face that enters a cell by less only touches it
+MIN_HALF_EXTENT_M = 2 * TOUCH_M  # a wall without thickness still blocks the cells it stands in
+SURFACE_REACH_M = 1.0  # kerbs, lawns and carriageways differ by less; a flyover lies higher
+MAX_CELLS = 400_000_000  # 10 km x 10 km at 0.5 m; more is a stray box, or a resolution too fine for the memory
+
+WATER = KINDS["Water"]
+_CORNER_SIGNS = np.array(
+    [[x, y, z] for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))], dtype=np.float64
+)
+_EDGES = np.array(
+    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)], dtype=np.int64
+)
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Cells over the ground plane.
+
+    x_min_m, y_min_m: the low corner of cell (0, 0), world. occupied: (ny, nx) bool.
+    """
+
+    x_min_m: float
+    y_min_m: float
+    resolution_m: float
+    occupied: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Cells along x and along y, as in "a 1238 x 1013 grid"."""
+        return self.occupied.shape[1], self.occupied.shape[0]
+
+    def cells_at(self, points_m: np.ndarray) -> np.ndarray:
+        """Give (..., 2) int64 x and y indices of (..., 2) world points: floor((x - x_min) / resolution). May lie outside."""
+        origin = np.array([self.x_min_m, self.y_min_m])
+        return np.floor((np.asarray(points_m, dtype=np.float64)[..., :2] - origin) / self.resolution_m).astype(np.int64)
+
+    def centers_of(self, cells: np.ndarray) -> np.ndarray:
+        """Give (..., 2) world points in the middle of (..., 2) cells (x index, y index)."""
+        origin = np.array([self.x_min_m, self.y_min_m])
+        return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + origin
+
+    def contains(self, cells: np.ndarray) -> np.ndarray:
+        """Tell which of (..., 2) cells lie on the grid."""
+        cells = np.asarray(cells)
+        return np.all((cells >= 0) & (cells < np.array(self.size)), axis=-1)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How two grids over the same cells compare: equal cells / all cells, and intersection / union of the occupied ones."""
+
+    cell_agreement: float
+    iou: float
+
+
+# --- boxes to cells ---------------------------------------------------------------------------------------------------
+
+
+def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
+    """Give a free grid over the bounds of all boxes, whatever their kind.
+
+    Raises:
+        ValueError: the map is empty or the resolution is not positive.
+        InputError: the grid would have more than MAX_CELLS cells.
+    """
+    if len(box_map) == 0:
+        raise ValueError("a grid needs at least one box")
+    if not resolution_m > 0:
+        raise ValueError(f"resolution_m must be positive, got {resolution_m}")
+    low, high = box_map.bounds()
+    num_x, num_y = (max(1.0, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
+    if num_x * num_y > MAX_CELLS:
+        raise InputError(
+            "the map is too wide for a grid",
+            where=box_map.name,
+            got=f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m",
+            expected=f"at most {MAX_CELLS} cells",
+            fix="remove the box that lies far out, or take a coarser resolution_m",
+        )
+    return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
+
+
+def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, ground_z_m: float = 0.0) -> np.ndarray:
+    """Tell which boxes stand in a person's way, (n,) bool.
+
+    A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval does not
+    count. Surfaces (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
+    """
+    is_in_interval = (box_map.maxs[:, 2] > ground_z_m + TOUCH_M) & (
+        box_map.mins[:, 2] < ground_z_m + height_m - TOUCH_M
+    )
+    is_ground = np.isin(box_map.kinds, np.array(sorted(GROUND_KINDS), dtype=np.uint8))
+    return (is_in_interval & ~is_ground) | (box_map.kinds == WATER)
+
+
+def occupancy(
+    box_map: BoxMap,
+    *,
+    resolution_m: float = RESOLUTION_M,
+    height_m: float = HUMAN_HEIGHT_M,
+    ground_z_m: float = 0.0,
+    like: OccupancyGrid | None = None,
+) -> OccupancyGrid:
+    """Mark the cells that boxes stand on.
+
+    The rule is conservative: a cell is occupied if the part of a box between the ground and `height_m` covers any of its area,
+    however little (more than TOUCH_M deep). Boxes are rasterised exactly as they are turned, not as their axis-aligned bounds.
+
+    Args:
+        like: take this grid's cells instead of the map's own bounds (its occupied cells and `resolution_m` are ignored), so
+            that two maps can be compared; what lies outside is left out.
+    Returns:
+        a grid, (ny, nx).
+    Source: Step 3 of the paper (sec:step3).
+    """
+    grid = empty_grid(box_map, resolution_m) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
+    boxes = box_map.select(blocks_walking(box_map, height_m=height_m, ground_z_m=ground_z_m))
+    is_water = boxes.kinds == WATER
+    lows = np.where(is_water, -np.inf, ground_z_m)
+    highs = np.where(is_water, np.inf, ground_z_m + height_m)
+    _mark(boxes, lows, highs, grid)
+    return grid
+
+
+def surface(
+    box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: OccupancyGrid, ground_z_m: float = 0.0
+) -> np.ndarray | None:
+    """Tell over which cells of a grid the map has ground to stand on.
+
+    Args:
+        kinds: what counts as ground; a box does if its top lies within SURFACE_REACH_M of the ground plane.
+    Returns:
+        (ny, nx) bool, cells that such a box overlaps; None if the map holds no such box, so that it does not say.
+    """
+    is_level = np.abs(box_map.maxs[:, 2] - ground_z_m) <= SURFACE_REACH_M
+    boxes = box_map.select(is_level & np.isin(box_map.kinds, np.array(sorted(kinds), dtype=np.uint8)))
+    if len(boxes) == 0:
+        return None
+    grid = replace(like, occupied=np.zeros_like(like.occupied))
+    _mark(boxes, np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf), grid)
+    return grid.occupied
+
+
+def _mark(boxes: BoxMap, lows: np.ndarray, highs: np.ndarray, grid: OccupancyGrid) -> None:
+    """Mark the cells under the slices of boxes between two heights each, (n,) m."""
+    turns = rotation_matrices(np.radians(boxes.rotations_deg))
+    extents = np.maximum(boxes.half_extents, MIN_HALF_EXTENT_M)
+    corners = np.einsum("nij,nkj->nki", turns, _CORNER_SIGNS * extents[:, None]) + boxes.centers[:, None]
+    corners[..., :2] = (corners[..., :2] - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
+    is_upright = np.abs(turns[:, 2, 2]) > 1.0 - 1e-12
+    _rasterise(corners, lows, highs, is_upright, TOUCH_M / grid.resolution_m, grid.occupied)
+
+
+@numba.njit(cache=True)
+def _rasterise(corners, lows, highs, is_upright, touch, occupied):  # pragma: no cover (compiled)
+    """Mark the cells under the slices of boxes; corners (n, 8, 3) with x and y in cells, z in m."""
+    points = np.empty((8 + 2 * len(_EDGES), 2))
+    for box in range(len(corners)):
+        if is_upright[box]:
+            count = 4
+            for k in range(4):
+                points[k, 0], points[k, 1] = corners[box, k, 0], corners[box, k, 1]
+        else:
+            count = _slice_points(corners, box, lows[box], highs[box], points)
+        if count > 0:
+            _fill_hull(points, count, touch, occupied)
+
+
+@numba.njit(cache=True)
+def _slice_points(corners, box, low, high, points):  # pragma: no cover (compiled)
+    """Collect points whose hull is the footprint of a box between two heights: corners inside, and edges cut."""
+    count = 0
+    for k in range(8):
+        if low <= corners[box, k, 2] <= high:
+            points[count, 0], points[count, 1] = corners[box, k, 0], corners[box, k, 1]
+            count += 1
+    for edge in range(len(_EDGES)):
+        a, b = _EDGES[edge, 0], _EDGES[edge, 1]
+        za, zb = corners[box, a, 2], corners[box, b, 2]
+        for end in range(2):
+            height = low if end == 0 else high
+            if (za < height) != (zb < height):  # never at an infinite height
+                t = (height - za) / (zb - za)
+                for axis in range(2):
+                    points[count, axis] = corners[box, a, axis] + t * (corners[box, b, axis] - corners[box, a, axis])
+                count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
+    """Mark the cells that the convex hull of the first `count` points (k, 2), in cells, overlaps.
+
+    The part of a convex shape inside one row of cells spans one interval of x, and exactly the cells that meet the interval
+    overlap the shape. The ends of the interval lie on points or on lines between two of them, so the hull is never built.
+    """
+    num_y = len(occupied)
+    bottom, top = np.inf, -np.inf
+    for i in range(count):
+        bottom, top = min(bottom, points[i, 1]), max(top, points[i, 1])
+    # Limits are cut as floats: far points do not fit an integer.
+    first, stop_row = int(max(0.0, np.floor(bottom + touch))), int(max(0.0, min(float(num_y), np.ceil(top - touch))))
+    for row in range(first, stop_row):
+        low, high = row + touch, row + 1.0 - touch
+        left, right = np.inf, -np.inf
+        for i in range(count):
+            xi, yi = points[i, 0], points[i, 1]
+            if low <= yi <= high:
+                left, right = min(left, xi), max(right, xi)
+            for j in range(i):
+                xj, yj = points[j, 0], points[j, 1]
+                for end in range(2):
+                    y = low if end == 0 else high
+                    if (yi < y) != (yj < y):
+                        x = xi + (y - yi) / (yj - yi) * (xj - xi)
+                        left, right = min(left, x), max(right, x)
+        if left <= right:
+            _fill_row(occupied, row, np.floor(left + touch), np.ceil(right - touch))
+
+
+@numba.njit(cache=True)
+def _fill_row(mask, row, start, stop):  # pragma: no cover (compiled)
+    """Mark the cells of a row from start up to stop, whole numbers as floats, as far as they lie on the grid."""
+    for column in range(int(max(0.0, start)), int(max(0.0, min(float(mask.shape[1]), stop)))):
+        mask[row, column] = True
+
+
+def compare(one: OccupancyGrid, other: OccupancyGrid) -> Agreement:
+    """Compare two grids over the same cells; two grids without an occupied cell have an IoU of 1.
+
+    Raises:
+        ValueError: the grids do not cover the same cells.
+    """
+    same = (one.x_min_m, one.y_min_m, one.resolution_m) == (other.x_min_m, other.y_min_m, other.resolution_m)
+    if not same or one.occupied.shape != other.occupied.shape:
+        raise ValueError("the grids do not cover the same cells; make one `like` the other")
+    union = int(np.count_nonzero(one.occupied | other.occupied))
+    intersection = int(np.count_nonzero(one.occupied & other.occupied))
+    return Agreement(1.0 - (union - intersection) / one.occupied.size, intersection / union if union else 1.0)
+
+
+# --- cells to walkable ground -----------------------------------------------------------------------------------------
+
+
+def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
+    """Grow the occupied cells by an exact disc.
+
+    A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m adds
+    the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
+
+    Raises:
+        ValueError: the radius is negative.
+    """
+    if not radius_m >= 0:
+        raise ValueError(f"radius_m must not be negative, got {radius_m}")
+    radius = radius_m / grid.resolution_m + 1e-9
+    reach = int(radius)
+    if reach == 0:
+        return grid
+    offsets = np.arange(-reach, reach + 1)
+    disc = (offsets[:, None] ** 2 + offsets**2 <= radius**2).astype(np.uint8)
+    return replace(grid, occupied=cv2.dilate(grid.occupied.view(np.uint8), disc).view(bool))
+
+
+def roi_mask(grid: OccupancyGrid, roi: Roi) -> np.ndarray:
+    """Tell which cells have their centre in a region of interest, (ny, nx) bool.
+
+    In one of its polygons is enough; in a polygon means in its outer ring and in none of its holes. A ring that crosses itself is
+    read by the even-odd rule.
+    """
+    mask = np.zeros(grid.occupied.shape, dtype=bool)
+    for polygon in roi.rings():
+        inside = _ring_mask(grid, polygon.points_world)
+        for hole in polygon.holes:
+            inside &= ~_ring_mask(grid, hole)
+        mask |= inside
+    return mask
+
+
+def _ring_mask(grid: OccupancyGrid, ring: list[tuple[float, float]]) -> np.ndarray:
+    points = (np.array(ring, dtype=np.float64) - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
+    mask = np.zeros(grid.occupied.shape, dtype=bool)
+    _fill_ring(points, mask)
+    return mask
+
+
+@numba.njit(cache=True)
+def _fill_ring(points, mask):  # pragma: no cover (compiled)
+    """Mark the cells whose centre lies in a ring (k, 2) in cells, by the even-odd rule."""
+    crossings = np.empty(len(points))
+    for row in range(len(mask)):
+        y = row + 0.5
+        count = 0
+        for i in range(len(points)):
+            xi, yi, xj, yj = points[i, 0], points[i, 1], points[i - 1, 0], points[i - 1, 1]
+            if (yi <= y) != (yj <= y):
+                x = xi + (y - yi) / (yj - yi) * (xj - xi)
+                place = count  # insertion keeps the few crossings in order
+                while place > 0 and crossings[place - 1] > x:
+                    crossings[place] = crossings[place - 1]
+                    place -= 1
+                crossings[place] = x
+                count += 1
+        for k in range(0, count - 1, 2):
+            _fill_row(mask, row, np.ceil(crossings[k] - 0.5), np.ceil(crossings[k + 1] - 0.5))
+
+
+def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Label connected free cells.
+
+    Args:
+        free: (ny, nx) bool; connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves exactly
+            within 4-connected parts: each of its diagonal steps has two straight ones beside it.
+    Returns:
+        labels (ny, nx) int32, 0 where not free; sizes (num_labels,) int64 in cells, sizes[0] = 0.
+    """
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(
+        np.ascontiguousarray(free).view(np.uint8), connectivity=connectivity, ltype=cv2.CV_32S
+    )
+    sizes = statistics[:, cv2.CC_STAT_AREA].astype(np.int64)
+    sizes[0] = 0
+    return labels, sizes

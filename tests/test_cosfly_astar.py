@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from cosfly.astar import SQRT2, find_route, route_cost
+from cosfly.grid import connected_parts
+
+
+def free_cells(text: str) -> np.ndarray:
+    """Make a grid from rows of text, row 0 first: # blocks."""
+    return np.array([[mark != "#" for mark in row] for row in text.split()])
+
+
+def shortest_costs(free: np.ndarray, start: tuple[int, int]) -> np.ndarray:
+    """Give the optimal cost to every cell by another library, infinite where there is no route; (ny, nx)."""
+    num_y, num_x = free.shape
+    rows, columns, costs = [], [], []
+    for y in range(num_y):
+        for x in range(num_x):
+            for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+                a, b = x + dx, y + dy
+                if not (0 <= a < num_x and 0 <= b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]):
+                    continue
+                rows.append(y * num_x + x)
+                columns.append(b * num_x + a)
+                costs.append(np.hypot(dx, dy))
+    graph = coo_matrix((costs, (rows, columns)), shape=(free.size, free.size)).tocsr()
+    return dijkstra(graph, directed=False, indices=start[1] * num_x + start[0]).reshape(free.shape)
+
+
+def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
+    """List what is wrong with a route."""
+    found = []
+    for (x0, y0), (x1, y1) in zip(route[:-1].tolist(), route[1:].tolist(), strict=True):
+        if max(abs(x1 - x0), abs(y1 - y0)) != 1:
+            found.append(f"not neighbours: {(x0, y0)} {(x1, y1)}")
+        elif not (free[y0, x1] and free[y1, x0]):
+            found.append(f"cuts a corner: {(x0, y0)} {(x1, y1)}")
+    return found + [f"blocked: {(x, y)}" for x, y in route.tolist() if not free[y, x]]
+
+
+@pytest.mark.parametrize(
+    ("text", "start", "goal", "cost"),
+    [
+        ("....", (0, 0), (3, 0), 3.0),
+        (".... .... .... ....", (0, 0), (3, 3), 3 * SQRT2),
+        (".... .... .... ....", (3, 0), (0, 1), 2 + SQRT2),
+        (". . .", (0, 2), (0, 0), 2.0),
+        (".# ..", (0, 0), (1, 1), 2.0),  # the corner may not be cut
+        (".#. .#. ...", (0, 0), (2, 0), 6.0),
+        ("..... .###. .....", (0, 1), (4, 1), 6.0),
+    ],
+)
+def test_costs_by_hand(text, start, goal, cost):
+    free = free_cells(text)
+    route = find_route(free, start, goal)
+    assert route_cost(route) == pytest.approx(cost, abs=1e-12)
+    assert tuple(route[0]) == start
+    assert tuple(route[-1]) == goal
+    assert problems(free, route) == []
+
+
+def test_start_is_goal():
+    assert find_route(free_cells("..."), (1, 0), (1, 0)).tolist() == [[1, 0]]
+    assert route_cost(np.array([[1, 0]])) == 0.0
+
+
+@pytest.mark.parametrize("text", ["..#.. ..#.. ..#..", "..... ...## ...#."])
+def test_no_route_is_none(text):
+    free = free_cells(text)
+    assert find_route(free, (0, 0), (4, 2)) is None
+
+
+def test_two_cells_that_touch_by_a_corner_have_no_route():
+    assert find_route(free_cells(".# #."), (0, 0), (1, 1)) is None
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "words"),
+    [
+        ((1, 0), (2, 0), "start.*not a free"),
+        ((0, 0), (1, 0), "goal.*not a free"),
+        ((-1, 0), (2, 0), "start.*off the grid"),
+        ((0, 0), (3, 0), "goal.*off the grid"),
+        ((0, 0), (0, 1), "goal.*off the grid"),
+    ],
+)
+def test_bad_ends_are_value_errors(start, goal, words):
+    with pytest.raises(ValueError, match=words):
+        find_route(free_cells(".#."), start, goal)
+
+
+@pytest.mark.parametrize("free", [np.ones((4, 4)), np.ones(4, dtype=bool), np.ones((4, 4), dtype=bool).T[::2]])
+def test_bad_grids_are_value_errors(free):
+    with pytest.raises(ValueError, match="contiguous"):
+        find_route(free, (0, 0), (1, 1))
+
+
+def test_the_checker_finds_planted_faults():
+    free = free_cells("... .#. ...")
+    assert problems(free, np.array([[0, 0], [0, 1], [0, 2], [1, 2]])) == []
+    assert problems(free, np.array([[0, 0], [2, 0]])) == ["not neighbours: (0, 0) (2, 0)"]
+    assert problems(free, np.array([[0, 1], [1, 2]])) == ["cuts a corner: (0, 1) (1, 2)"]
+    assert "blocked: (1, 1)" in problems(free, np.array([[0, 1], [1, 1]]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**9), st.integers(1, 24), st.integers(1, 24), st.floats(0.0, 0.55))
+def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density):
+    rng = np.random.default_rng(seed)
+    free = rng.random((num_y, num_x)) >= density
+    start, goal = (tuple(rng.integers((num_x, num_y)).tolist()) for _ in range(2))
+    free[start[1], start[0]] = free[goal[1], goal[0]] = True
+    optimum = shortest_costs(free, start)[goal[1], goal[0]]
+    route = find_route(free, start, goal)
+    if route is None:
+        assert np.isinf(optimum)
+        return
+    assert route_cost(route) == pytest.approx(optimum, abs=1e-9)
+    assert problems(free, route) == []
+    assert route_cost(find_route(free, goal, start)) == pytest.approx(optimum, abs=1e-9)
+
+
+def test_a_large_maze_of_walls_is_solved_at_the_optimum():
+    free = np.ones((150, 160), dtype=bool)
+    for number, column in enumerate(range(8, 160, 8)):
+        free[:, column] = False
+        free[(3 if number % 2 else 146), column] = True
+    optimum = shortest_costs(free, (0, 0))[149, 159]
+    route = find_route(free, (0, 0), (159, 149))
+    assert np.isfinite(optimum)
+    assert route_cost(route) == pytest.approx(optimum, abs=1e-8)  # the other library adds up thousands of roundings
+    assert problems(free, route) == []
+
+
+def test_a_route_exists_exactly_within_a_part_of_four_neighbours():
+    rng = np.random.default_rng(8)
+    free = rng.random((30, 30)) < 0.6
+    parts, _ = connected_parts(free, 4)
+    cells = np.argwhere(free)[:, ::-1]
+    outcomes = set()
+    for _ in range(200):
+        start, goal = (tuple(cells[i].tolist()) for i in rng.integers(len(cells), size=2))
+        is_same_part = parts[start[1], start[0]] == parts[goal[1], goal[0]]
+        assert (find_route(free, start, goal) is not None) == is_same_part
+        outcomes.add(bool(is_same_part))
+    assert outcomes == {True, False}

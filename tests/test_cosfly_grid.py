@@ -1,0 +1,269 @@
+import itertools
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from cosfly.errors import InputError
+from cosfly.geometry import rotation_matrix
+from cosfly.grid import (
+    OccupancyGrid,
+    blocks_walking,
+    compare,
+    connected_parts,
+    empty_grid,
+    inflate,
+    occupancy,
+    roi_mask,
+    surface,
+)
+from cosfly.schema import KINDS, Roi, make_box_map
+
+BUILDINGS, WATER, ROADS = KINDS["Buildings"], KINDS["Water"], KINDS["Roads"]
+
+
+def grid_of(text: str) -> OccupancyGrid:
+    """Make a grid from rows of text, the first row at the north: # is occupied."""
+    rows = [[mark == "#" for mark in row] for row in text.split()]
+    return OccupancyGrid(0.0, 0.0, 1.0, np.array(rows[::-1]))
+
+
+def free_grid(num_x: int, num_y: int, resolution_m: float = 1.0, x_min_m: float = 0.0, y_min_m: float = 0.0):
+    return OccupancyGrid(x_min_m, y_min_m, resolution_m, np.zeros((num_y, num_x), dtype=bool))
+
+
+def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
+    return make_box_map([center], [half_extents], [rotation_deg], [kind])
+
+
+# --- cells and metres -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("point", "cell"), [((-10.0, 5.0), (0, 0)), ((-9.51, 5.49), (0, 0)), ((-9.5, 5.5), (1, 1)), ((0.0, 0.0), (20, -10))]
+)
+def test_world_to_cell_is_the_floor_of_the_papers_map(point, cell):
+    grid = free_grid(40, 40, 0.5, -10.0, 5.0)
+    assert tuple(grid.cells_at(np.array(point))) == cell
+
+
+@given(st.integers(-50, 50), st.integers(-50, 50), st.floats(0.1, 3.0), st.floats(-500, 500))
+def test_a_cells_center_lies_in_the_cell(x, y, resolution_m, x_min_m):
+    grid = free_grid(10, 20, resolution_m, x_min_m, -7.25)
+    assert tuple(grid.cells_at(grid.centers_of(np.array([x, y])))) == (x, y)
+
+
+def test_contains_knows_the_borders():
+    grid = free_grid(3, 2)
+    cells = np.array([[0, 0], [2, 1], [3, 1], [2, 2], [-1, 0]])
+    assert grid.contains(cells).tolist() == [True, True, False, False, False]
+
+
+def test_empty_grid_covers_the_bounds_and_no_more():
+    box_map = make_box_map([[0, 0, 0], [10, 5, 1]], [[2, 1, 0.1], [2, 1, 1]], np.zeros((2, 3)), [ROADS, BUILDINGS])
+    grid = empty_grid(box_map)
+    assert (grid.x_min_m, grid.y_min_m, grid.size) == (-2.0, -1.0, (28, 14))
+    assert not grid.occupied.any()
+
+
+def test_a_stray_box_is_an_error_and_not_a_memory_error():
+    box_map = make_box_map([[0, 0, 0], [1e9, 1e9, 0]], np.ones((2, 3)), np.zeros((2, 3)), [BUILDINGS] * 2)
+    with pytest.raises(InputError, match=r"too wide.*coarser resolution_m"):
+        empty_grid(box_map)
+
+
+def test_bad_arguments_are_value_errors():
+    box_map = one_box((0, 0, 0), (1, 1, 1))
+    with pytest.raises(ValueError, match="resolution_m"):
+        empty_grid(box_map, 0.0)
+    with pytest.raises(ValueError, match="at least one box"):
+        empty_grid(box_map.select(np.zeros(1, dtype=bool)))
+    with pytest.raises(ValueError, match="radius_m"):
+        inflate(free_grid(2, 2), -1.0)
+
+
+# --- which boxes, which cells -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bottom_m", "top_m", "kind", "blocks"),
+    [
+        (0.0, 3.0, BUILDINGS, True),
+        (-5.0, 0.0, BUILDINGS, False),  # ends at the ground
+        (-5.0, 0.1, BUILDINGS, True),
+        (2.0, 6.0, BUILDINGS, False),  # begins where the head ends
+        (1.9, 6.0, BUILDINGS, True),
+        (1.0, 1.0, BUILDINGS, True),  # a plate without thickness at chest height
+        (0.0, 0.0, BUILDINGS, False),  # and on the ground
+        (-0.2, 0.3, ROADS, False),
+        (-4.0, -1.0, WATER, True),
+        (0.0, 1.0, WATER, True),
+    ],
+)
+def test_only_boxes_at_a_persons_height_block(bottom_m, top_m, kind, blocks):
+    box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
+    assert blocks_walking(box_map).tolist() == [blocks]
+    assert occupancy(box_map).occupied.any() == blocks
+
+
+def test_a_box_on_cell_borders_fills_its_cells_and_no_neighbour():
+    grid = occupancy(one_box((3, 2, 1), (1, 1, 1)), like=free_grid(6, 4))
+    expected = grid_of("...... ..##.. ..##.. ......")
+    np.testing.assert_array_equal(grid.occupied, expected.occupied)
+
+
+def test_a_box_that_enters_a_cell_a_little_occupies_it():
+    grid = occupancy(one_box((3, 2, 1), (1.01, 0.99, 1)), like=free_grid(6, 4))
+    np.testing.assert_array_equal(grid.occupied, grid_of("...... .####. .####. ......").occupied)
+
+
+def test_a_wall_without_thickness_leaves_no_gap():
+    grid = occupancy(one_box((3, 2, 1), (0.0, 1.0, 1)), like=free_grid(6, 4))
+    np.testing.assert_array_equal(grid.occupied, grid_of("...... ..##.. ..##.. ......").occupied)
+
+
+def test_what_lies_outside_the_grid_is_left_out():
+    grid = occupancy(one_box((0, 0, 1), (2.5, 1.5, 1)), like=free_grid(3, 3))
+    np.testing.assert_array_equal(grid.occupied, grid_of("... ### ###").occupied)
+    assert not occupancy(one_box((90, 90, 1), (2, 2, 1)), like=free_grid(3, 3)).occupied.any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-3, 15), st.floats(-3, 15), st.floats(0.05, 6), st.floats(0.05, 6), st.floats(-180, 180))
+def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, yaw_deg):
+    grid = occupancy(one_box((x, y, 1), (half_x, half_y, 1), (0, yaw_deg, 0)), like=free_grid(12, 12))
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * [half_x, half_y]
+    turn = rotation_matrix(0.0, np.radians(yaw_deg), 0.0)[:2, :2]
+    footprint = shapely.Polygon(corners @ turn.T + [x, y])
+    for row, column in itertools.product(range(12), range(12)):
+        cell = shapely.box(column, row, column + 1, row + 1)
+        # Within twice the tolerance of a mere touch both answers are right.
+        if footprint.intersects(cell.buffer(-2e-6, join_style="mitre")):
+            assert grid.occupied[row, column]
+        elif not footprint.intersects(cell):
+            assert not grid.occupied[row, column]
+
+
+@pytest.mark.parametrize("rotation_deg", [(25, 40, 0), (70, -15, 33), (0, 10, 60), (-90, 20, 0)])
+def test_a_tilted_box_fills_what_its_slice_at_walking_height_covers(rotation_deg):
+    center, half_extents = np.array([6.3, 5.2, 2.9]), np.array([4.0, 1.3, 2.1])
+    grid = occupancy(one_box(center, half_extents, rotation_deg), like=free_grid(12, 11))
+    pitch, yaw, roll = np.radians(rotation_deg)
+    body_from_world = rotation_matrix(pitch, yaw, roll).T
+    sides = np.vstack([body_from_world, -body_from_world])
+    limits = np.concatenate([half_extents, half_extents]) + sides @ center
+    assert 0 < grid.occupied.sum() < grid.occupied.size
+    for row, column in itertools.product(range(11), range(12)):
+        bounds = [(column, column + 1), (row, row + 1), (0, 2)]
+        is_met = linprog([0, 0, 0], A_ub=sides, b_ub=limits, bounds=bounds).status == 0
+        assert grid.occupied[row, column] == is_met, (row, column)
+
+
+def test_one_more_box_never_frees_a_cell():
+    rng = np.random.default_rng(5)
+    rotations = np.column_stack([np.zeros(30), rng.uniform(0, 360, 30), np.zeros(30)])
+    centers = np.column_stack([rng.uniform(0, 40, (30, 2)), np.ones(30)])
+    box_map = make_box_map(centers, rng.uniform(0.1, 3, (30, 3)), rotations, [BUILDINGS] * 30)
+    frame = empty_grid(box_map)
+    before = occupancy(box_map.select(np.arange(29)), like=frame).occupied
+    assert (occupancy(box_map, like=frame).occupied | ~before).all()
+
+
+def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
+    box_map = make_box_map(
+        [[1, 1, -0.1], [3, 1, 6.0], [5, 1, 1.0]], [[1, 1, 0.1]] * 3, np.zeros((3, 3)), [ROADS, ROADS, BUILDINGS]
+    )
+    np.testing.assert_array_equal(surface(box_map, like=free_grid(6, 2)), grid_of("##.... ##....").occupied)
+    assert surface(box_map, [WATER], like=free_grid(6, 2)) is None
+
+
+# --- comparing --------------------------------------------------------------------------------------------------------
+
+
+def test_compare_by_hand():
+    agreement = compare(grid_of("##. ..."), grid_of("#.# ..."))
+    assert agreement.cell_agreement == pytest.approx(4 / 6)
+    assert agreement.iou == pytest.approx(1 / 3)
+    assert compare(free_grid(3, 3), free_grid(3, 3)).iou == 1.0
+
+
+@pytest.mark.parametrize("other", [free_grid(3, 2), free_grid(2, 2, 0.5), free_grid(2, 2, 1.0, 0.5)])
+def test_grids_over_other_cells_are_not_compared(other):
+    with pytest.raises(ValueError, match="same cells"):
+        compare(free_grid(2, 2), other)
+
+
+# --- growing, cutting out, connecting ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "expected"),
+    [
+        (0.4, "..... ..... ..#.. ..... ....."),
+        (0.5, "..... ..#.. .###. ..#.. ....."),
+        (0.7, "..... ..#.. .###. ..#.. ....."),
+        (0.75, "..... .###. .###. .###. ....."),
+        (1.0, "..#.. .###. ##### .###. ..#.."),
+    ],
+)
+def test_inflation_by_hand(radius_m, expected):
+    occupied = grid_of("..... ..... ..#.. ..... .....").occupied
+    grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m)
+    np.testing.assert_array_equal(grown.occupied, grid_of(expected).occupied)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0, 4))
+def test_inflation_equals_all_distances(seed, radius_m):
+    occupied = np.random.default_rng(seed).random((13, 17)) < 0.03
+    grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m).occupied
+    for y, x in itertools.product(range(13), range(17)):
+        distances_m = np.hypot(*(np.argwhere(occupied) - [y, x]).T) * 0.5
+        assert grown[y, x] == bool((distances_m <= radius_m + 1e-9).any())
+
+
+def test_roi_with_holes_and_several_rings_equals_shapely():
+    rng = np.random.default_rng(3)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 15))
+    star = np.column_stack([np.cos(angles), np.sin(angles)]) * rng.uniform(5, 14, 15)[:, None] + [14, 13]
+    hole = [(10.2, 10.1), (16.4, 11.3), (13.3, 17.2)]
+    poking = [(25.3, 2.2), (40.1, 2.2), (40.1, 9.4)]  # a hole that leaves its ring cuts only what is inside
+    square = [(20.1, 0.3), (29.4, 0.3), (29.4, 8.9), (20.1, 8.9)]
+    roi = Roi(
+        points_world=star.tolist(), holes=[hole], polygons=[{"points_world": square, "holes": [poking]}]
+    )  # the last ring may overlap the first: together they count as one region
+    grid = free_grid(60, 56, 0.5, -0.3, -0.7)
+    region = (shapely.Polygon(star) - shapely.Polygon(hole)) | (shapely.Polygon(square) - shapely.Polygon(poking))
+    centers = grid.centers_of(np.stack(np.meshgrid(np.arange(60), np.arange(56)), axis=-1))
+    expected = shapely.contains_xy(region, centers[..., 0], centers[..., 1])
+    np.testing.assert_array_equal(roi_mask(grid, roi), expected)
+    assert 0 < expected.sum() < expected.size
+
+
+def test_roi_in_the_papers_form_takes_cells_by_their_center():
+    roi = Roi(points_world=[(0.4, 0.4), (2.6, 0.4), (2.6, 1.4), (0.4, 1.4)])
+    np.testing.assert_array_equal(roi_mask(free_grid(4, 3), roi), grid_of(".... .... ###.").occupied)
+
+
+def test_roi_direction_does_not_matter():
+    ring = [(1.3, 0.2), (8.4, 3.3), (6.1, 9.2), (0.4, 5.1)]
+    grid = free_grid(10, 10)
+    np.testing.assert_array_equal(roi_mask(grid, Roi(points_world=ring)), roi_mask(grid, Roi(points_world=ring[::-1])))
+
+
+def test_a_corner_joins_eight_neighbours_but_not_four():
+    free = grid_of("##... ##... ..### ..###").occupied
+    labels, sizes = connected_parts(free, 8)
+    assert sizes.tolist() == [0, 10]
+    assert set(labels[free]) == {1}
+    assert set(labels[~free]) == {0}
+    assert sorted(connected_parts(free, 4)[1].tolist()) == [0, 4, 6]
+
+
+def test_nothing_free_has_no_parts():
+    labels, sizes = connected_parts(np.zeros((3, 4), dtype=bool), 8)
+    assert sizes.tolist() == [0]
+    assert not labels.any()

@@ -1,0 +1,427 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cosfly.astar import find_route
+from cosfly.config import build
+from cosfly.errors import ConfigError, CosflyError, NoPathError
+from cosfly.grid import OccupancyGrid
+from cosfly.pedestrians import (
+    Ground,
+    PedestriansConfig,
+    make_walk,
+    report,
+    run,
+    sample_goal,
+    sample_start,
+    walkable_ground,
+)
+from cosfly.runner import rng_for
+from cosfly.schema import DT_S, KINDS, Roi, make_box_map, read_boxes, read_paths, write_boxes
+from cosfly.store import Journal, dump_json
+
+BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
+
+
+def town(size_m: float = 160.0, *, walls: list = (), seed: int = 4):
+    """Make a square of ground with 40 turned houses and what else is given as (center, half_extents)."""
+    rng = np.random.default_rng(seed)
+    centers = [[size_m / 2, size_m / 2, -0.1], *np.column_stack([rng.uniform(0, size_m, (40, 2)), np.full(40, 3.0)])]
+    extents = [[size_m / 2, size_m / 2, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
+    yaws = [0.0, *rng.uniform(0, 360, 40), *[0.0] * len(walls)]
+    centers += [center for center, _ in walls]
+    extents += [half_extents for _, half_extents in walls]
+    rotations = np.column_stack([np.zeros(len(yaws)), yaws, np.zeros(len(yaws))])
+    return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * (len(yaws) - 1), header={"name": "Town"})
+
+
+def plain(size_m: float, *walls):
+    """Make a square of ground with walls only, given as (center, half_extents)."""
+    centers = [[size_m / 2, size_m / 2, -0.1]] + [center for center, _ in walls]
+    extents = [[size_m / 2, size_m / 2, 0.1]] + [half_extents for _, half_extents in walls]
+    return make_box_map(centers, extents, np.zeros((len(centers), 3)), [ROADS] + [BUILDINGS] * len(walls))
+
+
+def lawn(size_m: float):
+    box_map = plain(size_m)
+    box_map.kinds[0] = KINDS["Terrain"]
+    return box_map
+
+
+def ground_of(text: str) -> Ground:
+    """Make a ground from rows of part numbers, row 0 first."""
+    parts = np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32)
+    grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
+    return Ground(grid, grid, parts)
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    write_boxes(tmp_path / "step2_simplified.json", town())
+    return tmp_path / "step2_simplified.json"
+
+
+def write_roi(path: Path, points: list) -> Path:
+    path.write_text(json.dumps({"description": "", "closed": True, "points_world": points}))
+    return path
+
+
+# --- sampling ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_walkable_cell_starts_as_often():
+    ground = ground_of("0102 0000 1110 0000 0033")
+    rng = np.random.default_rng(0)
+    starts = [sample_start(ground, rng) for _ in range(7000)]
+    cells, counts = np.unique(np.array(starts), axis=0, return_counts=True)
+    assert {(x, y) for x, y in cells.tolist()} == {(x, y) for y, x in np.argwhere(ground.parts).tolist()}
+    assert abs(counts - 1000).max() < 150  # 5 standard deviations
+
+
+@pytest.mark.parametrize("start", [(0, 0), (4, 2), (6, 6)])
+def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
+    rng = np.random.default_rng(1)
+    parts = rng.integers(0, 3, (8, 9)).astype(np.int32)
+    parts[start[1], start[0]] = 2
+    expected = {
+        (x, y)
+        for y, x in np.argwhere(parts == 2).tolist()
+        if 2.5 <= np.hypot(x - start[0], y - start[1]) <= 5.0
+    }  # fmt: skip
+    drawn = [sample_goal(parts, start, 2.5, 5.0, rng) for _ in range(200 * len(expected))]
+    assert set(drawn) == expected
+    counts = np.unique(np.array(drawn), axis=0, return_counts=True)[1]
+    assert abs(counts - 200).max() < 75  # 5 standard deviations
+
+
+def test_no_goal_is_none():
+    ground = ground_of("1111 2222")
+    assert sample_goal(ground.parts, (0, 0), 3.5, 9.0, np.random.default_rng(0)) is None
+    assert sample_goal(ground.parts, (0, 0), 3.0, 9.0, np.random.default_rng(0)) == (3, 0)
+
+
+# --- the ground -------------------------------------------------------------------------------------------------------
+
+
+def test_counts_add_up_and_small_components_are_left_out():
+    # A wall cuts off 20 of 100 m: 0.5 m cells, wall of 2 and a margin of 1 on each side.
+    box_map = plain(100.0, ((20.5, 50.0, 1.0), (0.5, 50.0, 1.0)))
+    cfg = PedestriansConfig(min_component_cells=10_000)
+    ground = walkable_ground(box_map, cfg)
+    counts = ground.counts
+    assert counts["grid"] == [200, 200]
+    assert counts["cells_occupied"] == 2 * 200
+    assert counts["cells_inflated"] == 4 * 200
+    assert counts["cells_free"] == counts["cells_walkable"] == 196 * 200
+    assert (counts["components"], counts["components_used"]) == (2, 1)
+    assert counts["component_sizes_used"] == [157 * 200]
+    assert np.count_nonzero(ground.parts) == counts["cells_used"] == 157 * 200
+    assert not ground.parts[:, :43].any()
+
+
+def test_areas_that_touch_by_a_corner_are_one_component_but_two_parts():
+    # Two walls, one row of cells each, that meet in a corner at x = 19.5: so do the free areas on either side.
+    box_map = plain(40.0, ((9.75, 20.25, 1), (9.75, 0.25, 1)), ((29.75, 20.75, 1), (10.25, 0.25, 1)))
+    ground = walkable_ground(box_map, PedestriansConfig(safety_radius_m=0.0))
+    assert (ground.counts["components"], ground.counts["parts"]) == (1, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        start = sample_start(ground, rng)
+        goal = sample_goal(ground.parts, start, 20.0, 60.0, rng)
+        assert find_route(ground.walkable, start, goal) is not None
+
+
+def test_the_region_of_interest_bounds_every_walk():
+    roi = Roi(
+        points_world=[(10, 10), (150, 10), (150, 150), (10, 150)], holes=[[(60, 60), (100, 60), (100, 100), (60, 100)]]
+    )
+    ground = walkable_ground(town(), PedestriansConfig(), roi)
+    assert ground.counts["cells_in_roi"] == 280 * 280 - 80 * 80
+    walk = make_walk("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
+    for xy in walk.path.polyline_m:
+        assert (xy > 10).all()
+        assert (xy < 150).all()
+        assert not ((xy > 60) & (xy < 100)).all()
+
+
+def test_water_is_no_ground():
+    box_map = plain(100.0, ((50, 50, -3), (30, 30, 0.5)))
+    box_map.kinds[1] = WATER
+    ground = walkable_ground(box_map, PedestriansConfig())
+    assert not ground.parts[40:160, 40:160].any()
+
+
+@pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
+def test_people_walk_where_the_settings_say(ground, columns):
+    # 80 m of road, 40 m of lawn, 30 m of nothing up to a far wall; boxes of 30 m by 0.2 m.
+    kinds = [ROADS, KINDS["Terrain"], BUILDINGS]
+    box_map = make_box_map(
+        [[40, 50, -0.1], [100, 50, 0.1], [149.95, 50, 5]],
+        [[40, 50, 0.1], [20, 50, 0.1], [0.05, 50, 1]],
+        np.zeros((3, 3)),
+        kinds,
+    )
+    found = walkable_ground(box_map, PedestriansConfig(ground=ground))
+    assert np.count_nonzero(found.parts) == columns * 200
+    assert not found.parts[:, columns:].any()
+
+
+def test_a_map_without_ground_boxes_does_not_say_where_the_ground_is():
+    box_map = make_box_map([[0, 0, 1], [60, 60, 1]], np.ones((2, 3)), np.zeros((2, 3)), [BUILDINGS] * 2)
+    counts = walkable_ground(box_map, PedestriansConfig()).counts
+    assert counts["cells_with_surface"] is None
+    assert counts["cells_walkable"] == counts["cells_free"]
+
+
+@pytest.mark.parametrize(
+    ("box_map", "settings", "roi", "words"),
+    [
+        (plain(30.0, ((15, 15, 1), (15, 15, 1))), {}, None, "the map leaves no walkable cell.*1 boxes.*ground type"),
+        (plain(60.0), {}, [(100, 100), (120, 100), (120, 120)], "region of interest leaves no walkable cell.*got 0 of"),
+        (plain(30.0, ((15, 15, 1), (15, 15, 1))), {"safety_radius_m": 0.0}, None, "1 boxes"),
+        (plain(60.0, ((30, 30, 1), (30, 30, 1))), {"ground": "paved", "safety_radius_m": 0}, None, "the map leaves no"),
+        (lawn(60.0), {"ground": "paved"}, None, "ground that the settings want.*0 cells with.*set ground to surfaces"),
+        (plain(25.0), {}, None, "large enough.*2500 cells.*at least 4000 cells.*lower min_component_cells"),
+        (plain(60.0), {}, [(5, 5), (15, 5), (15, 15), (5, 15)], "large enough.*400 cells.*widen the region"),
+    ],
+)
+def test_no_ground_says_what_to_change(box_map, settings, roi, words):
+    with pytest.raises(NoPathError, match=words) as caught:
+        walkable_ground(
+            box_map,
+            PedestriansConfig(**settings),
+            roi and Roi(points_world=roi),
+            where="map.json",
+            roi_where="roi.json",
+        )
+    assert caught.value.where == ("roi.json" if roi else "map.json")
+
+
+# --- one walk ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_walk_keeps_every_promise(number):
+    cfg = PedestriansConfig()
+    ground = walkable_ground(town(), cfg)
+    path = make_walk(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).path
+    assert 50 <= np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]) <= 100
+    np.testing.assert_allclose(path.time_s, np.arange(len(path.time_s)) * DT_S)
+    np.testing.assert_allclose(path.positions_m[[0, -1], :2], path.polyline_m[[0, -1]], atol=1e-9)
+    assert (path.positions_m[:, 2] == 0).all()
+    assert ((path.speeds_mps > 0) & (path.speeds_mps <= 1.6)).all()
+    steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
+    assert steps_m.max() <= 1.6 * DT_S + 1e-9
+    x, y = ground.grid.cells_at(path.positions_m).T
+    assert not ground.grid.occupied[y, x].any()
+    x, y = ground.grid.cells_at(path.polyline_m).T
+    assert (ground.parts[y, x] == ground.parts[y[0], x[0]]).all()
+
+
+def test_a_walk_depends_on_its_own_random_numbers_only():
+    cfg = PedestriansConfig()
+    ground = walkable_ground(town(), cfg)
+    texts = [
+        dump_json(make_walk("p", ground, cfg, rng_for(seed, "pedestrians", name)).path.as_json())
+        for seed, name in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
+    ]
+    assert texts[0] == texts[1]
+    assert len(set(texts)) == 3
+
+
+def test_a_start_without_a_goal_is_given_up_and_counted():
+    # The yard on the left measures 35 m from corner to corner; every start in the field has a goal 40 m off.
+    ground = ground_of("\n".join(["1" * 20 + "0" + "2" * 84] * 30))
+    cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=40, max_distance_m=50)
+    walks = [make_walk("p", ground, cfg, np.random.default_rng(k)) for k in range(100)]
+    assert min(w.path.polyline_m[:, 0].min() for w in walks) > 21
+    assert 0.08 < np.mean([w.retries["no_goal"] > 0 for w in walks]) < 0.32  # 20 of 104 columns
+
+
+def test_a_detour_is_given_up_and_counted():
+    # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
+    ground = ground_of("\n".join(["1" * 100] * 5 + ["0" * 95 + "1" * 5] + ["1" * 100] * 5))
+    cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=4, max_distance_m=11, num_retries=50, max_detour=2.0)
+    walks = [make_walk("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
+    free_walks = [
+        make_walk("p", ground, cfg.model_copy(update={"max_detour": 0.0}), np.random.default_rng(k)) for k in range(40)
+    ]
+
+    def worst(walks):
+        lines = [w.path.polyline_m for w in walks]
+        return max(
+            np.linalg.norm(np.diff(p, axis=0), axis=1).sum() / np.linalg.norm(p[-1] - p[0]) for p in lines
+        )  # fmt: skip
+
+    assert worst(walks) <= 2.0 < worst(free_walks)
+    assert sum(w.retries["detour"] for w in walks) > 0
+    assert sum(w.retries["detour"] for w in free_walks) == 0
+
+
+def test_no_goal_for_any_start_is_an_error_that_names_the_path():
+    ground = ground_of("\n".join(["1" * 40] * 40))
+    with pytest.raises(
+        NoPathError, match=r"6 starts without a goal, 0 detours.*60 to 70 m.*lower min_distance_m"
+    ) as caught:
+        make_walk(
+            "path_00007",
+            ground,
+            PedestriansConfig(resolution_m=1.0, min_distance_m=60, max_distance_m=70),
+            np.random.default_rng(0),
+        )
+    assert caught.value.where == "path_00007"
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"min_distance_m": 100.0}, "min_distance_m 100.0 is not below"),
+        ({"min_speed_mps": 2.0}, "min_speed_mps 2.0 is above"),
+        ({"num_path": 3}, "num_path: unknown setting .did you mean 'num_paths'"),
+        ({"resolution_m": 0}, "resolution_m"),
+        ({"speed_jitter": 1.0}, "speed_jitter"),
+        ({"max_detour": 0.5}, "max_detour 0.5 is below 1"),
+    ],
+)
+def test_bad_settings_are_config_errors(settings, words):
+    with pytest.raises(ConfigError, match=words):
+        build(PedestriansConfig, settings, "test.yaml")
+
+
+def test_every_setting_is_described():
+    assert all(setting.description for setting in PedestriansConfig.model_fields.values())
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):
+    roi = write_roi(tmp_path / "roi.json", [[2, 2], [158, 2], [158, 140], [2, 140]])
+    product = run(PedestriansConfig(num_paths=3), map_file, tmp_path / "out", seed=7, roi=roi)
+    paths = read_paths(product)
+    assert [p.path_id for p in paths] == ["path_00000", "path_00001", "path_00002"]
+    header = json.loads(product.read_text())
+    assert (header["map"], header["seed"], header["dt_s"]) == ("Town", 7, 0.5)
+    facts = json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())
+    assert facts["total"]["paths"] == len(facts["paths"]) == 3
+    assert facts["total"]["points"] == sum(len(p.time_s) for p in paths)
+    assert facts["ground"]["cells_in_roi"] == 312 * 276
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["counts"] == {"input": 3, "kept": 3, "dropped": {}, "failed": {}}
+    steps = {"read", "grid", "project", "inflate", "connectivity", "sample", "astar", "report"}
+    assert set(manifest["seconds_by_step"]) == steps
+    picture = cv2.imread(str(tmp_path / "out" / "paths.png"))
+    assert picture.shape[1] == 1600
+    assert len(np.unique(picture[::7, ::7].reshape(-1, 3), axis=0)) > 5
+
+
+def products(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in ("path.json", "pedestrians_report.json", "paths.png")}
+
+
+def test_one_and_two_workers_and_a_second_run_give_the_same_bytes(map_file, tmp_path):
+    cfg = PedestriansConfig(num_paths=6)
+    run(cfg, map_file, tmp_path / "one")
+    run(cfg, map_file, tmp_path / "two", workers=2)
+    run(cfg, map_file, tmp_path / "other", seed=1)
+    assert products(tmp_path / "one") == products(tmp_path / "two")
+    assert products(tmp_path / "one") != products(tmp_path / "other")
+    written_ns = (tmp_path / "one" / "path.json").stat().st_mtime_ns
+    assert run(cfg, map_file, tmp_path / "one") == tmp_path / "one" / "path.json"
+    assert (tmp_path / "one" / "path.json").stat().st_mtime_ns == written_ns
+
+
+def test_fewer_paths_are_the_first_of_more(map_file, tmp_path):
+    few = read_paths(run(PedestriansConfig(num_paths=2), map_file, tmp_path / "few"))
+    more = read_paths(run(PedestriansConfig(num_paths=4), map_file, tmp_path / "more"))
+    assert [p.as_json() for p in few] == [p.as_json() for p in more[:2]]
+
+
+def test_killed_and_resumed_gives_the_same_bytes(map_file, tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from cosfly.pedestrians import PedestriansConfig, run\n"
+        "run(PedestriansConfig(num_paths=250), Path(sys.argv[1]), Path(sys.argv[2]))"
+    )
+    victim = subprocess.Popen([sys.executable, "-c", program, str(map_file), str(tmp_path / "killed")])
+    journal = tmp_path / "killed" / "items.jsonl"
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s and not (journal.exists() and journal.stat().st_size > 20_000):
+        time.sleep(0.001)
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.wait()
+    assert not (tmp_path / "killed" / "manifest.json").exists(), "the run ended before it was killed"
+    num_before = len(list(Journal(journal).read()))
+    assert 0 < num_before < 250
+    cfg = PedestriansConfig(num_paths=250)
+    run(cfg, map_file, tmp_path / "killed")
+    run(cfg, map_file, tmp_path / "whole")
+    assert products(tmp_path / "killed") == products(tmp_path / "whole")
+    assert len(list(Journal(journal).read())) == 250  # what was finished was not done again
+
+
+def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
+    # A yard of 40 m beside a field: starts in the yard have no goal 60 m off.
+    box_map = plain(
+        120.0,
+        ((41.0, 60.0, 1.0), (1.0, 60.0, 1.0)),
+        ((20.0, 41.0, 1.0), (20.0, 1.0, 1.0)),
+        ((20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
+    )
+    write_boxes(tmp_path / "map.json", box_map)
+    cfg = PedestriansConfig(num_paths=12, num_retries=0, min_distance_m=60)
+    product = run(cfg, tmp_path / "map.json", tmp_path / "out")
+    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
+    assert counts["failed"]["no_path"] > 0
+    assert counts["kept"] == len(read_paths(product)) > 0
+    assert counts["kept"] + counts["failed"]["no_path"] == 12
+    failures = [json.loads(line) for line in (tmp_path / "out" / "failures.jsonl").read_text().splitlines()]
+    assert len(failures) == counts["failed"]["no_path"]
+    assert json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())["failed"] == counts["failed"]
+
+
+def test_no_path_at_all_is_an_error_after_the_records_are_written(tmp_path):
+    write_boxes(tmp_path / "map.json", plain(40.0))
+    with pytest.raises(NoPathError, match=r"not one walk.*no_path 3.*path_00000"):
+        run(PedestriansConfig(num_paths=3, min_distance_m=60), tmp_path / "map.json", tmp_path / "out")
+    assert len((tmp_path / "out" / "failures.jsonl").read_text().splitlines()) == 3
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_a_region_off_the_map_is_an_error_that_names_its_file(map_file, tmp_path):
+    roi = write_roi(tmp_path / "roi.json", [[1000, 1000], [1100, 1000], [1100, 1100]])
+    with pytest.raises(CosflyError, match=r"roi\.json.*no walkable cell") as caught:
+        run(PedestriansConfig(), map_file, tmp_path / "out", roi=roi)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_report_sums_up_its_lines():
+    cfg = PedestriansConfig()
+    ground = walkable_ground(town(), cfg)
+    walks = [make_walk(f"p{k}", ground, cfg, np.random.default_rng(k)) for k in range(3)]
+    retries = [{"no_goal": 0, "detour": 2}, {"no_goal": 1, "detour": 0}, {"no_goal": 0, "detour": 1}]
+    total = report(ground, [w.path for w in walks], retries, {})["total"]
+    assert total["retries"] == {"no_goal": 1, "detour": 3}
+    assert total["cells"] == sum(len(w.path.polyline_m) for w in walks)
+    assert total["mean_speed_mps"] == pytest.approx(total["length_m"] / total["duration_s"], abs=1e-4)
+
+
+def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
+    from cosfly.maps.simworld import SimWorldConfig, load
+    from cosfly.simplify import SimplifyConfig, simplify
+
+    folder = shared_data / "simworld-progen"
+    city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))
+    write_boxes(tmp_path / "map.json", simplify(city, SimplifyConfig()).box_map)
+    product = run(PedestriansConfig(), tmp_path / "map.json", tmp_path / "out")
+    assert len(read_paths(product)) == 20
+    ground = json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())["ground"]
+    assert ground["component_sizes_used"][0] > 0.9 * ground["cells_walkable"]  # one large walkable component
+    assert len(read_boxes(tmp_path / "map.json")) == ground["boxes"]
