@@ -1,0 +1,425 @@
+"""Compiled geometry of many oriented boxes: distance, outward normal, blocked segments, five-ray visibility.
+
+`BoxIndex` sorts boxes into square cells of the xy plane, so that a query looks at the few boxes near it. Functions whose
+names say `..._box` or that take single coordinates are for other compiled code; those that take arrays check their arguments.
+Nothing here runs in parallel: the stages spread items over processes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cosfly.geometry import rotation_matrices
+from cosfly.schema import GROUND_KINDS, KINDS, BoxMap
+
+CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells
+MAX_CELLS = 1 << 18  # a map with a stray box a thousand kilometres away must not fill the memory
+
+# Nothing to fly into and nothing that hides a person: what people stand on, water, and labels without a body.
+NO_OBSTACLE_KINDS = GROUND_KINDS | {KINDS["Water"], KINDS["Sky"]}
+
+# Ends of the five rays relative to the target's hip point, m (subsec:appendix_planner_tastar).
+RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0.3, 0.0, 0.0], [-0.3, 0.0, 0.0]])
+RAY_SPREAD_M = 0.8  # the longest of the offsets
+
+
+class BoxIndex(NamedTuple):
+    """Oriented boxes and the cells that hold them; k boxes.
+
+    rows: (k, 21) m, one box in three cache lines: centre, half extents, world_from_box row by row, low and high corner of the
+    axis-aligned bounds. grid: (3,) low corner of cell (0, 0) and cell size, m. shape: (2,) cells along x and y.
+    starts: (cells + 1,) and members: (m,): cell c = ix * shape[1] + iy holds members[starts[c]:starts[c + 1]].
+    """
+
+    rows: np.ndarray
+    grid: np.ndarray
+    shape: np.ndarray
+    starts: np.ndarray
+    members: np.ndarray
+
+    @property
+    def num_boxes(self) -> int:
+        return len(self.rows)
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+
+def index_boxes(
+    centers: np.ndarray, half_extents: np.ndarray, rotations: np.ndarray, *, cell_m: float = CELL_M
+) -> BoxIndex:
+    """Sort boxes into cells.
+
+    Args:
+        centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map is vast.
+    Raises:
+        ValueError: a shape is wrong, a number is not finite, or a half extent is negative.
+    """
+    centers, half_extents = _points(centers, "centers"), _points(half_extents, "half_extents")
+    rotations = np.ascontiguousarray(rotations, dtype=np.float64)
+    if len(half_extents) != len(centers) or rotations.shape != (len(centers), 3, 3):
+        raise ValueError(f"shapes differ: {centers.shape}, {half_extents.shape}, {rotations.shape}")
+    if not (np.isfinite(rotations).all() and (half_extents >= 0).all() and cell_m > 0):
+        raise ValueError("rotations must be finite, half extents at least 0 and cell_m positive")
+    spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
+    mins, maxs = centers - spans, centers + spans
+    low = mins[:, :2].min(axis=0) if len(centers) else np.zeros(2)
+    size = maxs[:, :2].max(axis=0) - low if len(centers) else np.zeros(2)
+    while np.prod(np.floor(size / cell_m) + 1) > MAX_CELLS:
+        cell_m *= 2.0
+    shape = (np.floor(size / cell_m) + 1).astype(np.int64)
+    first = np.floor((mins[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
+    last = np.floor((maxs[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
+    starts, members = _fill_cells(first, last, shape)
+    rows = np.column_stack([centers, half_extents, rotations.reshape(-1, 9), mins, maxs])
+    return BoxIndex(np.ascontiguousarray(rows), np.array([low[0], low[1], cell_m]), shape, starts, members)
+
+
+def obstacle_index(box_map: BoxMap) -> BoxIndex:
+    """Index the boxes of a map that a drone can hit or that can hide a person (NO_OBSTACLE_KINDS left out)."""
+    solid = box_map.select(~np.isin(box_map.kinds, sorted(NO_OBSTACLE_KINDS)))
+    return index_boxes(solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg)))
+
+
+@njit(cache=True)
+def _fill_cells(first, last, shape):
+    """Give starts and members: a counting sort of boxes by cell, boxes in order within each cell."""
+    starts = np.zeros(shape[0] * shape[1] + 1, dtype=np.int64)
+    for box in range(len(first)):
+        for ix in range(first[box, 0], last[box, 0] + 1):
+            for iy in range(first[box, 1], last[box, 1] + 1):
+                starts[ix * shape[1] + iy + 1] += 1
+    for cell in range(len(starts) - 1):
+        starts[cell + 1] += starts[cell]
+    members = np.empty(starts[-1], dtype=np.int64)
+    filled = starts[:-1].copy()
+    for box in range(len(first)):
+        for ix in range(first[box, 0], last[box, 0] + 1):
+            for iy in range(first[box, 1], last[box, 1] + 1):
+                members[filled[ix * shape[1] + iy]] = box
+                filled[ix * shape[1] + iy] += 1
+    return starts, members
+
+
+# --- one box ----------------------------------------------------------------------------------------------------------
+
+
+# Columns of BoxIndex.rows: 0-2 centre, 3-5 half extents, 6-14 rotation, 15-17 low corner, 18-20 high corner. Single numbers are
+# read, not slices: a slice costs two atomic reference counts, more than the arithmetic around it.
+
+
+@njit(cache=True, inline="always")
+def _in_box_frame(rows, box, x, y, z):
+    """Give the coordinates of a world point in a box's frame."""
+    dx, dy, dz = x - rows[box, 0], y - rows[box, 1], z - rows[box, 2]
+    return (
+        rows[box, 6] * dx + rows[box, 9] * dy + rows[box, 12] * dz,
+        rows[box, 7] * dx + rows[box, 10] * dy + rows[box, 13] * dz,
+        rows[box, 8] * dx + rows[box, 11] * dy + rows[box, 14] * dz,
+    )
+
+
+@njit(cache=True)
+def distance_to_box(rows, box, x, y, z):
+    """Signed distance of a point to a box, m: negative inside (depth below the nearest face)."""
+    u, v, w = _in_box_frame(rows, box, x, y, z)
+    qx, qy, qz = abs(u) - rows[box, 3], abs(v) - rows[box, 4], abs(w) - rows[box, 5]
+    deepest = max(qx, qy, qz)
+    if deepest <= 0.0:
+        return deepest
+    px, py, pz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    return np.sqrt(px * px + py * py + pz * pz)
+
+
+@njit(cache=True)
+def normal_of_box(rows, box, x, y, z):
+    """Unit vector away from a box at a point: from the nearest surface point, inside out through the nearest face.
+
+    A tie between faces goes to the first axis, a point in the middle plane to the positive side.
+    """
+    u, v, w = _in_box_frame(rows, box, x, y, z)
+    qx, qy, qz = abs(u) - rows[box, 3], abs(v) - rows[box, 4], abs(w) - rows[box, 5]
+    sx, sy, sz = (1.0 if u >= 0 else -1.0), (1.0 if v >= 0 else -1.0), (1.0 if w >= 0 else -1.0)
+    a, b, c = max(qx, 0.0) * sx, max(qy, 0.0) * sy, max(qz, 0.0) * sz
+    length = np.sqrt(a * a + b * b + c * c)
+    if length > 0.0:
+        a, b, c = a / length, b / length, c / length
+    elif qx >= qy and qx >= qz:
+        a, b, c = sx, 0.0, 0.0
+    elif qy >= qz:
+        a, b, c = 0.0, sy, 0.0
+    else:
+        a, b, c = 0.0, 0.0, sz
+    return (
+        rows[box, 6] * a + rows[box, 7] * b + rows[box, 8] * c,
+        rows[box, 9] * a + rows[box, 10] * b + rows[box, 11] * c,
+        rows[box, 12] * a + rows[box, 13] * b + rows[box, 14] * c,
+    )
+
+
+@njit(cache=True, inline="always")
+def _clip(origin, direction, half, enter, leave):
+    """Clip the part [enter, leave] of a segment to one slab; enter > leave means nothing is left."""
+    if abs(direction) < 1e-12:
+        return (enter, leave) if abs(origin) <= half else (1.0, 0.0)
+    near, far = (-half - origin) / direction, (half - origin) / direction
+    return max(enter, min(near, far)), min(leave, max(near, far))
+
+
+@njit(cache=True)
+def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
+    """Tell whether a segment touches a box grown by `inflate_m` on every side (slab method, Kay and Kajiya 1986)."""
+    if min(ax, bx) > rows[box, 18] + inflate_m or max(ax, bx) < rows[box, 15] - inflate_m:
+        return False
+    if min(ay, by) > rows[box, 19] + inflate_m or max(ay, by) < rows[box, 16] - inflate_m:
+        return False
+    if min(az, bz) > rows[box, 20] + inflate_m or max(az, bz) < rows[box, 17] - inflate_m:
+        return False
+    u, v, w = _in_box_frame(rows, box, ax, ay, az)
+    u1, v1, w1 = _in_box_frame(rows, box, bx, by, bz)
+    enter, leave = _clip(u, u1 - u, rows[box, 3] + inflate_m, 0.0, 1.0)
+    enter, leave = _clip(v, v1 - v, rows[box, 4] + inflate_m, enter, leave)
+    enter, leave = _clip(w, w1 - w, rows[box, 5] + inflate_m, enter, leave)
+    return enter <= leave
+
+
+# --- many boxes, one query --------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def nearest_box(index, x, y, z, reach_m):
+    """Give (signed distance, box) of the nearest box, or (reach_m, -1) if none is nearer than `reach_m`.
+
+    Rings of cells are searched outwards until no unseen box can be nearer.
+    """
+    best, best_box = reach_m, -1
+    if len(index.rows) == 0:
+        return best, best_box
+    num_x, num_y = index.shape[0], index.shape[1]
+    # The grid is convex: the distance from the nearest point of the grid is a lower bound of the distance from outside it.
+    gx = min(max((x - index.grid[0]) / index.grid[2], 0.0), float(num_x))
+    gy = min(max((y - index.grid[1]) / index.grid[2], 0.0), float(num_y))
+    cx, cy = min(int(gx), num_x - 1), min(int(gy), num_y - 1)
+    border_m = min(gx - cx, cx + 1 - gx, gy - cy, cy + 1 - gy) * index.grid[2]
+    for ring in range(max(cx, num_x - 1 - cx, cy, num_y - 1 - cy) + 1):
+        if ring > 0 and (ring - 1) * index.grid[2] + border_m >= best:
+            break
+        for ix in range(max(cx - ring, 0), min(cx + ring, num_x - 1) + 1):
+            # A column inside the ring has two cells of it, a column at its edge all.
+            step = 1 if ring == 0 or abs(ix - cx) == ring else 2 * ring
+            for iy in range(cy - ring, cy + ring + 1, step):
+                if iy < 0 or iy >= num_y:
+                    continue
+                cell = ix * num_y + iy
+                for place in range(index.starts[cell], index.starts[cell + 1]):
+                    box = index.members[place]
+                    dx = max(index.rows[box, 15] - x, 0.0, x - index.rows[box, 18])
+                    dy = max(index.rows[box, 16] - y, 0.0, y - index.rows[box, 19])
+                    dz = max(index.rows[box, 17] - z, 0.0, z - index.rows[box, 20])
+                    gap = dx * dx + dy * dy + dz * dz
+                    if gap > 0.0 and (best <= 0.0 or gap >= best * best):
+                        continue
+                    distance = distance_to_box(index.rows, box, x, y, z)
+                    if distance < best:
+                        best, best_box = distance, box
+    return best, best_box
+
+
+@njit(cache=True)
+def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
+    """Put the boxes that a segment touches, grown by `inflate_m`, into `out` and give their number.
+
+    Stops when `out` is full, so an `out` of length 1 asks: is there any?
+    """
+    found = 0
+    if len(index.rows) == 0 or len(out) == 0:
+        return found
+    cell, num_x, num_y = index.grid[2], index.shape[0], index.shape[1]
+    ox, oy = index.grid[0], index.grid[1]
+    first_x = max(int(np.floor((min(ax, bx) - inflate_m - ox) / cell)), 0)
+    last_x = min(int(np.floor((max(ax, bx) + inflate_m - ox) / cell)), num_x - 1)
+    dx = bx - ax
+    for ix in range(first_x, last_x + 1):
+        t0, t1 = 0.0, 1.0  # the part of the segment within inflate_m of this column of cells
+        if abs(dx) > 1e-12:
+            t0, t1 = (ox + ix * cell - inflate_m - ax) / dx, (ox + (ix + 1) * cell + inflate_m - ax) / dx
+            if t0 > t1:
+                t0, t1 = t1, t0
+            t0, t1 = max(t0 - 1e-9, 0.0), min(t1 + 1e-9, 1.0)
+        y0, y1 = ay + t0 * (by - ay), ay + t1 * (by - ay)
+        first_y = max(int(np.floor((min(y0, y1) - inflate_m - oy) / cell)), 0)
+        last_y = min(int(np.floor((max(y0, y1) + inflate_m - oy) / cell)), num_y - 1)
+        for iy in range(first_y, last_y + 1):
+            for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
+                box = index.members[place]
+                known = False
+                for k in range(found):
+                    known = known or out[k] == box
+                if not known and segment_hits_box(index.rows, box, ax, ay, az, bx, by, bz, inflate_m):
+                    out[found] = box
+                    found += 1
+                    if found == len(out):
+                        return found
+    return found
+
+
+@njit(cache=True)
+def free_rays(index, boxes, num_boxes, x, y, z, target):
+    """Give the fraction of the five rays from a point to a target that none of `boxes[:num_boxes]` touches."""
+    free = 0
+    for ray in range(5):
+        tx, ty, tz = (
+            target[0] + RAY_OFFSETS_M[ray, 0],
+            target[1] + RAY_OFFSETS_M[ray, 1],
+            target[2] + RAY_OFFSETS_M[ray, 2],
+        )
+        blocked = False
+        for k in range(num_boxes):
+            if segment_hits_box(index.rows, boxes[k], tx, ty, tz, x, y, z, 0.0):
+                blocked = True
+                break
+        if not blocked:
+            free += 1
+    return free / 5.0
+
+
+@njit(cache=True)
+def window_rays(index, boxes, num_boxes, x, y, z, step_m, target, free):
+    """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
+
+    The same tests as seven calls of `free_rays`, but each box sees each of the twelve ends of the rays once.
+    """
+    blocked = np.zeros((7, 5), dtype=np.bool_)
+    ends, feet = np.empty((7, 3)), np.empty((5, 3))
+    for k in range(num_boxes):
+        box = boxes[k]
+        for place in range(7):
+            shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2
+            ends[place, 0], ends[place, 1], ends[place, 2] = _in_box_frame(
+                index.rows,
+                box,
+                x + (shift if place > 0 and axis == 0 else 0.0),
+                y + (shift if place > 0 and axis == 1 else 0.0),
+                z + (shift if place > 0 and axis == 2 else 0.0),
+            )
+        for ray in range(5):
+            feet[ray, 0], feet[ray, 1], feet[ray, 2] = _in_box_frame(
+                index.rows,
+                box,
+                target[0] + RAY_OFFSETS_M[ray, 0],
+                target[1] + RAY_OFFSETS_M[ray, 1],
+                target[2] + RAY_OFFSETS_M[ray, 2],
+            )
+        for place in range(7):
+            for ray in range(5):
+                if blocked[place, ray]:
+                    continue
+                enter, leave = 0.0, 1.0
+                for axis in range(3):
+                    foot = feet[ray, axis]
+                    enter, leave = _clip(foot, ends[place, axis] - foot, index.rows[box, 3 + axis], enter, leave)
+                blocked[place, ray] = enter <= leave
+    for place in range(7):
+        free[place] = 1.0 - blocked[place].sum() / 5.0
+
+
+# --- arrays -----------------------------------------------------------------------------------------------------------
+
+
+def signed_distances(index: BoxIndex, points: np.ndarray, reach_m: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance to the nearest box for many points.
+
+    Args:
+        points: (n, 3) m. reach_m: boxes farther away are not looked for.
+    Returns:
+        (n,) m, at most reach_m, and (n,) the nearest box, -1 where there is none in reach (k == 0 too).
+    """
+    return _signed_distances(index, _points(points, "points"), float(reach_m))
+
+
+@njit(cache=True)
+def _signed_distances(index, points, reach_m):
+    distances, boxes = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        distances[i], boxes[i] = nearest_box(index, points[i, 0], points[i, 1], points[i, 2], reach_m)
+    return distances, boxes
+
+
+def outward_normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Unit vectors away from the given box at each point.
+
+    Args:
+        points: (n, 3) m. boxes: (n,) box numbers, as `signed_distances` gives them; -1 gives a zero vector.
+    Returns:
+        (n, 3).
+    """
+    points, boxes = _points(points, "points"), np.asarray(boxes, dtype=np.int64)
+    if boxes.shape != (len(points),) or (len(boxes) and not -1 <= boxes.min() <= boxes.max() < len(index.rows)):
+        raise ValueError(f"boxes must be {len(points)} numbers from -1 to {len(index.rows) - 1}")
+    normals = np.zeros_like(points)
+    for i in np.flatnonzero(boxes >= 0):
+        normals[i] = normal_of_box(index.rows, boxes[i], *points[i])
+    return normals
+
+
+def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:
+    """Tell which segments touch any box grown by `inflate_m` on every side.
+
+    Args:
+        starts, ends: (n, 3) m.
+    Returns:
+        (n,) bool. Touching a face counts, lying inside too. k == 0 gives all False.
+    """
+    starts, ends = _pair(starts, ends)
+    return _segments_hit(index, starts, ends, float(inflate_m))
+
+
+@njit(cache=True)
+def _segments_hit(index, starts, ends, inflate_m):
+    hits, one = np.zeros(len(starts), dtype=np.bool_), np.empty(1, dtype=np.int64)
+    for i in range(len(starts)):
+        a, b = starts[i], ends[i]
+        hits[i] = collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], inflate_m, one) > 0
+    return hits
+
+
+def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Five-ray visibility of each target from each drone.
+
+    A box that holds a ray's end blocks the ray, whatever the direction: a person inside a solid box is hidden, and the
+    renderer shows it so. Ground slabs are no obstacles (`obstacle_index`), so standing on one hides nobody.
+
+    Args:
+        drones, targets: (n, 3) m; a target is a hip point.
+    Returns:
+        (n,) the fraction of unblocked rays, 0, 0.2 ... 1. k == 0 gives all 1.
+    """
+    drones, targets = _pair(drones, targets)
+    return _visibility(index, drones, targets)
+
+
+@njit(cache=True)
+def _visibility(index, drones, targets):
+    fractions, boxes = np.empty(len(drones)), np.empty(len(index.rows), dtype=np.int64)
+    for i in range(len(drones)):
+        p, x = drones[i], targets[i]
+        count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, boxes)
+        fractions[i] = free_rays(index, boxes, count, p[0], p[1], p[2], x)
+    return fractions
+
+
+def _points(values: np.ndarray, name: str) -> np.ndarray:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be (n, 3) finite numbers, not {array.shape}")
+    return array
+
+
+def _pair(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    starts, ends = _points(starts, "starts"), _points(ends, "ends")
+    if len(starts) != len(ends):
+        raise ValueError(f"{len(starts)} starts for {len(ends)} ends")
+    return starts, ends

@@ -1,0 +1,166 @@
+"""Where a flight begins its life: behind the walker where that works, else the best of a coarse search round the walker.
+
+The plain start, `behind_distance_m` behind the target at the preferred altitude, ends up inside towers and behind corners. Pushing
+each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search here chooses places that can be
+reached from each other: dynamic programming over time, places on rings round the target, edges that keep their distance to boxes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.ndimage import gaussian_filter1d
+
+from cosfly.kernels import BoxIndex, collect_hits, free_rays, nearest_box
+from cosfly.schema import DT_S
+
+# Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
+# the others climb over what blocks the way and are tried only where the first two do not suffice.
+STEEP_RADIUS, STEEP_CLIMB_M = 0.6, 6.0
+NUM_CLIMBS = 5
+NUM_AZIMUTHS = 18
+MAX_TURN = 3  # azimuths between one key frame and the next: 60 degrees, 21 m on the normal ring in 3 s
+FRAMES_BETWEEN_KEYS = 6  # 3 s
+
+# Costs of the search, in units of "the target fully hidden for one key frame" = 1.
+TURN_COST = 0.5  # looking at the walker's face instead of the back
+CLIMB_COST = 0.6  # each preferred altitude more
+STEEP_COST = 0.1  # a ring other than the normal one
+MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
+
+
+def smoothed_headings(targets_m: np.ndarray, smoothing_s: float) -> np.ndarray:
+    """Walking direction of each point, radians, continuous, smoothed over time by a Gaussian.
+
+    Args:
+        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0 takes the direction as it is.
+    Returns:
+        (n,). A walker who stands keeps the direction before; one who never moves faces east.
+    """
+    steps = np.diff(targets_m[:, :2], axis=0)
+    moves = np.flatnonzero(np.hypot(steps[:, 0], steps[:, 1]) > 1e-6)
+    if len(moves) == 0:
+        return np.zeros(len(targets_m))
+    yaws = np.unwrap(np.arctan2(steps[moves, 1], steps[moves, 0]))
+    before = np.searchsorted(moves, np.arange(len(targets_m)), side="right") - 1
+    yaws = yaws[np.maximum(before, 0)]
+    return gaussian_filter1d(yaws, smoothing_s / DT_S, mode="nearest") if smoothing_s > 0 else yaws
+
+
+def behind(targets_m: np.ndarray, headings_rad: np.ndarray, distance_m: float, altitude_m: float) -> np.ndarray:
+    """Give the places `distance_m` behind the target, (n, 3), at the world altitude `altitude_m`."""
+    back = -distance_m * np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=1)
+    return np.column_stack([targets_m[:, :2] + back, np.full(len(targets_m), altitude_m)])
+
+
+def search_start(
+    targets_m: np.ndarray,
+    headings_rad: np.ndarray,
+    index: BoxIndex,
+    *,
+    distance_m: float,
+    altitudes_m: tuple[float, float, float],
+    climbing: bool,
+    clearance_m: float,
+    speed_max_mps: float,
+) -> np.ndarray | None:
+    """Find a free trajectory that sees the target well, by dynamic programming over key frames.
+
+    Args:
+        targets_m: (n, 3). headings_rad: (n,). distance_m: horizontal distance of the normal ring. altitudes_m: least, preferred
+            and greatest z in the world. climbing: also try places higher than those.
+    Returns:
+        (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is none.
+    """
+    keys = np.unique(np.append(np.arange(0, len(targets_m), FRAMES_BETWEEN_KEYS), len(targets_m) - 1))
+    rings = _rings(distance_m, altitudes_m, climbing)
+    azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
+    angles = headings_rad[keys, None, None] + np.pi + azimuths[None, None, :]
+    shape = (len(keys), len(rings), NUM_AZIMUTHS)
+    offsets = rings[None, :, 0, None]
+    places = np.stack(
+        [
+            targets_m[keys, 0, None, None] + offsets * np.cos(angles),
+            targets_m[keys, 1, None, None] + offsets * np.sin(angles),
+            np.broadcast_to(rings[None, :, 1, None], shape),
+        ],
+        axis=-1,
+    ).reshape(len(keys), -1, 3)
+    turned = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
+    climbs = np.maximum(rings[:, 1] - altitudes_m[1], 0.0) / 20.0
+    extra = (
+        TURN_COST * turned[None] ** 2 + CLIMB_COST * climbs[:, None] + STEEP_COST * (np.arange(len(rings)) > 0)[:, None]
+    )
+    chosen = _search(places, targets_m[keys], keys * DT_S, extra, index, clearance_m, speed_max_mps)
+    if chosen[0] < 0:
+        return None
+    path = places[np.arange(len(keys)), chosen]
+    frames = np.arange(len(targets_m))
+    return np.stack([np.interp(frames, keys, path[:, axis]) for axis in range(3)], axis=1)
+
+
+def _rings(distance_m: float, altitudes_m: tuple[float, float, float], climbing: bool) -> np.ndarray:
+    """Give (r, 2): horizontal distance and z of the rings, the normal one first."""
+    _, preferred, greatest = altitudes_m
+    rings = [(distance_m, preferred), (STEEP_RADIUS * distance_m, min(preferred + STEEP_CLIMB_M, greatest))]
+    climbs = np.geomspace(8.0, max(greatest - preferred, 8.0), NUM_CLIMBS if climbing else 0)
+    rings += [(distance_m + 0.2 * climb, min(preferred + climb, greatest)) for climb in climbs]
+    return np.array(rings)
+
+
+@njit(cache=True)
+def _search(places, targets, times, extra, index, clearance_m, speed_max_mps):
+    """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
+
+    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place whatever
+    is seen from it.
+    """
+    num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
+    blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
+    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
+    own, guesses = np.empty(num_places), np.empty(num_places)
+    for key in range(num_keys):
+        for c in range(num_places):
+            p, x = places[key, c], targets[key]
+            gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
+            own[c] = np.inf
+            if gap >= clearance_m:
+                count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], 0.8, blockers)
+                own[c] = (
+                    extra[c // num_azimuths, c % num_azimuths]
+                    + 1.0
+                    - free_rays(index, blockers, count, p[0], p[1], p[2], x)
+                )
+        if key == 0:
+            cost[0] = own
+            continue
+        seconds = times[key] - times[key - 1]
+        for c in range(num_places):
+            if own[c] == np.inf:
+                continue
+            p = places[key, c]
+            for b in range(num_places):
+                turn = abs(c % num_azimuths - b % num_azimuths)
+                guesses[b] = np.inf
+                if cost[key - 1, b] == np.inf or min(turn, num_azimuths - turn) > MAX_TURN:
+                    continue
+                q = places[key - 1, b]
+                speed = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2) / seconds
+                if speed <= 0.9 * speed_max_mps:
+                    guesses[b] = cost[key - 1, b] + MOVE_COST * (speed / MOVE_SCALE_MPS) ** 2
+            while True:  # the cheapest way whose segment is free; most often the first one tried is
+                b = int(np.argmin(guesses))
+                if guesses[b] == np.inf:
+                    break
+                q = places[key - 1, b]
+                if collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], clearance_m, one) == 0:
+                    cost[key, c], came_from[key, c] = guesses[b] + own[c], b
+                    break
+                guesses[b] = np.inf
+    chosen = np.full(num_keys, -1, dtype=np.int64)
+    last = int(np.argmin(cost[num_keys - 1]))
+    if cost[num_keys - 1, last] < np.inf:
+        chosen[num_keys - 1] = last
+        for key in range(num_keys - 1, 0, -1):
+            chosen[key - 1] = came_from[key, chosen[key]]
+    return chosen

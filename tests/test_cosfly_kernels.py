@@ -1,0 +1,254 @@
+"""Box kernels against slow, obvious numpy versions, hand-checkable tables and invariances."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly import kernels
+from cosfly.geometry import rotation_matrices, rotation_matrix
+from cosfly.schema import KINDS, make_box_map
+
+NO_TURN = np.eye(3)[None]
+
+
+def parts(index):
+    """Centres (k, 3), half extents (k, 3) and rotations (k, 3, 3) of an index."""
+    return index.rows[:, :3], index.rows[:, 3:6], index.rows[:, 6:15].reshape(-1, 3, 3)
+
+
+def slow_distances(index, points):
+    """(n, k) signed distances, all pairs, straight from the definition."""
+    centers, half_extents, rotations = parts(index)
+    local = np.einsum("kij,nki->nkj", rotations, points[:, None] - centers[None])
+    q = np.abs(local) - half_extents[None]
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
+
+
+def slow_hits(index, start, end, inflate_m=0.0):
+    """(k,) bool: clip the segment by the six planes of each grown box."""
+    hits = np.zeros(index.num_boxes, dtype=bool)
+    for box, (center, half_extent, rotation) in enumerate(zip(*parts(index), strict=True)):
+        a = rotation.T @ (start - center)
+        d = rotation.T @ (end - center) - a
+        half = half_extent + inflate_m
+        low, high = 0.0, 1.0
+        for axis in range(3):
+            for sign in (1, -1):  # sign * (a + t d) <= half
+                slope, room = sign * d[axis], half[axis] - sign * a[axis]
+                if abs(slope) < 1e-12:
+                    high = high if room >= 0 else -1.0
+                elif slope > 0:
+                    high = min(high, room / slope)
+                else:
+                    low = max(low, room / slope)
+        hits[box] = low <= high
+    return hits
+
+
+def slow_visibility(index, drone, target):
+    return np.mean([not slow_hits(index, target + offset, drone).any() for offset in kernels.RAY_OFFSETS_M])
+
+
+def random_boxes(rng, num_boxes, spread_m=60.0, tilt=True):
+    angles = rng.uniform(-np.pi, np.pi, (num_boxes, 3)) * (1.0 if tilt else np.array([0, 1, 0]))
+    centers = rng.uniform(-spread_m, spread_m, (num_boxes, 3)) * np.array([1, 1, 0.3])
+    return kernels.index_boxes(centers, rng.uniform(0, 8, (num_boxes, 3)), rotation_matrices(angles))
+
+
+def one_box(center=(0, 0, 0), half=(1, 2, 3), yaw_deg=0.0):
+    return kernels.index_boxes([center], [half], rotation_matrix(0, np.radians(yaw_deg), 0)[None])
+
+
+@pytest.mark.parametrize(
+    ("point", "distance", "normal"),
+    [
+        ((3, 0, 0), 2, (1, 0, 0)),
+        ((-1.5, 0, 0), 0.5, (-1, 0, 0)),
+        ((0, 6, 0), 4, (0, 1, 0)),
+        ((0, 0, -5), 2, (0, 0, -1)),
+        ((4, 6, 3), 5, (0.6, 0.8, 0)),
+        ((0.5, 0, 0), -0.5, (1, 0, 0)),
+        ((0, -1.75, 0), -0.25, (0, -1, 0)),
+        ((0, 0, 0), -1, (1, 0, 0)),
+    ],
+)
+def test_distance_and_normal_by_hand(point, distance, normal):
+    index = one_box()
+    found, boxes = kernels.signed_distances(index, [point])
+    assert found[0] == pytest.approx(distance)
+    np.testing.assert_allclose(kernels.outward_normals(index, [point], boxes), [normal], atol=1e-12)
+
+
+def test_a_turned_box_has_turned_faces():
+    index = one_box(half=(1, 2, 3), yaw_deg=90)  # now 2 along x, 1 along y
+    distances, boxes = kernels.signed_distances(index, [(5, 0, 0), (0, 5, 0)])
+    np.testing.assert_allclose(distances, [3, 4])
+    np.testing.assert_allclose(
+        kernels.outward_normals(index, [(5, 0, 0), (0, 5, 0)], boxes), [(1, 0, 0), (0, 1, 0)], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("cell_m", [1.0, 8.0, 500.0])
+def test_nearest_agrees_with_all_pairs(seed, cell_m):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, 80)
+    index = kernels.index_boxes(*parts(index), cell_m=cell_m)
+    points = rng.uniform(-150, 150, (200, 3))  # inside the grid, at its border and far outside
+    expected = slow_distances(index, points)
+    distances, boxes = kernels.signed_distances(index, points)
+    np.testing.assert_allclose(distances, expected.min(axis=1), atol=1e-9)
+    np.testing.assert_allclose(expected[np.arange(200), boxes], distances, atol=1e-9)
+    limited, in_reach = kernels.signed_distances(index, points, 10.0)
+    np.testing.assert_allclose(limited, np.minimum(expected.min(axis=1), 10.0), atol=1e-9)
+    assert ((in_reach == -1) == (expected.min(axis=1) >= 10.0)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_moving_along_the_normal_changes_the_distance_by_as_much(seed):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, 1)
+    points = rng.uniform(-90, 90, (100, 3))
+    distances, boxes = kernels.signed_distances(index, points)
+    normals = kernels.outward_normals(index, points, boxes)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    moved, _ = kernels.signed_distances(index, points + 0.25 * normals)
+    outside = distances > 0
+    np.testing.assert_allclose(moved[outside], distances[outside] + 0.25, atol=1e-9)
+
+
+@pytest.mark.parametrize("inflate_m", [0.0, 2.5])
+def test_segments_agree_with_plane_clipping(inflate_m):
+    rng = np.random.default_rng(5)
+    index = random_boxes(rng, 60)
+    starts, ends = rng.uniform(-80, 80, (2, 300, 3)) * np.array([1, 1, 0.3])
+    ends[:40, 0] = starts[:40, 0]  # along y
+    ends[40:80, :2] = starts[40:80, :2]  # upright
+    ends[80:90] = starts[80:90]  # a point
+    expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
+    assert 0 < sum(expected) < 300
+    np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "hit"),
+    [
+        ((-5, 0, 0), (5, 0, 0), True),
+        ((-5, 2, 0), (5, 2, 0), True),  # along a face
+        ((-5, 2.001, 0), (5, 2.001, 0), False),
+        ((0, 0, 0), (0.5, 0, 0), True),  # inside
+        ((2, 0, 0), (5, 0, 0), False),
+        ((1, 0, 0), (5, 0, 0), True),  # starts on a face
+        ((-5, 0, 0), (-1.5, 0, 0), False),  # ends before it
+    ],
+)
+def test_segments_by_hand(start, end, hit):
+    assert kernels.segments_hit(one_box(), [start], [end])[0] == hit
+
+
+def test_visibility_agrees_with_slow_rays():
+    rng = np.random.default_rng(8)
+    index = random_boxes(rng, 120, tilt=False)
+    targets = rng.uniform(-60, 60, (150, 3)) * np.array([1, 1, 0]) + np.array([0, 0, 0.9])
+    drones = targets + rng.uniform(-1, 1, (150, 3)) * np.array([20, 20, 5]) + np.array([0, 0, 20])
+    expected = [slow_visibility(index, p, x) for p, x in zip(drones, targets, strict=True)]
+    assert len(set(expected)) > 2
+    np.testing.assert_allclose(kernels.visibility(index, drones, targets), expected)
+
+
+def test_a_wall_hides_what_it_should():
+    wall = one_box(center=(10, 0, 0.5), half=(0.1, 5, 0.5))  # 1 m high, so from low down it hides the legs only
+    drone, target = [(20.0, 0.0, 1.0)], [(0.0, 0.0, 0.9)]
+    assert kernels.visibility(wall, drone, target)[0] == pytest.approx(0.2)  # only the head's ray passes over
+    assert kernels.visibility(wall, [(20.0, 0.0, 20.0)], target)[0] == 1.0
+    assert kernels.visibility(wall, [(20.0, 9.0, 0.0)], target)[0] == pytest.approx(0.0)
+    assert kernels.visibility(wall, [(20.0, 11.0, 0.0)], target)[0] == 1.0  # past its end
+
+
+def test_a_person_inside_a_box_is_hidden_from_everywhere():
+    index = one_box(half=(2, 2, 2))
+    assert kernels.visibility(index, [(20.0, 0.0, 20.0), (-9.0, 3.0, 50.0)], [(0.0, 0.0, 0.9)] * 2).tolist() == [0, 0]
+
+
+def test_no_boxes_no_points():
+    empty = kernels.index_boxes(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+    points = np.zeros((3, 3))
+    distances, boxes = kernels.signed_distances(empty, points)
+    assert np.isinf(distances).all()
+    assert (boxes == -1).all()
+    assert not kernels.segments_hit(empty, points, points + 1).any()
+    assert (kernels.visibility(empty, points, points + 1) == 1).all()
+    assert (kernels.outward_normals(empty, points, boxes) == 0).all()
+    assert kernels.signed_distances(one_box(), np.empty((0, 3)))[0].shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: kernels.index_boxes([(0, 0, 0)], [(1, -1, 1)], NO_TURN),
+        lambda: kernels.index_boxes([(0, 0, np.nan)], [(1, 1, 1)], NO_TURN),
+        lambda: kernels.index_boxes([(0, 0, 0)], [(1, 1, 1)], np.eye(3)),
+        lambda: kernels.signed_distances(one_box(), np.zeros(3)),
+        lambda: kernels.segments_hit(one_box(), np.zeros((2, 3)), np.zeros((3, 3))),
+        lambda: kernels.outward_normals(one_box(), np.zeros((1, 3)), [1]),
+    ],
+)
+def test_bad_arguments_are_value_errors(call):
+    with pytest.raises(ValueError, match=r"must be|differ|starts for"):
+        call()
+
+
+def test_a_stray_box_far_away_does_not_fill_the_memory():
+    index = kernels.index_boxes([(0, 0, 0), (1e9, -1e9, 0)], [(1, 1, 1), (1, 1, 1)], np.repeat(NO_TURN, 2, axis=0))
+    assert len(index.starts) <= kernels.MAX_CELLS + 1
+    np.testing.assert_allclose(kernels.signed_distances(index, [(3, 0, 0), (1e9, -1e9, 6)])[0], [2, 5])
+
+
+def test_ground_and_water_are_no_obstacles():
+    kinds = [KINDS[name] for name in ("Roads", "Water", "Terrain", "Buildings", "Vegetation")]
+    box_map = make_box_map(np.zeros((5, 3)), np.ones((5, 3)), np.zeros((5, 3)), kinds)
+    assert kernels.obstacle_index(box_map).num_boxes == 2
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-np.pi, np.pi), st.floats(-200, 200), st.floats(-200, 200))
+def test_a_rigid_motion_changes_nothing(seed, yaw_rad, east_m, north_m):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, 12, spread_m=20)
+    points, ends = rng.uniform(-30, 30, (2, 10, 3))
+    turn, shift = rotation_matrix(0, yaw_rad, 0), np.array([east_m, north_m, 0])
+    centers, half_extents, rotations = parts(index)
+    moved = kernels.index_boxes(centers @ turn.T + shift, half_extents, turn @ rotations)
+    before, after = (kernels.signed_distances(i, p)[0] for i, p in ((index, points), (moved, points @ turn.T + shift)))
+    np.testing.assert_allclose(before, after, atol=1e-9)
+    hits = kernels.segments_hit(index, points, ends)
+    # A hair's breadth may decide a graze; it may not decide a segment that is clearly in or clearly out.
+    clear = hits == kernels.segments_hit(index, points, ends, 1e-6)
+    np.testing.assert_array_equal(
+        kernels.segments_hit(moved, points @ turn.T + shift, ends @ turn.T + shift)[clear], hits[clear]
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_more_boxes_never_uncover_anything(seed):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, 30)
+    fewer = kernels.index_boxes(*(part[:15] for part in parts(index)))
+    drones, targets = rng.uniform(-50, 50, (2, 20, 3))
+    assert (kernels.visibility(index, drones, targets) <= kernels.visibility(fewer, drones, targets)).all()
+    assert (kernels.signed_distances(index, drones)[0] <= kernels.signed_distances(fewer, drones)[0]).all()
+
+
+def test_a_window_of_rays_is_seven_bundles():
+    rng = np.random.default_rng(2)
+    index, free = random_boxes(rng, 120, tilt=True), np.empty(7)
+    everything, seen = np.arange(120), set()
+    for _ in range(40):
+        point, target = rng.uniform(-40, 40, (2, 3))
+        kernels.window_rays(index, everything, 120, *point, 0.5, target, free)
+        moves = np.vstack([np.zeros(3), *([-axis, axis] for axis in 0.5 * np.eye(3))])
+        np.testing.assert_allclose(free, kernels.visibility(index, point + moves, np.repeat(target[None], 7, axis=0)))
+        seen.update(np.round(free, 1).tolist())
+    assert len(seen) > 3

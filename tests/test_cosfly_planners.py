@@ -1,0 +1,501 @@
+"""Metrics on analytic curves, MuCO's terms against plain versions, whole flights over hand-made maps, and the plan stage."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import cosfly.planners as planners
+from cosfly import kernels
+from cosfly.errors import InputError, NoPathError, ResumeError
+from cosfly.geometry import look_at
+from cosfly.planners import MucoConfig, PlanConfig, loss, metrics, muco, start
+from cosfly.schema import DT_S, KINDS, PedestrianPath, make_box_map, read_traces, write_boxes, write_paths
+
+CFG = PlanConfig()
+
+
+# --- hand-made worlds -------------------------------------------------------------------------------------------------
+
+
+def walk_along(path_id, corners, speed_mps=1.2):
+    """Walk a polyline at constant speed, sampled every DT_S."""
+    corners = np.asarray(corners, dtype=np.float64)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    time_s = np.arange(0, along[-1] / speed_mps, DT_S)
+    xy = np.stack([np.interp(time_s * speed_mps, along, corners[:, k]) for k in (0, 1)], axis=1)
+    positions = np.column_stack([xy, np.zeros(len(xy))])
+    return PedestrianPath(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
+
+
+def town_of(*rows):
+    """(centre, half extents[, yaw_deg]) of buildings, on a large ground slab that must not count as an obstacle."""
+    ground = ((0, 0, -0.5), (500, 500, 0.5), 0)
+    rows = [ground, *((*row, 0) if len(row) == 2 else row for row in rows)]
+    kinds = [KINDS["Ground"]] + [KINDS["Buildings"]] * (len(rows) - 1)
+    return make_box_map(
+        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header={"name": "hand"}
+    )
+
+
+CANYON = [((x, side * 16, 20), (9, 8, 20)) for x in range(-40, 140, 20) for side in (-1, 1)]
+WORLDS = {
+    "empty": (town_of(), [(0, 0), (60, 0), (60, 50)]),
+    "canyon": (town_of(*CANYON), [(0, 0), (100, 0)]),
+    "u_turn": (town_of(*CANYON), [(0, 0), (50, 0), (50, 2), (0, 2)]),
+    "tower_behind": (town_of(((-18, 0, 40), (6, 6, 40), 30)), [(0, 0), (60, 0)]),  # the plain start is inside it
+    "tower_midway": (town_of(((30, 14, 60), (8, 8, 60), 30)), [(0, 0), (30, 0), (60, 0), (60, 60)]),
+    "corner": (town_of(((-20, 20, 25), (30, 12, 25)), ((40, 40, 25), (12, 40, 25))), [(-30, 0), (20, 2), (22, 70)]),
+    "short": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (1.3, 0)]),  # three points
+}  # fmt: skip
+
+
+def scenario_of(world):
+    box_map, corners = WORLDS[world]
+    obstacles = kernels.obstacle_index(box_map)
+    return planners.make_scenario(walk_along(world, corners), obstacles), obstacles
+
+
+def problem_of(scenario, cfg=CFG):
+    return muco.make_problem(scenario, start.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s), cfg)
+
+
+def assert_safe(positions, obstacles, cfg=CFG):
+    """Check a flight point by point and, between points, every ten centimetres: independent of `is_feasible`."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert steps.max() <= cfg.speed_max_mps * DT_S + 1e-3
+    assert positions[:, 2].min() >= cfg.altitude_min_m - 1e-3
+    assert positions[:, 2].max() <= cfg.altitude_max_m + 1e-3
+    assert kernels.signed_distances(obstacles, positions)[0].min() >= cfg.relaxed_safety_m - 1e-3
+    shares = np.linspace(0, 1, 51)[:, None, None]
+    between = (positions[None, :-1] * (1 - shares) + positions[None, 1:] * shares).reshape(-1, 3)
+    assert kernels.signed_distances(obstacles, between)[0].min() > 0
+
+
+# --- metrics ----------------------------------------------------------------------------------------------------------
+
+
+def test_uniform_motion_is_perfectly_smooth():
+    line = np.outer(np.arange(50), [0.5, -0.2, 0.1])
+    assert metrics.accel_rms(line) == pytest.approx(0, abs=1e-12)
+    assert metrics.jerk_rms(line) == pytest.approx(0, abs=1e-11)
+    assert metrics.smoothness_score(0, 0) == 1
+    assert metrics.length_m(line) == pytest.approx(49 * np.sqrt(0.3))
+    assert metrics.speed_max_mps(line) == pytest.approx(2 * np.sqrt(0.3))
+
+
+def test_parabola_has_constant_acceleration_and_cubic_constant_jerk():
+    time_s = np.arange(40) * DT_S
+    parabola = np.stack([0.5 * 3.0 * time_s**2, time_s, 0 * time_s], axis=1)
+    assert metrics.accel_rms(parabola) == pytest.approx(3.0)
+    assert metrics.jerk_rms(parabola) == pytest.approx(0, abs=1e-9)
+    cubic = np.stack([0 * time_s, 2.0 * time_s**3 / 6, time_s], axis=1)
+    assert metrics.jerk_rms(cubic) == pytest.approx(2.0)
+
+
+def test_circle_has_centripetal_acceleration():
+    time_s = np.arange(400) * 0.01
+    circle = 10 * np.stack([np.cos(0.3 * time_s), np.sin(0.3 * time_s), 0 * time_s], axis=1)
+    assert metrics.accel_rms(circle, 0.01) == pytest.approx(10 * 0.3**2, rel=1e-4)
+    assert metrics.jerk_rms(circle, 0.01) == pytest.approx(10 * 0.3**3, rel=1e-3)
+
+
+def test_smoothness_score_by_hand():
+    assert metrics.smoothness_score(5, 10) == pytest.approx(np.exp(-1))
+    assert metrics.smoothness_score(5, 0) == pytest.approx(np.exp(-0.5))
+
+
+@pytest.mark.parametrize("num_points", [1, 2, 3])
+def test_short_paths_have_no_differences(num_points):
+    assert metrics.jerk_rms(np.arange(3.0 * num_points).reshape(-1, 3)) == 0
+
+
+@pytest.mark.parametrize(
+    "call", [lambda: metrics.accel_rms(np.zeros(3)), lambda: metrics.accel_rms(np.zeros((4, 3)), 0.0)]
+)
+def test_metrics_refuse_bad_arguments(call):
+    with pytest.raises(ValueError, match="must be"):
+        call()
+
+
+# --- the loss ---------------------------------------------------------------------------------------------------------
+
+
+def plain_terms(points, problem, obstacles):
+    """Every term of the loss, straight from its definition, one waypoint at a time."""
+    targets, weights = problem.targets, problem.weights
+    terms = dict.fromkeys(loss.TERM_NAMES, 0.0)
+    for i, (p, x) in enumerate(zip(points, targets, strict=True)):
+        terms["tracking"] += weights[0] * (np.linalg.norm(p - x) - 28.0) ** 2
+        gap = kernels.signed_distances(obstacles, p[None])[0][0]
+        if gap < 8.0:
+            terms["safety"] += weights[3] * 0.5 * (8.0 - gap) ** 2
+        window = [p] + [p + sign * 0.5 * axis for axis in np.eye(3) for sign in (1, -1)]
+        seen = kernels.visibility(obstacles, np.array(window), np.repeat(x[None], 7, axis=0)).mean()
+        terms["visibility"] += weights[4] * (1 - seen) ** 2
+        pitch, yaw = look_at(p, x)
+        turn = np.angle(np.exp(1j * (yaw - problem.headings_rad[i])))
+        terms["view_angle"] += weights[5] * ((-pitch - np.pi / 4) ** 2 + turn**2)
+        outside = max(np.pi / 6 + pitch, 0) + max(-pitch - np.pi / 3, 0)
+        terms["pitch"] += 20 * outside**2
+        terms["altitude"] += 50 * max(20 - p[2], 0) ** 2 + 20 * max(p[2] - 20, 0) ** 2
+    terms["smoothness"] = weights[1] * (np.diff(points, n=2, axis=0) ** 2).sum()
+    terms["jerk"] = weights[2] * (np.diff(points, n=3, axis=0) ** 2).sum()
+    terms["path_length"] = weights[6] * 0.1 * np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    terms["altitude"] += 8 * (np.diff(points[:, 2]) ** 2).sum()
+    return terms
+
+
+def shaken(world, seed=3):
+    """A trajectory behind the target, shaken, so that every term is at work."""
+    scenario, obstacles = scenario_of(world)
+    problem = problem_of(scenario)
+    points = start.behind(scenario.targets_m, problem.headings_rad, 18.0, 21.0)
+    points += np.random.default_rng(seed).normal(0, 2.5, points.shape)
+    return points, problem, obstacles
+
+
+@pytest.mark.parametrize("world", ["empty", "canyon", "corner", "tower_behind"])
+def test_terms_agree_with_their_definitions(world):
+    points, problem, obstacles = shaken(world)
+    state = loss.make_state(len(points), obstacles.num_boxes)
+    total = loss.evaluate(points, problem, obstacles, np.zeros(len(points), dtype=bool), state)
+    expected = plain_terms(points, problem, obstacles)
+    np.testing.assert_allclose(state.terms, list(expected.values()), rtol=1e-9, atol=1e-9)
+    assert total == pytest.approx(sum(expected.values()))
+    if world == "tower_behind":
+        assert min(expected.values()) > 0  # every term is at work somewhere
+
+
+def test_gradient_is_the_derivative_of_the_loss():
+    points, problem, obstacles = shaken("corner")
+    problem = problem._replace(weights=problem.weights * np.array([1, 1, 1, 1, 0, 1, 1]))  # visibility is a staircase
+    state, unmasked = loss.make_state(len(points), obstacles.num_boxes), np.zeros(len(points), dtype=bool)
+    loss.evaluate(points, problem, obstacles, unmasked, state)
+    gradient, scratch = state.gradient.copy(), loss.make_state(len(points), obstacles.num_boxes)
+    for i, axis in np.ndindex(len(points), 3):
+        if i % 17:
+            continue
+        ends = []
+        for sign in (1, -1):
+            moved = points.copy()
+            moved[i, axis] += sign * 1e-5
+            ends.append(loss.evaluate(moved, problem, obstacles, unmasked, scratch))
+        assert gradient[i, axis] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-3)
+
+
+def test_difference_gradient_tends_to_the_analytic_one():
+    points, problem, obstacles = shaken("canyon")
+    narrow = problem._replace(difference_m=1e-5, altitudes=np.array([0.0, 20.0, 100.0]))
+    state, unmasked = loss.make_state(len(points), obstacles.num_boxes), np.zeros(len(points), dtype=bool)
+    loss.evaluate(points, narrow, obstacles, unmasked, state)
+    differences, before = np.empty_like(points), points.copy()
+    loss.difference_gradient(
+        points, narrow, obstacles, unmasked, loss.make_state(len(points), obstacles.num_boxes), differences
+    )
+    np.testing.assert_array_equal(points, before)
+    np.testing.assert_allclose(differences, state.gradient, rtol=1e-3, atol=1e-3)
+
+
+def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
+    points, problem, obstacles = shaken("empty")
+    quadratic = problem._replace(
+        weights=problem.weights * np.array([0, 1, 1, 0, 0, 0, 0]),
+        pitch_weight=0.0,
+        altitude_weights=np.array([0, 0, 8.0]),
+    )
+    state, unmasked = loss.make_state(len(points), 0), np.zeros(len(points), dtype=bool)
+
+    def dense(problem):
+        loss.evaluate(points, problem, obstacles, unmasked, state)
+        size = 3 * len(points)
+        matrix = sum(np.diag(state.band[k, : size - k], -k) for k in range(loss.BAND_ROWS))
+        return matrix + np.tril(matrix, -1).T, state.gradient.reshape(-1).copy(), state.terms.sum()
+
+    matrix, gradient, value = dense(quadratic)
+    x = points.reshape(-1)
+    np.testing.assert_allclose(matrix @ x, gradient, atol=1e-8)
+    assert 0.5 * x @ matrix @ x == pytest.approx(value)
+    assert np.linalg.eigvalsh(dense(problem)[0]).min() > -1e-8
+
+
+def test_masked_waypoints_have_no_visibility_or_view_gradient():
+    points, problem, obstacles = shaken("tower_behind")
+    only = problem._replace(
+        weights=problem.weights * np.array([0, 0, 0, 0, 1, 1, 0]), pitch_weight=0.0, altitude_weights=np.zeros(3)
+    )
+    state = loss.make_state(len(points), obstacles.num_boxes)
+    free = loss.evaluate(points, only, obstacles, np.zeros(len(points), dtype=bool), state)
+    assert state.gradient.any()
+    assert state.visibility_gradient.any()
+    masked = loss.evaluate(points, only, obstacles, np.ones(len(points), dtype=bool), state)
+    assert not state.gradient.any()
+    assert not state.visibility_gradient.any()
+    assert not state.band.any()
+    assert masked == free  # the loss itself keeps them
+
+
+@pytest.mark.parametrize(
+    ("low", "expected"),
+    [((5, 24), 0), ((5, 25), 20), ((0, 20), 20), ((30, 60), 30)],
+)
+def test_low_visibility_runs(low, expected):
+    seen = np.ones(60)
+    seen[low[0] : low[1]] = 0.2
+    marked = muco.low_visibility_runs(seen, 0.3, 20)
+    assert marked.sum() == expected
+    assert marked[low[0] : low[1]].all() == (expected > 0)
+
+
+# --- start ------------------------------------------------------------------------------------------------------------
+
+
+def test_headings_follow_the_walk_and_survive_standing_still():
+    walk = walk_along("w", [(0, 0), (50, 0), (50, 50)])
+    headings = start.smoothed_headings(walk.positions_m, 4.0)
+    assert headings[0] == pytest.approx(0, abs=1e-6)
+    assert headings[-1] == pytest.approx(np.pi / 2, abs=1e-6)
+    assert (np.diff(headings) >= -1e-12).all()
+    assert np.diff(headings).max() < 0.12  # the turn is spread over seconds
+    standing = np.vstack([walk.positions_m[:5], np.repeat(walk.positions_m[4:5], 10, axis=0)])
+    np.testing.assert_allclose(start.smoothed_headings(standing, 0.0), 0, atol=1e-12)
+    np.testing.assert_array_equal(start.smoothed_headings(np.zeros((4, 3)), 4.0), 0)
+
+
+def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():
+    scenario, obstacles = scenario_of("tower_behind")
+    problem = problem_of(scenario)
+    point = np.array([-17.0, 1.0, 20.0])
+    assert loss.push_out(point, problem, obstacles) == pytest.approx(3.0, abs=1e-5)
+    slit = kernels.obstacle_index(town_of(((-5, 0, 60), (2.3, 500, 60)), ((5, 0, 60), (2.3, 500, 60))))  # 5.4 m wide
+    point = np.array([1.0, 0.0, 20.0])
+    assert 2.5 <= loss.push_out(point, problem, slit) < 2.75
+
+
+# --- flights ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_loss_never_rises_and_the_flight_is_safe(world):
+    scenario, obstacles = scenario_of(world)
+    problem = problem_of(scenario)
+    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    assert_safe(first, obstacles)
+    points, solver = muco.optimize(first, problem, obstacles, CFG.muco)
+    assert_safe(points, obstacles)
+    history = np.array(solver["loss_history"])
+    assert (np.diff(history) < 0).all()
+    assert solver["stopped"] in ("converged", "no_step_lowers_the_loss")
+    assert history[-1] == pytest.approx(sum(plain_terms(points, problem, obstacles).values()))
+    if len(points) > 20:
+        assert history[-1] < 0.8 * history[0]
+    np.testing.assert_array_equal(points[[0, -1]], first[[0, -1]])
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_camera_keeps_the_target_in_view(world):
+    box_map, corners = WORLDS[world]
+    trace = planners.plan_flight(walk_along(world, corners), kernels.obstacle_index(box_map), CFG, 0)
+    assert trace.drop_reason is None
+    assert trace.visibility.mean() >= 0.88
+    assert trace.metrics["clearance_min_m"] >= 2.5
+    assert trace.metrics["visibility_mean"] == pytest.approx(trace.visibility.mean(), abs=1e-4)
+    assert np.isfinite(trace.clearances_m).all()
+    pitch, yaw = look_at(trace.positions_m, trace.targets_m)
+    np.testing.assert_allclose(trace.rotations_deg, np.degrees(np.stack([pitch, yaw, 0 * yaw], axis=1)))
+    assert (trace.rotations_deg[:, 0] < -20).all()
+    np.testing.assert_allclose(np.linalg.norm(trace.positions_m - trace.targets_m, axis=1), 28, atol=8)
+
+
+def test_the_papers_step_overshoots_and_the_difference_gradient_ends_near_the_analytic_one():
+    scenario, obstacles = scenario_of("corner")
+    problem = problem_of(scenario)
+    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    _, plain = muco.optimize(first, problem, obstacles, MucoConfig(step="paper", iterations_max=60))
+    assert (np.diff(plain["loss_history"]) > 0).any()
+    _, analytic = muco.optimize(first, problem, obstacles, MucoConfig())
+    _, difference = muco.optimize(first, problem, obstacles, MucoConfig(gradient="finite_difference"))
+    assert (np.diff(difference["loss_history"]) < 0).all()
+    assert difference["loss_end"] == pytest.approx(analytic["loss_end"], rel=0.1)
+
+
+@pytest.mark.parametrize("world", ["corner", "tower_midway"])
+def test_the_end_is_within_five_percent_of_a_general_solver(world):
+    scenario, obstacles = scenario_of(world)
+    problem = problem_of(scenario)
+    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    _, solver = muco.optimize(first, problem, obstacles, CFG.muco)
+    state, unmasked = loss.make_state(len(first), obstacles.num_boxes), np.zeros(len(first), dtype=bool)
+
+    def loss_and_gradient(interior):
+        points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
+        value = loss.evaluate(points, problem, obstacles, unmasked, state)
+        return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
+
+    bounds = [(None, None), (None, None), (20.0, 100.0)] * (len(first) - 2)
+    settings = {"maxiter": 400, "maxfun": 800}
+    general = minimize(
+        loss_and_gradient, first[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=bounds, options=settings
+    )
+    assert solver["loss_end"] <= 1.05 * general.fun
+
+
+def test_a_small_learning_rate_lets_the_papers_step_fall():
+    scenario, obstacles = scenario_of("empty")
+    problem = problem_of(scenario)
+    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    _, slow = muco.optimize(
+        first, problem, obstacles, MucoConfig(step="paper", learning_rate=0.001, iterations_max=200)
+    )
+    assert slow["loss_end"] < slow["loss_start"]
+    assert slow["stopped"] in ("converged", "iteration_limit")
+
+
+def test_the_safety_checker_notices_a_flight_through_a_tower():
+    _, obstacles = scenario_of("tower_behind")
+    through = np.column_stack([np.linspace(-40, 0, 30), np.zeros(30), np.full(30, 20.0)])
+    with pytest.raises(AssertionError):
+        assert_safe(through, obstacles)
+    scenario, _ = scenario_of("tower_behind")
+    assert not loss.is_feasible(through, problem_of(scenario), obstacles)
+
+
+def test_a_thin_wall_between_two_waypoints_is_a_collision():
+    wall = kernels.obstacle_index(town_of(((0, 0, 20), (0.01, 50, 40))))
+    points = np.array([[-2.45, 0, 20.0], [2.45, 0, 20.0]])
+    problem = problem_of(scenario_of("empty")[0])._replace(floor_m=2.0)
+    assert not loss.is_feasible(points, problem, wall)
+    assert loss.is_feasible(points - np.array([5.0, 0, 0]), problem, wall)
+
+
+@pytest.mark.parametrize(
+    ("walk", "rows", "words"),
+    [
+        (walk_along("w", [(0, 0), (0.4, 0)]), (), "one point"),
+        (walk_along("w", [(0, 0), (50, 0)]), [((25, 0, 5), (1, 10, 5))], "through an obstacle"),
+        (walk_along("w", [(0, 0), (50, 0)]), [((0, 0, 5), (3, 3, 5))], "through an obstacle"),
+        (walk_along("w", [(1e8, 0), (1e8 + 50, 0)]), (), "too large"),
+        (walk_along("w", [(0, 0), (50, 0)]), [((0, 0, 60), (300, 300, 50))], "no free drone trajectory"),  # roofed over
+        (replace(walk_along("w", [(0, 0), (5, 0)]), time_s=np.arange(9) * 0.4), (), "uneven time"),
+    ],
+)
+def test_hopeless_walks_are_clear_errors(walk, rows, words):
+    with pytest.raises(NoPathError, match=words) as caught:
+        planners.plan_flight(walk, kernels.obstacle_index(town_of(*rows)), CFG, 0)
+    assert "w" in str(caught.value.where)
+
+
+@pytest.mark.parametrize("name", ["visibility_mean", "accel_rms_mps2", "jerk_rms_mps3"])
+def test_the_prefilter_has_three_rules(name):
+    fine = {"visibility_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
+    assert planners.drop_reason(fine, CFG) is None
+    worse = {**fine, name: fine[name] + (-0.01 if name == "visibility_mean" else 0.01)}
+    expected = {
+        "visibility_mean": "low_visibility",
+        "accel_rms_mps2": "high_acceleration",
+        "jerk_rms_mps3": "high_jerk",
+    }
+    assert planners.drop_reason(worse, CFG) == expected[name]
+
+
+def test_settings_that_contradict_are_refused():
+    for bad in (
+        {"relaxed_safety_m": 4.0},
+        {"altitude_max_m": 10.0},
+        {"muco": {"pitch_band_deg": (60, 30)}},
+        {"spede": 1},
+    ):
+        with pytest.raises(ValueError, match=r"may not exceed|ascending|lower one first|Extra inputs"):
+            PlanConfig.model_validate(bad)
+
+
+def test_every_planner_of_the_table_can_be_loaded():
+    assert all(callable(planners.load_planner(name)) for name in planners.PLANNERS)
+
+
+def test_settings_are_read_without_compiled_code():
+    code = "import sys, cosfly.planners; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A canyon with three walks that work and one through a wall."""
+    folder = tmp_path_factory.mktemp("inputs")
+    write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
+    walks = [
+        walk_along("a", [(0, 0), (40, 0)]),
+        walk_along("b", [(30, 2), (70, 2), (72, -2)]),
+        walk_along("into_wall", [(60, -50), (60, -30)]),
+        walk_along("c", [(90, 0), (50, 0)]),
+    ]
+    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
+    return folder / "map.json", folder / "path.json"
+
+
+def test_stage_counts_failures_and_does_the_others(inputs, tmp_path):
+    product = planners.run(CFG, *inputs, tmp_path / "plan")
+    traces = read_traces(product)
+    assert [trace.path_id for trace in traces] == ["a", "b", "c"]
+    manifest = json.loads((tmp_path / "plan/manifest.json").read_text())
+    assert manifest["counts"] == {"input": 4, "kept": 3, "dropped": {}, "failed": {"no_path": 1}}
+    assert manifest["planning_ms"]["mean"] > 0
+    failure = json.loads((tmp_path / "plan/failures.jsonl").read_text())
+    assert failure["id"] == "into_wall"
+    assert "through an obstacle" in failure["message"]
+    assert (tmp_path / "plan/plan.png").read_bytes().startswith(b"\x89PNG")
+    before = product.stat().st_mtime_ns
+    assert planners.run(CFG, *inputs, tmp_path / "plan") == product  # complete: nothing to do
+    assert product.stat().st_mtime_ns == before
+    with pytest.raises(ResumeError, match="safety_distance_m"):
+        planners.run(PlanConfig(safety_distance_m=3.5), *inputs, tmp_path / "plan")
+
+
+def test_dropped_flights_are_counted_and_written(inputs, tmp_path):
+    product = planners.run(PlanConfig(jerk_rms_max_mps3=1e-6), *inputs, tmp_path / "plan")
+    assert {trace.drop_reason for trace in read_traces(product)} == {"high_jerk"}
+    assert json.loads((tmp_path / "plan/manifest.json").read_text())["counts"]["dropped"] == {"high_jerk": 3}
+
+
+@pytest.mark.slow
+def test_same_bytes_with_two_workers_and_after_a_kill(inputs, tmp_path):
+    reference = planners.run(CFG, *inputs, tmp_path / "one").read_bytes()
+    assert planners.run(CFG, *inputs, tmp_path / "two", workers=2).read_bytes() == reference
+    code = (
+        "import sys, pathlib, cosfly.planners as p\n"
+        "m, w, o = map(pathlib.Path, sys.argv[1:])\n"
+        "p.run(p.PlanConfig(), m, w, o)\n"
+    )
+    out = tmp_path / "killed"
+    process = subprocess.Popen([sys.executable, "-c", code, *map(str, inputs), str(out)])
+    try:
+        deadline_s = time.monotonic() + 60
+        while not (out / "items.jsonl").exists() and process.poll() is None and time.monotonic() < deadline_s:
+            time.sleep(0.005)
+        os.kill(process.pid, signal.SIGKILL)
+    finally:
+        process.wait()
+    assert planners.run(CFG, *inputs, out).read_bytes() == reference
+
+
+def test_stage_input_errors(inputs, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        planners.run(CFG, inputs[0], tmp_path / "none.json", tmp_path / "a")
+    walk = walk_along("same", [(0, 0), (9, 0)])
+    write_paths(tmp_path / "twice.json", [walk, walk], {})
+    with pytest.raises(InputError, match="more than once"):
+        planners.run(CFG, inputs[0], tmp_path / "twice.json", tmp_path / "b")
+    write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
+    with pytest.raises(NoPathError, match="not one walk"):
+        planners.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "c")
+    assert not (tmp_path / "c/manifest.json").exists()
