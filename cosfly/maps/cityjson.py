@@ -1,0 +1,299 @@
+"""A CityJSON 1.1 or 2.0 city model, plain or gzipped: polygons become oriented boxes.
+
+One box round an object can be hundreds of metres wide, so everything is cut up: solids into rectangles that cover their footprint,
+surfaces into thin slabs that never stand in anybody's way, walls along their course. Vegetation is a surface in such models, with the
+heights of its canopy in the vertices: it becomes a lawn, and trees where it rises well over the ground.
+The middle of the map becomes the origin, and the usual height of its roads z = 0; `header["offset_m"]` leads back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from pydantic import Field
+from shapely.geometry import Polygon
+
+from cosfly.config import Config
+from cosfly.errors import ConfigError, InputError
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.cityjson_file import CityObject, read_model
+from cosfly.maps.footprints import cover, polygons_of, rectangle_polygon, united
+from cosfly.schema import BoxMap
+
+SLAB_M = 0.3
+STEEP = 0.02  # a surface whose projection is less than this share of its area is a wall: it has no footprint
+# The map is made flat. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads cover lawns.
+SURFACE_TOPS_M = {
+    "Sidewalks": 0.0,
+    "Bridge": -0.02,
+    "Walls": 0.0,
+    "Roads": -0.03,
+    "RailTrack": -0.03,
+    "Ground": -0.05,
+    "Terrain": -0.1,
+    "Water": -0.07,
+}
+
+
+class CityJsonConfig(Config):
+    """A CityJSON city model."""
+
+    name: str = Field("CityJson", min_length=1, description="map name, the head of the playback tree's folder names")
+    path: Path | None = Field(None, description="the CityJSON file, .json or .json.gz")
+    licence: str = Field(
+        "unknown: see the source", description="licence line for the records of everything made from the map"
+    )
+    tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
+    solid_fill: float = Field(
+        0.9, gt=0.0, le=1.0, description="share of each box of a building that its footprint fills"
+    )
+    solid_piece_m: float = Field(3.0, gt=0.0, description="building pieces of at most this length are not cut again, m")
+    wall_fill: float = Field(0.6, gt=0.0, le=1.0, description="share of each box of a wall that the wall fills")
+    wall_piece_m: float = Field(1.0, gt=0.0, description="wall pieces of at most this length are not cut again, m")
+    wall_max_m: float = Field(
+        2.5, gt=0.0, description="highest wall, m: laser heights of walls often belong to trees above them"
+    )
+    surface_fill: float = Field(0.8, gt=0.0, le=1.0, description="share of each slab that its surface fills")
+    surface_piece_m: float = Field(2.0, gt=0.0, description="slabs of at most this length are not cut again, m")
+    surface_max_m: float = Field(60.0, gt=0.0, description="longer slabs are cut however full they are, m")
+    water_fill: float = Field(
+        0.97,
+        gt=0.0,
+        le=1.0,
+        description="the same for water, which is an obstacle and must not spill over quays and bridges",
+    )
+    water_piece_m: float = Field(1.5, gt=0.0, description="slabs of water of at most this length are not cut again, m")
+    canopy_m: float = Field(2.5, gt=0.0, description="green that rises higher than this over the ground is a tree, m")
+    canopy_max_m: float = Field(40.0, gt=0.0, description="tallest tree, m")
+    canopy_cell_m: float = Field(2.0, gt=0.2, description="raster cell of canopies, m")
+    crown_cells: int = Field(3, ge=1, description="cells along a tree's side at most")
+    crown_min_m: float = Field(
+        3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller than its crown"
+    )
+
+    def inputs(self) -> dict[str, Path]:
+        if self.path is None:
+            raise ConfigError(
+                "no file is given", where="maps.cityjson.path", expected="a path", fix="--set maps.cityjson.path=..."
+            )
+        return {"city_model": self.path}
+
+
+class Facet(NamedTuple):
+    """The projection of a surface that is not upright, and its plane z = a x + b y + c."""
+
+    polygon: Polygon
+    plane: np.ndarray
+
+
+def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
+    """Read a city model; the seed changes nothing.
+
+    Raises:
+        ConfigError: no file is given. InputError: the file is malformed; names the object and the field.
+    """
+    cfg.inputs()
+    assert cfg.path is not None
+    model = read_model(cfg.path)
+    objects, offset = _centred(model.objects, cfg.path)
+    facets = {item.object_id: _facets(item) for item in objects}
+    footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
+    boxes = BoxList()
+    footprint_m2 = boxes_m2 = covered_m2 = 0.0
+    for item in objects:
+        footprint = footprints[item.object_id]
+        if item.rule.form == "solid":
+            outline = _add_solid(boxes, cfg, item, footprint)
+            if item.rule.kind == "Buildings":
+                footprint_m2, boxes_m2 = footprint_m2 + footprint.area, boxes_m2 + outline.area
+                covered_m2 += shapely.intersection(footprint, outline).area
+        elif item.rule.form == "wall":
+            _add_wall(boxes, cfg, item, footprint)
+        elif item.rule.kind != "Water":
+            _add_surface(boxes, cfg, item.rule.kind, footprint)
+        if item.rule.kind == "Bridge":
+            _add_surface(boxes, cfg, "Sidewalks", footprint)  # what people walk on
+        if item.rule.form == "green":
+            _add_trees(boxes, cfg, item, facets[item.object_id])
+    _add_water(boxes, cfg, objects, footprints)
+    header = {
+        "name": cfg.name,
+        "source": {
+            "tool": cfg.tool,
+            "version": f"CityJSON {model.version}",
+            "file": cfg.path.name,
+            "licence": cfg.licence,
+        },
+        "ground_z_m": 0.0,
+        "offset_m": {axis: float(offset[k]) for k, axis in enumerate("xyz")},
+        "building_footprint_m2": round(footprint_m2, 1),
+        "building_area_ratio": round(boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
+        "building_covered_share": round(covered_m2 / footprint_m2, 4) if footprint_m2 else None,
+        "num_objects": model.num_objects,
+        "dropped_objects": model.dropped,
+    }
+    return boxes.box_map(header)
+
+
+def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], np.ndarray]:
+    """Move the middle of the map to the origin and the usual height of roads to z = 0; gives the offset too."""
+    corners = np.concatenate([ring for item in objects for surface in item.surfaces for ring in surface])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    if max(high[:2] - low[:2]) > 20_000:
+        raise InputError(
+            "the map is too wide", where=f"{path}: vertices", got=f"{high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m",
+            expected="at most 20 km", fix="cut a part out, or mend the stray vertex",
+        )  # fmt: skip
+    roads = [
+        ring[:, 2]
+        for item in objects
+        if item.rule.kind in ("Roads", "Sidewalks")
+        for surface in item.surfaces
+        for ring in surface
+    ]
+    heights = np.concatenate(roads) if roads else corners[:, 2]
+    ground = float(np.median(heights)) if roads else float(np.percentile(heights, 5))
+    offset = np.array([*np.round((low + high)[:2] / 2), round(ground, 3)])
+    moved = [
+        item._replace(surfaces=[[ring - offset for ring in surface] for surface in item.surfaces]) for item in objects
+    ]
+    return moved, offset
+
+
+def _facets(item: CityObject) -> list[Facet]:
+    """Project the surfaces of an object that are not upright."""
+    facets = []
+    for surface in item.surfaces:
+        ring = surface[0]
+        # Newell's normal: right for any planar ring, whatever its first three corners are. (np.cross is slow on short rings.)
+        after = np.concatenate([ring[1:], ring[:1]])
+        normal = (ring[:, [1, 2, 0]] * after[:, [2, 0, 1]] - ring[:, [2, 0, 1]] * after[:, [1, 2, 0]]).sum(axis=0)
+        if abs(normal[2]) <= STEEP * np.linalg.norm(normal) or abs(normal[2]) < 1e-6:
+            continue
+        a, b = -normal[0] / normal[2], -normal[1] / normal[2]
+        middle = ring.mean(axis=0)
+        plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
+        facets.append(Facet(Polygon(ring[:, :2], [hole[:, :2] for hole in surface[1:]]), plane))
+    return facets
+
+
+# --- boxes ------------------------------------------------------------------------------------------------------------
+
+
+def _add_solid(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint) -> Any:
+    """Add a building as upright boxes from the ground (or below it) to its top; gives the union of their outlines."""
+    low, high = item.heights()
+    low, high = min(low, 0.0), max(high, low + 0.1)
+    outlines = []
+    for polygon in polygons_of(footprint):
+        for rectangle in cover(
+            polygon.simplify(0.05),
+            min_fill=cfg.solid_fill,
+            min_size_m=cfg.solid_piece_m,
+            shares=(0.25, 0.4, 0.5, 0.6, 0.75),
+        ):
+            boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
+            outlines.append(rectangle_polygon(rectangle))
+    return united(outlines)
+
+
+def _add_wall(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint) -> None:
+    """Add a wall piece by piece along its course, as high as the middle of its heights says."""
+    z = np.concatenate([ring[:, 2] for surface in item.surfaces for ring in surface])
+    high = float(np.clip(np.percentile(z, 75), 0.3, cfg.wall_max_m))
+    for polygon in polygons_of(footprint):
+        for rectangle in cover(polygon.simplify(0.02), min_fill=cfg.wall_fill, min_size_m=cfg.wall_piece_m):
+            boxes.add(item.rule.kind, rectangle.center, rectangle.size, -SLAB_M, high, rectangle.yaw_deg)
+
+
+def _add_surface(boxes: BoxList, cfg: CityJsonConfig, kind: str, footprint) -> None:
+    """Add a surface as slabs at the height of its kind: the map is flat, so that nothing of it stands in the way."""
+    top = SURFACE_TOPS_M.get(kind, -0.1)
+    fill, piece_m = (cfg.water_fill, cfg.water_piece_m) if kind == "Water" else (cfg.surface_fill, cfg.surface_piece_m)
+    for polygon in polygons_of(footprint):
+        for rectangle in cover(polygon.simplify(0.05), min_fill=fill, min_size_m=piece_m, max_size_m=cfg.surface_max_m):
+            boxes.add(kind, rectangle.center, rectangle.size, top - SLAB_M, top, rectangle.yaw_deg)
+
+
+def _add_water(boxes: BoxList, cfg: CityJsonConfig, objects: list[CityObject], footprints: dict[str, Any]) -> None:
+    """Add water, cut out where anything crosses it: nobody walks on water, but people walk over bridges."""
+    water = [footprints[item.object_id] for item in objects if item.rule.kind == "Water"]
+    if not water:
+        return
+    crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
+    rest = shapely.difference(united(water), shapely.buffer(united(crossing), 0.05)) if crossing else united(water)
+    _add_surface(boxes, cfg, "Water", rest)
+
+
+def _add_trees(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, facets: list[Facet]) -> None:
+    """Add a vegetation box for every patch of raster cells where the green rises over `canopy_m`."""
+    if not facets:
+        return
+    heights, low = canopy_heights(item, facets, cfg.canopy_cell_m)
+    for x0, y0, x1, y1, top in crowns(heights, cfg.canopy_m, cfg.crown_cells):
+        first, last = (np.array(corner) + low for corner in ((x0, y0), (x1, y1)))
+        size = np.maximum((last - first) * cfg.canopy_cell_m, cfg.crown_min_m)
+        boxes.add("Vegetation", (first + last) / 2 * cfg.canopy_cell_m, size, 0.0, min(top, cfg.canopy_max_m))
+
+
+def canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rasterise the heights of a surface: the highest corner in each cell, and the surface over the cell's middle.
+
+    Returns:
+        heights (nx, ny) m, 0 where there is nothing; the indices (2,) of the first cell, whose low corner is at index * cell_m.
+    """
+    bounds = np.array([facet.polygon.bounds for facet in facets])
+    corners = np.concatenate([ring for surface in item.surfaces for ring in surface])
+    low = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
+    high = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
+    heights = np.zeros(high - low + 1)
+    cells = np.floor(corners[:, :2] / cell_m).astype(int) - low
+    np.maximum.at(heights, (cells[:, 0], cells[:, 1]), corners[:, 2])
+    for facet, (x0, y0, x1, y1) in zip(facets, bounds, strict=True):
+        first = np.ceil(np.array([x0, y0]) / cell_m - 0.5).astype(int)
+        last = np.floor(np.array([x1, y1]) / cell_m - 0.5).astype(int)
+        if (last < first).any():
+            continue  # it lies between the middles
+        ix, iy = (a.ravel() for a in np.meshgrid(*(np.arange(first[k], last[k] + 1) for k in (0, 1)), indexing="ij"))
+        x, y = (ix + 0.5) * cell_m, (iy + 0.5) * cell_m
+        inside = shapely.intersects_xy(facet.polygon, x, y)
+        z = facet.plane[0] * x + facet.plane[1] * y + facet.plane[2]
+        np.maximum.at(heights, (ix[inside] - low[0], iy[inside] - low[1]), z[inside])
+    return heights, low
+
+
+def crowns(heights: np.ndarray, min_height_m: float, max_cells: int) -> list[tuple[int, int, int, int, float]]:
+    """Gather the cells of a canopy into trees, the highest first.
+
+    Args:
+        heights: (nx, ny) m. max_cells: cells along a tree's side at most.
+    Returns:
+        (x0, y0, x1, y1, height) in cells, ends excluded; every cell over `min_height_m` lies in exactly one.
+    """
+    free = heights > min_height_m
+    trees = []
+    for flat in np.argsort(-heights, axis=None, kind="stable"):
+        x, y = (int(k) for k in np.unravel_index(flat, heights.shape))
+        if not heights[x, y] > min_height_m:
+            break
+        if not free[x, y]:
+            continue
+        x0, y0, x1, y1 = x, y, x + 1, y + 1
+        grows = True
+        while grows:
+            grows = False
+            for nx0, ny0, nx1, ny1 in (
+                (x0 - 1, y0, x1, y1),
+                (x0, y0, x1 + 1, y1),
+                (x0, y0 - 1, x1, y1),
+                (x0, y0, x1, y1 + 1),
+            ):
+                fits = nx0 >= 0 and ny0 >= 0 and nx1 <= heights.shape[0] and ny1 <= heights.shape[1]
+                if fits and nx1 - nx0 <= max_cells and ny1 - ny0 <= max_cells and free[nx0:nx1, ny0:ny1].all():
+                    x0, y0, x1, y1, grows = nx0, ny0, nx1, ny1, True
+        free[x0:x1, y0:y1] = False
+        trees.append((x0, y0, x1, y1, float(heights[x0:x1, y0:y1].max())))
+    return trees

@@ -1,0 +1,157 @@
+"""Polygons to oriented rectangles, cut in two, again and again, until the rectangle round a piece is nearly full; and back."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, Roi, RoiPolygon
+
+MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
+JOIN_M = 0.3  # slabs this close hang together
+MIN_REGION_M2 = 100.0
+MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
+
+
+class Rectangle(NamedTuple):
+    """A turned rectangle: centre, full sizes (the first along the yaw direction), m."""
+
+    center: tuple[float, float]
+    size: tuple[float, float]
+    yaw_deg: float
+
+
+def polygons_of(geometry: BaseGeometry) -> list[Polygon]:
+    """Give the polygons with an area in any geometry; lines and points fall away."""
+    if isinstance(geometry, Polygon):
+        return [geometry] if geometry.area > MIN_AREA_M2 else []
+    return [part for child in getattr(geometry, "geoms", ()) for part in polygons_of(child)]
+
+
+def oriented_rectangle(polygon: Polygon) -> Rectangle:
+    """Give the smallest rectangle round a polygon; one side of it lies along a side of the convex hull."""
+    hull = np.asarray(polygon.convex_hull.exterior.coords)
+    edges = np.diff(hull, axis=0)
+    angles = np.unique(np.round(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2), 9))
+    cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    along, across = cos * hull[:, 0] + sin * hull[:, 1], cos * hull[:, 1] - sin * hull[:, 0]
+    sizes = np.stack([np.ptp(along, axis=1), np.ptp(across, axis=1)], axis=1)
+    best = int(np.argmin(sizes.prod(axis=1)))
+    middle = np.array([along[best].min() + along[best].max(), across[best].min() + across[best].max()]) / 2
+    c, s = float(cos[best, 0]), float(sin[best, 0])
+    center = (c * middle[0] - s * middle[1], s * middle[0] + c * middle[1])
+    return Rectangle(center, (float(sizes[best, 0]), float(sizes[best, 1])), float(np.degrees(angles[best])))
+
+
+def rectangle_polygon(rectangle: Rectangle) -> Polygon:
+    """Give a rectangle as a polygon."""
+    return _rectangle_at(rectangle, (-0.5, 0.5), (-0.5, 0.5))
+
+
+def _rectangle_at(rectangle: Rectangle, along: tuple[float, float], across: tuple[float, float]) -> Polygon:
+    """A part of a rectangle, in shares of its sizes from the middle; may reach out of it."""
+    yaw = np.radians(rectangle.yaw_deg)
+    x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
+    y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]
+    corners = ((along[0], across[0]), (along[1], across[0]), (along[1], across[1]), (along[0], across[1]))
+    return Polygon([np.array(rectangle.center) + a * x + b * y for a, b in corners])
+
+
+def cover(
+    polygon: Polygon,
+    *,
+    min_fill: float,
+    min_size_m: float,
+    max_size_m: float = np.inf,
+    shares: tuple[float, ...] = (0.5,),
+) -> list[Rectangle]:
+    """Cover a polygon, holes left out, with oriented rectangles.
+
+    A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece fills it to
+    `min_fill`. Else it is cut across the longer side, at the share (and, with more than one share given, across the side) that leaves the least empty area.
+
+    Args:
+        polygon: valid. shares: where to try to cut, from 0 to 1 along a side.
+    Returns:
+        rectangles that together cover the polygon, apart from pieces below MIN_AREA_M2.
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
+        raise ValueError(f"min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}")
+    done: list[Rectangle] = []
+    waiting = [(piece, 0) for piece in polygons_of(polygon)]
+    while waiting:
+        piece, depth = waiting.pop()
+        rectangle = oriented_rectangle(piece)
+        area = rectangle.size[0] * rectangle.size[1]
+        longest = max(rectangle.size)
+        is_full = piece.area >= min_fill * area and longest <= max_size_m
+        if is_full or area <= MIN_AREA_M2 or longest <= min_size_m or depth == MAX_DEPTH:
+            if min(rectangle.size) > 1e-3:
+                done.append(rectangle)
+            continue
+        waiting += [(part, depth + 1) for part in _cut(piece, rectangle, shares)]
+    return done
+
+
+def _cut(piece: Polygon, rectangle: Rectangle, shares: tuple[float, ...]) -> list[Polygon]:
+    longer = 0 if rectangle.size[0] >= rectangle.size[1] else 1
+    best: tuple[float, list[Polygon]] | None = None
+    for axis in (longer, 1 - longer) if len(shares) > 1 else (longer,):
+        for share in shares:
+            parts: list[Polygon] = []
+            for low, high in ((-0.6, share - 0.5), (share - 0.5, 0.6)):
+                window = _rectangle_at(
+                    rectangle, *(((low, high), (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), (low, high)))
+                )
+                parts += polygons_of(shapely.intersection(piece, window))
+            if len(shares) == 1:
+                return parts
+            empty = sum(float(np.prod(oriented_rectangle(part).size)) for part in parts) - piece.area
+            if best is None or empty < best[0] - 1e-9:
+                best = (empty, parts)
+    assert best is not None
+    return best[1]
+
+
+def united(polygons: list[Polygon]) -> BaseGeometry:
+    """Unite polygons that may be invalid."""
+    return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object))) if polygons else MultiPolygon()
+
+
+def covered_ground(box_map: BoxMap) -> Roi:
+    """Give the region that a map has ground for: what its surfaces and bridges cover, hairline gaps closed.
+
+    Buildings and water need no holes here, for the occupancy grid knows them; a map without surfaces gives its bounds.
+    """
+    kinds = np.array(sorted(GROUND_KINDS | {KINDS["Bridge"], KINDS["Buildings"]}), dtype=np.uint8)
+    has_ground = np.isin(box_map.kinds, np.array(sorted(GROUND_KINDS), dtype=np.uint8)).any()
+    rows = np.flatnonzero(np.isin(box_map.kinds, kinds)) if has_ground else np.empty(0, dtype=int)
+    slabs = []
+    for row in rows:
+        center, size = box_map.centers[row, :2], 2 * box_map.half_extents[row, :2]
+        rectangle = Rectangle((center[0], center[1]), (size[0], size[1]), float(box_map.rotations_deg[row, 1]))
+        slabs.append(rectangle_polygon(rectangle))
+    if not slabs:
+        low, high = box_map.bounds()
+        slabs = [shapely.box(low[0], low[1], high[0], high[1])]
+    region = shapely.buffer(united(slabs), JOIN_M, join_style="mitre")
+    region = shapely.simplify(shapely.buffer(region, -JOIN_M, join_style="mitre"), 0.1)
+    rings = [
+        RoiPolygon(
+            points_world=_ring_points(part.exterior),
+            holes=[_ring_points(r) for r in part.interiors if Polygon(r).area > 4.0],
+        )
+        for part in polygons_of(region)
+        if part.area >= MIN_REGION_M2
+    ]
+    return Roi(description=f"ground of {box_map.name}", polygons=rings)
+
+
+def _ring_points(ring) -> list[tuple[float, float]]:
+    return [(round(x, 3), round(y, 3)) for x, y in ring.coords[:-1]]

@@ -1,0 +1,205 @@
+"""What the synthetic town is made of: trees, benches, and the kinds of building blocks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosfly.maps.boxlist import BoxList
+
+# Tops of the surfaces, m. Two centimetres apart at least: a depth buffer tells them apart at 300 m.
+PAVEMENT_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
+WATER_TOP_M = 0.05  # over the ground, so that it is an obstacle: nobody walks on a pond
+SLAB_M = 0.3
+
+
+def ring(
+    boxes: BoxList, kind: str, low, high, inner_low, inner_high, top_m: float, base_m: float | None = None
+) -> None:
+    """Four slabs round a rectangle."""
+    base = top_m - SLAB_M if base_m is None else base_m
+    boxes.add_span(kind, low, (high[0], inner_low[1]), base, top_m)
+    boxes.add_span(kind, (low[0], inner_high[1]), high, base, top_m)
+    boxes.add_span(kind, (low[0], inner_low[1]), (inner_low[0], inner_high[1]), base, top_m)
+    boxes.add_span(kind, (inner_high[0], inner_low[1]), (high[0], inner_high[1]), base, top_m)
+
+
+def bench(boxes: BoxList, axis: int, along: float, across: float, rng: np.random.Generator) -> None:
+    boxes.add("Static", point(axis, along, across), point(axis, 1.8, 0.55), 0.0, 0.48)
+    boxes.add("Static", point(axis, along + 1.5, across), (0.5, 0.5), 0.0, 0.95)
+    if rng.random() < 0.5:  # the bin's liner: a box inside a box of the same kind
+        boxes.add("Static", point(axis, along + 1.5, across), (0.4, 0.4), 0.05, 0.9)
+
+
+def tree(
+    boxes: BoxList, xy, crown_m: float, height_m: float, rng: np.random.Generator, *, in_parts: bool = False
+) -> None:
+    """One box from the ground to the top, or a stem and overlapping parts of a crown, as simulators export trees."""
+    x, y = xy
+    if not in_parts:
+        boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, height_m)
+        return
+    boxes.add("Vegetation", xy, (0.45, 0.45), 0.0, height_m * 0.5)
+    for part in range(5):
+        size = crown_m * rng.uniform(0.5, 0.65)
+        shift = (crown_m - size) / 2
+        dx, dy = ((-shift, -shift), (shift, -shift), (-shift, shift), (shift, shift), (0.0, 0.0))[part]
+        low = 2.3 + rng.uniform(0.0, 0.8) + (height_m * 0.25 if part == 4 else 0.0)
+        boxes.add(
+            "Vegetation", (x + dx, y + dy), (size, size), low, height_m * (1.0 if part == 4 else rng.uniform(0.75, 0.9))
+        )
+
+
+def point(axis: int, along: float, across: float) -> tuple[float, float]:
+    """A point of a street along x (axis 0) or along y (axis 1)."""
+    return (along, across) if axis == 0 else (across, along)
+
+
+def _ground(boxes: BoxList, kind: str, low: np.ndarray, high: np.ndarray) -> None:
+    top = PAVEMENT_TOP_M if kind == "Sidewalks" else LAWN_TOP_M
+    boxes.add_span(kind, low, high, top - SLAB_M, top)
+
+
+def _park(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Lawns between two crossing paths, a pond with a stone rim, groves, a hedge with openings."""
+    middle = (low + high) / 2
+    lane = 2.0
+    boxes.add_span("Sidewalks", (low[0], middle[1] - lane), (high[0], middle[1] + lane), -SLAB_M, PAVEMENT_TOP_M)
+    for a, b in ((low[1], middle[1] - lane), (middle[1] + lane, high[1])):
+        boxes.add_span("Sidewalks", (middle[0] - lane, a), (middle[0] + lane, b), -SLAB_M, PAVEMENT_TOP_M)
+        boxes.add_span("Terrain", (low[0], a), (middle[0] - lane, b), LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
+        boxes.add_span("Terrain", (middle[0] + lane, a), (high[0], b), LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
+    pond = np.array([middle + np.array((3.5, 3.5)), high - 3.5])
+    boxes.add_span("Water", pond[0] + 0.5, pond[1] - 0.5, -0.8, WATER_TOP_M)
+    ring(boxes, "Static", pond[0], pond[1], pond[0] + 0.5, pond[1] - 0.5, 0.3, base_m=-0.5)
+    for quarter_low, quarter_high in (
+        (low, middle), ((middle[0], low[1]), (high[0], middle[1])), ((low[0], middle[1]), (middle[0], high[1])),
+    ):  # fmt: skip
+        inner = np.array([np.asarray(quarter_low) + 4.5, np.asarray(quarter_high) - 4.5])
+        for _ in range(5):
+            place = rng.uniform(inner[0], inner[1])
+            tree(boxes, place, rng.uniform(4.0, 6.5), rng.uniform(8.0, 14.0), rng, in_parts=rng.random() < 0.5)
+    for y in (low[1] + 0.5, high[1] - 0.5):
+        for a, b in ((low[0], middle[0] - 4.0), (middle[0] + 4.0, high[0])):
+            boxes.add_span("Vegetation", (a, y - 0.4), (b, y + 0.4), 0.0, 1.1)
+    for step in (-11.0, -7.0, 7.0, 11.0):
+        bench(boxes, 0, middle[0] + step, middle[1] - lane + 0.4, rng)
+
+
+def _square(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """A paved square with a hall, a fountain, kiosks and trees in rows."""
+    _ground(boxes, "Sidewalks", low, high)
+    middle, size = (low + high) / 2, high - low
+    hall = np.array([size[0] * 0.5, min(14.0, size[1] * 0.3)])
+    center = np.array([middle[0], high[1] - hall[1] / 2 - 2.0])
+    boxes.add("Buildings", center, hall, -1.5, 9.0)
+    boxes.add("Buildings", center, (6.0, 6.0), 9.0, 17.0)  # a clock tower on the roof
+    boxes.add("Water", (middle[0], middle[1] - 4.0), (5.0, 5.0), -0.6, 0.45)
+    ring(
+        boxes,
+        "Static",
+        middle - np.array((3.0, 7.0)),
+        middle + np.array((3.0, -1.0)),
+        middle - np.array((2.5, 6.5)),
+        middle + np.array((2.5, -1.5)),
+        0.6,
+        -0.4,
+    )
+    for x in np.linspace(low[0] + 4.0, high[0] - 4.0, 6):
+        tree(boxes, (x, low[1] + 3.5), rng.uniform(3.0, 3.8), rng.uniform(5.5, 7.5), rng)
+    for side in (-1, 1):
+        kiosk = (middle[0] + side * size[0] * 0.3, middle[1] - size[1] * 0.12)
+        boxes.add("Static", kiosk, (3.2, 2.6), 0.0, 2.8, yaw_deg=side * 18.0)
+        boxes.add("Static", kiosk, (1.0, 1.0), 0.1, 1.6)  # crates inside it
+        bench(boxes, 1, middle[1] - 4.0, middle[0] + side * 6.0, rng)
+
+
+def _courtyard(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Four L-shaped houses round a green yard, with a passage on every side."""
+    _ground(boxes, "Terrain", low, high)
+    low, high = low + 1.5, high - 1.5
+    middle, depth = (low + high) / 2, min(12.0, 0.24 * (high - low).min())
+    gap = rng.uniform(5.5, 7.0) / 2
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            corner = np.array([low[0] if sx < 0 else high[0], low[1] if sy < 0 else high[1]])
+            height = rng.uniform(10.0, 19.0)
+            _between(boxes, corner, (middle[0] + sx * gap, corner[1] - sy * depth), -2.0, height)
+            lower = height - rng.choice([0.0, 3.0, 6.0])
+            _between(
+                boxes, (corner[0], corner[1] - sy * depth), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower
+            )
+            _between(boxes, corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0), height, height + 2.6)
+            _between(
+                boxes, corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0)), -5.0, -2.2
+            )  # a cellar
+    yard = np.array([low + depth + 4.0, high - depth - 4.0])
+    for _ in range(4):
+        tree(
+            boxes,
+            rng.uniform(yard[0], yard[1]),
+            rng.uniform(3.5, 5.0),
+            rng.uniform(6.0, 9.0),
+            rng,
+            in_parts=rng.random() < 0.5,
+        )
+    bench(boxes, 0, middle[0], middle[1], rng)
+
+
+def _between(boxes: BoxList, a, b, low_m: float, high_m: float, kind: str = "Buildings") -> None:
+    """A box whose footprint has two given opposite corners, in any order."""
+    boxes.add_span(kind, np.minimum(a, b), np.maximum(a, b), low_m, high_m)
+
+
+def _houses(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Two rows of detached houses, slightly turned, back to back with gardens, hedges and garden walls between."""
+    _ground(boxes, "Terrain", low, high)
+    middle = (low + high) / 2
+    columns = max(2, int((high[0] - low[0]) // 18.0))
+    pitch = (high[0] - low[0]) / columns
+    for row, side in ((low[1], 1), (high[1], -1)):
+        for column in range(columns):
+            center = np.array([low[0] + (column + 0.5) * pitch, row + side * 8.5]) + rng.uniform(-0.6, 0.6, 2)
+            width, depth, height = rng.uniform(9.0, 11.0), rng.uniform(8.0, 10.0), rng.uniform(5.6, 7.6)
+            yaw = rng.uniform(-7.0, 7.0)
+            boxes.add("Buildings", center, (width, depth), -0.5, height, yaw)
+            boxes.add("Buildings", center, (width * 0.92, depth * 0.5), height, height + 1.8, yaw)  # the ridge
+            boxes.add("Buildings", center, (width * 0.5, depth * 0.5), 0.2, height - 0.5, yaw)  # rooms inside
+            garden = np.array([center[0] + rng.uniform(-3.0, 3.0), (center[1] + side * 5.0 + middle[1]) / 2])
+            tree(boxes, garden, rng.uniform(2.8, 4.2), rng.uniform(4.0, 7.0), rng, in_parts=rng.random() < 0.3)
+            if column:
+                edge = low[0] + column * pitch
+                _between(
+                    boxes,
+                    (edge - 0.12, center[1] + side * 1.0),
+                    (edge + 0.12, middle[1] - side * 3.5),
+                    -0.2,
+                    1.7,
+                    "Walls",
+                )
+    for column in range(columns):
+        a = low[0] + column * pitch + 3.5
+        boxes.add_span("Fences", (a, middle[1] - 0.06), (a + pitch - 5.5, middle[1] + 0.06), -0.1, 1.2)
+    for column in range(columns):
+        a = low[0] + column * pitch
+        boxes.add_span("Vegetation", (a + 0.6, low[1] + 0.4), (a + pitch * 0.55, low[1] + 1.2), 0.0, 1.0)
+
+
+def _towers(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Two towers on podiums, one lower slab between them, on a paved plot."""
+    _ground(boxes, "Sidewalks", low, high)
+    size = high - low
+    for number, share in enumerate((np.array([0.27, 0.3]), np.array([0.72, 0.7]))):
+        center = low + size * share
+        podium = np.array([size[0] * 0.4, size[1] * 0.42])
+        yaw = float(rng.choice([0.0, 0.0, -12.0, 15.0])) if number else 0.0
+        boxes.add("Buildings", center, podium, -1.0, 5.0)
+        boxes.add("Buildings", center, podium * rng.uniform(0.6, 0.72), 5.0, rng.uniform(20.0, 35.0), yaw)
+        boxes.add("Buildings", center + podium * 0.1, (5.0, 5.0), 1.0, 18.0, yaw)  # the lift shaft, inside
+    boxes.add(
+        "Buildings", low + size * (0.73, 0.22), size * (0.34, 0.2), -1.0, rng.uniform(8.0, 12.0), rng.uniform(-9.0, 9.0)
+    )
+    for place in ((0.2, 0.62), (0.32, 0.72), (0.2, 0.84), (0.34, 0.9)):
+        tree(boxes, low + size * place, rng.uniform(3.2, 4.4), rng.uniform(6.0, 9.0), rng, in_parts=rng.random() < 0.5)
+
+
+BLOCKS = {"park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers}

@@ -1,0 +1,543 @@
+"""Step 1: the three sources, their conversions, their errors, and known answers on real maps."""
+
+import copy
+import gzip
+import json
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import Point, Polygon, box
+
+from cosfly.config import build
+from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.maps import MapsConfig, load_map, run
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.cityjson import CityJsonConfig, crowns
+from cosfly.maps.cityjson_file import read_model, rule_of
+from cosfly.maps.footprints import Rectangle, cover, covered_ground, oriented_rectangle, rectangle_polygon, united
+from cosfly.maps.overview import draw_overview
+from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
+from cosfly.schema import KINDS, BoxMap, read_boxes, read_roi
+from cosfly.simplify import SimplifyConfig, cross_validate, simplify
+
+
+def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
+    return box_map.select(np.isin(box_map.kinds, [KINDS[kind] for kind in kinds]))
+
+
+def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
+    """The exact oriented rectangle of a box."""
+    yaw = float(box_map.rotations_deg[row, 1]) if with_yaw else 0.0
+    size = 2 * box_map.half_extents[row, :2]
+    x, y = box_map.centers[row, :2]
+    return shapely.affinity.rotate(box(x - size[0] / 2, y - size[1] / 2, x + size[0] / 2, y + size[1] / 2), yaw)
+
+
+# --- synthetic --------------------------------------------------------------------------------------------------------
+
+
+def test_towns_follow_their_seed():
+    one, two, other = (load_map(MapsConfig(), seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.centers, two.centers)
+    assert len(one) != len(other) or not np.array_equal(one.centers, other.centers)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_town_has_what_the_passes_and_the_walks_need(seed):
+    town = load_map(MapsConfig(), seed=seed)
+    kinds = set(town.counts())
+    assert kinds >= {
+        "Roads", "Sidewalks", "Terrain", "RoadLines", "Buildings", "Vegetation", "Poles", "TrafficLight", "TrafficSigns",
+        "Car", "Truck", "Static", "Fences", "Water",
+    }  # fmt: skip
+    tops = boxes_of(town, "Buildings").maxs[:, 2]
+    assert 20 < tops.max() <= 38
+    assert (town.maxs[:, 2] < -0.5).any(), "something to crop below the ground"
+    result = simplify(town, SimplifyConfig())
+    counts = [sum(c.values()) for _, c in result.passes]
+    assert counts[1] < counts[0]  # merged
+    assert counts[3] < counts[2]  # below the ground
+    assert counts[4] < counts[3]  # nested
+    walkable = cross_validate(town, result.box_map)
+    assert walkable["simplified_largest_part_m2"] > 45_000
+    assert walkable["simplified_largest_part_m2"] > 0.98 * walkable["simplified_walkable_m2"]
+
+
+def test_surfaces_of_a_town_do_not_share_a_plane():
+    town = load_map(MapsConfig())
+    for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
+        tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
+        assert abs(tops[0].max() - tops[1].max()) > 0.015
+
+
+def test_nothing_parks_in_a_house():
+    town = load_map(MapsConfig())
+    houses = united([footprint(m, row) for m in [boxes_of(town, "Buildings")] for row in range(len(m))])
+    vehicles = boxes_of(town, "Car", "Truck")
+    assert len(vehicles) > 50
+    assert not any(footprint(vehicles, row).intersects(houses) for row in range(len(vehicles)))
+
+
+def test_a_town_without_room_for_blocks_is_a_config_error():
+    with pytest.raises(ConfigError, match="raise size_m or lower num_blocks"):
+        build(MapsConfig, {"synthetic": {"size_m": 150}}, "x")
+
+
+@pytest.mark.parametrize(("size_m", "num_blocks"), [(110.0, 1), (420.0, 5)])
+def test_towns_of_other_sizes(size_m, num_blocks):
+    town = load_map(build(MapsConfig, {"synthetic": {"size_m": size_m, "num_blocks": num_blocks}}, "x"))
+    low, high = town.bounds()
+    np.testing.assert_allclose((high - low)[:2], size_m)
+    assert "Buildings" in town.counts()
+
+
+# --- simworld ---------------------------------------------------------------------------------------------------------
+
+
+def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0, scale: float = 1.0) -> dict:
+    return {
+        "id": f"GEN_{name}",
+        "instance_name": name,
+        "properties": {
+            "location": {"x": x, "y": y, "z": z},
+            "orientation": {"pitch": 0, "yaw": yaw, "roll": 0},
+            "scale": {"x": scale, "y": scale, "z": scale},
+        },
+    }
+
+
+def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWorldConfig:
+    table = {"BP_Building_01_C": (2000, 1000, 3000), "BP_Tree1_C": (800, 600, 1200), "BP_Can_C": (256, 256, 256)}
+    groups = {"all": {name: {"bbox": dict(zip("xyz", size, strict=True))} for name, size in (sizes or table).items()}}
+    (folder / "world.json").write_text(json.dumps({"base_map": "x", "nodes": list(nodes)}))
+    (folder / "Bbox.json").write_text(json.dumps(groups))
+    return SimWorldConfig(world=folder / "world.json")
+
+
+def simworld(cfg: SimWorldConfig) -> BoxMap:
+    return load_map(MapsConfig(source="simworld", simworld=cfg))
+
+
+def test_unreal_axes_become_right_handed_metres(tmp_path: Path):
+    city = simworld(write_world(tmp_path, node("BP_Building_01_C", 5000, 3000, yaw=30.0)))
+    house = boxes_of(city, "Buildings")
+    np.testing.assert_allclose(house.centers, [(50, -30, 15)])
+    np.testing.assert_allclose(house.half_extents, [(10, 5, 15)])
+    np.testing.assert_allclose(house.rotations_deg, [(0, -30, 0)])
+
+
+def test_sizes_scale_and_placeholders_get_plausible_sizes(tmp_path: Path):
+    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0, z=20, scale=2.0), node("BP_Can_C", 900, 0, z=20))
+    city = simworld(cfg)
+    tree, can = boxes_of(city, "Vegetation"), boxes_of(city, "Static")
+    np.testing.assert_allclose(tree.half_extents[0, :2], (8, 6))
+    np.testing.assert_allclose((tree.mins[0, 2], tree.maxs[0, 2]), (0, 24.2))  # lets its foot down 20 cm
+    assert can.half_extents.max() < 0.6
+    assert city.header["extent_sources"] == {"road": 0, "bbox": 1, "engine": 0, "default": 1}
+
+
+def test_roads_take_their_width_from_what_stands_beside_them(tmp_path: Path):
+    houses = [node("BP_Building_01_C", x, side * 2500) for x in (-6000, 0, 6000) for side in (-1, 1)]
+    cans = [node("BP_Can_C", x, side * 900) for x in (-5000, -2000, 2000, 5000) for side in (-1, 1)]
+    city = simworld(write_world(tmp_path, node("BP_Road1_C", 0, 0), *houses, *cans))
+    assert city.header["roads"] == {"carriageway_m": 17.0, "front_to_front_m": 40.0}
+    roads, pavements = boxes_of(city, "Roads"), boxes_of(city, "Sidewalks")
+    for one, other in combinations([footprint(m, k) for m in (roads, pavements) for k in range(len(m))], 2):
+        assert one.intersection(other).area < 1e-6, "slabs overlap"
+    ground = united([footprint(m, k) for m in (roads, pavements) for k in range(len(m))])
+    assert ground.covers(box(-100, -19.9, 100, 19.9))
+    assert roads.maxs[:, 2].max() <= 0
+    assert pavements.maxs[:, 2].max() <= 0
+
+
+def broken_worlds() -> list:
+    good = node("BP_Building_01_C", 0, 0)
+    cases = []
+    for field, change in {
+        "nodes[0] (GEN_BP_Building_01_C).properties.location.x": lambda n: n["properties"]["location"].update(x="far"),
+        "nodes[0] (GEN_BP_Building_01_C).properties.scale": lambda n: n["properties"]["scale"].update(x=-1.0),
+        "nodes[0] (GEN_BP_Building_01_C).properties.orientation.yaw": lambda n: n["properties"]["orientation"].pop(
+            "yaw"
+        ),
+        "nodes[0] (GEN_BP_Building_01_C).properties.orientation": lambda n: n["properties"]["orientation"].update(
+            roll=9
+        ),
+        "GEN_BP_Building_01_C.instance_name": lambda n: n.update(instance_name="BP_Spaceship_C"),
+    }.items():
+        bad = copy.deepcopy(good)
+        change(bad)
+        cases.append(pytest.param(bad, field, id=field))
+    return cases
+
+
+@pytest.mark.parametrize(("bad", "field"), broken_worlds())
+def test_malformed_worlds_name_the_node_and_the_field(tmp_path: Path, bad: dict, field: str):
+    cfg = write_world(tmp_path, bad)
+    with pytest.raises(InputError) as caught:
+        simworld(cfg)
+    assert str(caught.value.where).endswith(field)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"nodes": []}', '{"nodes": 3}', '{"nodes": [3]}', '{"nodes": [NaN]}']
+)
+def test_what_is_no_world_is_an_input_error(tmp_path: Path, text: str):
+    cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0))
+    (tmp_path / "world.json").write_text(text)
+    with pytest.raises(InputError, match=r"world\.json"):
+        simworld(cfg)
+
+
+def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
+    cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
+    with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
+        simworld(cfg)
+    cfg = cfg.model_copy(update={"unknown": "drop"})
+    assert simworld(cfg).header["dropped_objects"] == {"unknown_asset": 1}
+    run(MapsConfig(source="simworld", simworld=cfg), tmp_path / "out")
+    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    assert manifest["counts"] == {"input": 2, "kept": 1, "dropped": {"unknown_asset": 1}, "failed": {}}
+
+
+def test_the_asset_table_tells_road_furniture_from_roads():
+    names = {
+        "BP_Road1_C": "Roads",
+        "BP_RoadCone_C": "Static",
+        "BP_RoadBlocker_C": "Static",
+        "BP_Scooter_02_C": "Motorcycle",
+    }
+    assert {name: asset_of(name).kind for name in names} == names
+    assert asset_of("Zeppelin") is None
+    assert {asset.kind for asset in ASSETS} <= set(KINDS)
+
+
+def test_a_source_without_a_file_is_a_config_error():
+    for source in ("simworld", "cityjson"):
+        with pytest.raises(ConfigError, match=f"maps.{source}"):
+            load_map(MapsConfig(source=source))
+
+
+def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:
+    """Pairs whose exact rectangles overlap by more than 5 cm: still do when both have lost 2.5 cm on every side."""
+    shapes = [
+        footprint(buildings, row, with_yaw=with_yaw).buffer(-0.025, join_style="mitre") for row in range(len(buildings))
+    ]
+    return sum(one.intersects(other) for one, other in combinations(shapes, 2))
+
+
+def progen_city(shared_data: Path) -> BoxMap:
+    return simworld(SimWorldConfig(world=shared_data / "simworld-progen" / "progen_world.json"))
+
+
+def test_known_answer_no_buildings_overlap_with_yaw_and_19_pairs_without(shared_data: Path):
+    city = progen_city(shared_data)
+    buildings = boxes_of(city, "Buildings")
+    assert len(buildings) == 66
+    assert overlapping_pairs(buildings, with_yaw=True) == 0
+    assert overlapping_pairs(buildings, with_yaw=False) == 19
+    assert city.counts()["Vegetation"] == 214
+    assert city.header["extent_sources"] | {"road": 0} == {"road": 0, "bbox": 280, "engine": 0, "default": 155}
+
+
+@pytest.mark.parametrize(("world", "pairs"), [("middle_mode_road_20", 24), ("sample_task_dist_11", 27)])
+def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pairs: int):
+    folder = shared_data / "simworld-robotics"
+    sizes = [folder / "Bbox_total.json", shared_data / "simworld-progen" / "Bbox.json"]
+    city = simworld(SimWorldConfig(world=folder / world / "progen_world.json", sizes=sizes))
+    buildings = boxes_of(city, "Buildings")
+    assert overlapping_pairs(buildings, with_yaw=True) == 0
+    assert overlapping_pairs(buildings, with_yaw=False) == pairs
+
+
+def test_the_real_city_stays_walkable(shared_data: Path):
+    city = progen_city(shared_data)
+    walkable = cross_validate(city, simplify(city, SimplifyConfig()).box_map)
+    assert walkable["simplified_largest_part_m2"] > 0.99 * walkable["simplified_walkable_m2"]
+    assert walkable["simplified_walkable_m2"] > 400_000
+    paper = simplify(city, SimplifyConfig(min_fill=0.0, min_canopy_fill=0.0, trunk="full")).box_map
+    assert cross_validate(city, paper)["simplified_walkable_m2"] < 0.75 * walkable["simplified_walkable_m2"]
+
+
+# --- footprints -------------------------------------------------------------------------------------------------------
+
+
+def test_the_smallest_rectangle_is_found_at_any_angle():
+    for yaw in (0.0, 12.0, 45.0, 80.0):
+        shape = rectangle_polygon(Rectangle((5.0, -3.0), (8.0, 2.0), yaw))
+        found = oriented_rectangle(shape)
+        assert sorted(found.size) == pytest.approx([2.0, 8.0])
+        assert rectangle_polygon(found).symmetric_difference(shape).area < 1e-6
+
+
+@pytest.mark.parametrize("shares", [(0.5,), (0.25, 0.5, 0.75)])
+def test_covers_hold_the_polygon_and_leave_courtyards_free(shares):
+    ring = Point(0, 0).buffer(100, quad_segs=64).difference(Point(0, 0).buffer(90, quad_segs=64))
+    rectangles = cover(ring, min_fill=0.8, min_size_m=2.0, shares=shares)
+    union = united([rectangle_polygon(r) for r in rectangles])
+    assert ring.difference(union).area < 0.001 * ring.area
+    assert union.area < 1.2 * ring.area
+    assert not union.contains(Point(0, 0))
+    assert max(max(r.size) for r in rectangles) < 100  # a single box would be 200 m wide
+
+
+def test_covers_cut_what_is_too_long():
+    rectangles = cover(box(0, 0, 300, 4), min_fill=0.8, min_size_m=2.0, max_size_m=60.0)
+    assert max(max(r.size) for r in rectangles) <= 60
+    assert sum(np.prod(r.size) for r in rectangles) == pytest.approx(1200)
+
+
+def test_covers_reject_bad_settings():
+    with pytest.raises(ValueError, match="min_fill"):
+        cover(box(0, 0, 1, 1), min_fill=0.0, min_size_m=1.0)
+
+
+def test_covered_ground_has_holes_where_there_is_nothing():
+    boxes = BoxList()
+    for low, high in (((0, 0), (40, 10)), ((0, 30), (40, 40)), ((0, 10), (10, 30)), ((30, 10), (40, 30))):
+        boxes.add_span("Roads", low, high, -0.3, 0.0)
+    boxes.add_span("Static", (60, 60), (70, 70), 0.0, 1.0)
+    (ring,) = covered_ground(boxes.box_map({})).rings()
+    assert Polygon(ring.points_world, ring.holes).area == pytest.approx(1600 - 400, abs=1.0)
+
+
+def test_boxes_without_a_size_are_refused():
+    with pytest.raises(ValueError, match="empty box"):
+        BoxList().add("Roads", (0, 0), (1, 0), 0, 1)
+
+
+# --- cityjson ---------------------------------------------------------------------------------------------------------
+
+
+def prism(low: tuple, high: tuple, first: int) -> tuple[list, list]:
+    """Vertices, in mm, and the outer shell of an upright box."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    vertices = [(x, y, z) for z in (z0, z1) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+    faces = [(3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+    return [[round(1000 * c) for c in v] for v in vertices], [[[first + k for k in face]] for face in faces]
+
+
+def city_model() -> dict:
+    """A house of 10 x 6 m at (100, 50), 12 m high; a road along it at z = 2; a lawn with one tall corner."""
+    house, shell = prism((100, 50, 2), (110, 56, 14), 0)
+    road = [[80_000, 40_000, 2000], [140_000, 40_000, 2000], [140_000, 46_000, 2000], [80_000, 46_000, 2000]]
+    lawn = [[80_000, 60_000, 2000], [110_000, 60_000, 2000], [80_000, 90_000, 2000], [110_000, 90_000, 10_000]]
+    return {
+        "type": "CityJSON",
+        "version": "2.0",
+        "transform": {"scale": [0.001] * 3, "translate": [0.0, 0.0, 0.0]},
+        "vertices": house + road + lawn,
+        "CityObjects": {
+            "house": {"type": "Building", "geometry": [{"type": "Solid", "lod": "1", "boundaries": [shell]}]},
+            "road": {
+                "type": "Road",
+                "attributes": {"function": "rijbaan"},
+                "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[8, 9, 10, 11]]]}],
+            },
+            "lawn": {
+                "type": "PlantCover",
+                "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[12, 13, 14]], [[13, 15, 14]]]}],
+            },
+            "parent": {"type": "Building", "children": ["house"]},
+        },
+    }
+
+
+def city(tmp_path: Path, model: dict) -> BoxMap:
+    path = tmp_path / "city.json"
+    path.write_text(json.dumps(model))
+    return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path)))
+
+
+def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
+    boxes = city(tmp_path, city_model())
+    assert boxes.header["offset_m"] == {"x": 110.0, "y": 65.0, "z": 2.0}
+    house = boxes_of(boxes, "Buildings")
+    np.testing.assert_allclose(np.r_[house.mins[0], house.maxs[0]], (-10, -15, 0, 0, -9, 12), atol=1e-6)
+    assert boxes.header["building_area_ratio"] == pytest.approx(1.0, abs=1e-3)
+    roads = boxes_of(boxes, "Roads")
+    assert roads.maxs[:, 2].max() <= 0
+    assert roads.half_extents.max() <= 30
+    assert united([footprint(roads, k) for k in range(len(roads))]).area == pytest.approx(360, rel=0.01)
+    trees = boxes_of(boxes, "Vegetation")
+    assert len(trees) > 1
+    assert (trees.mins[:, 2] == 0).all()
+    assert 2.5 < trees.maxs[:, 2].min() < trees.maxs[:, 2].max() <= 8.0
+    assert trees.half_extents[:, :2].max() <= 3.0
+    assert boxes.header["dropped_objects"] == {"no_geometry": 1}
+    assert boxes.header["num_objects"] == 4
+
+
+def test_versions_gzip_and_nesting_give_the_same_map(tmp_path: Path):
+    model = city_model()
+    plain = city(tmp_path, model)
+    shell = model["CityObjects"]["house"]["geometry"][0]["boundaries"][0]
+    model["CityObjects"]["house"]["geometry"] = [
+        {"type": "MultiSurface", "lod": "0", "boundaries": [shell[0]]},
+        {"type": "CompositeSolid", "lod": "1.2", "boundaries": [[shell]]},
+    ]
+    model["version"] = "1.1"
+    path = tmp_path / "city.json.gz"
+    path.write_bytes(gzip.compress(json.dumps(model).encode()))
+    packed = load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path)))
+    np.testing.assert_array_equal(plain.centers, packed.centers)
+
+
+def test_courtyards_stay_open(tmp_path: Path):
+    model = city_model()
+    outer = [[0, 0], [40, 0], [40, 40], [0, 40]]
+    inner = [[10, 10], [10, 30], [30, 30], [30, 10]]
+    first = len(model["vertices"])
+    model["vertices"] += [[1000 * x, 1000 * y, z] for z in (2000, 9000) for x, y in outer + inner]
+    roof, floor = ([[first + k + 4 * (2 * level + part) for k in range(4)] for part in (0, 1)] for level in (1, 0))
+    model["CityObjects"]["court"] = {
+        "type": "BuildingPart",
+        "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [roof, floor]}],
+    }
+    boxes = city(tmp_path, model)
+    houses = boxes_of(boxes, "Buildings")
+    union = united([footprint(houses, k) for k in range(len(houses))])
+    court = Point(20 - boxes.header["offset_m"]["x"], 20 - boxes.header["offset_m"]["y"])
+    assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
+    assert 1259.9 < union.area < 1260 / 0.9
+
+
+def change(model: dict, path: str, value) -> None:
+    *parents, last = path.split("/")
+    for key in parents:
+        model = model[int(key) if isinstance(model, list) else key]
+    model[int(last) if isinstance(model, list) else last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("type", "FeatureCollection", "type: not a CityJSON file"),
+        ("version", "0.9", "version: unknown version; got '0.9'"),
+        ("CityObjects", {}, "CityObjects: no city objects"),
+        ("transform", {"scale": [1, 1]}, "transform.scale"),
+        ("vertices", [[0, 0]], "vertices"),
+        ("vertices", [[0, 0, "high"]], "vertices"),
+        ("CityObjects/house", 3, "CityObjects.house.type"),
+        ("CityObjects/house/geometry", 3, "CityObjects.house.geometry: not a list of geometries"),
+        ("CityObjects/house/geometry/0/boundaries", [[[["a"]]]], "house.geometry[0].boundaries surface 0: not a ring"),
+        ("CityObjects/road/geometry/0/boundaries", [[[8, 9, 99]]], "road.geometry[0].boundaries surface 0: no such vertex; got 99"),
+        ("CityObjects/road/geometry/0/boundaries", [[[8, 9, -1]]], "road.geometry[0].boundaries surface 0: no such vertex; got -1"),
+        ("CityObjects/road/geometry/0/boundaries", 5, "road.geometry[0].boundaries: not nested as its type says"),
+        ("CityObjects/road/geometry/0/boundaries", [[[8, 9]]], "road.geometry[0].boundaries surface 0: not a ring"),
+        ("vertices/8", [10**9, 0, 0], "vertices: the map is too wide"),
+    ],
+)  # fmt: skip
+def test_malformed_city_models_name_the_object_and_the_field(tmp_path: Path, path: str, value, words: str):
+    model = city_model()
+    change(model, path, value)
+    with pytest.raises(InputError) as caught:
+        city(tmp_path, model)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"[]", b"\x1f\x8b\x08broken", b'{"type": NaN}', gzip.compress(b"{}" * 999)[:20]]
+)
+def test_damaged_files_are_input_errors(tmp_path: Path, data: bytes):
+    path = tmp_path / "city.json.gz"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"city\.json\.gz"):
+        read_model(path)
+
+
+def test_rules_go_by_type_and_attribute():
+    assert rule_of("Road", {"function": "voetpad op trap"}).kind == "Sidewalks"
+    assert rule_of("Road", {"function": "rijbaan lokale weg"}).kind == "Roads"
+    assert rule_of("GenericCityObject", {"bgt_type": "muur"}).kind == "Walls"
+    assert rule_of("+GenericCityObject", {}).kind == "Static"
+    assert rule_of("CityObjectGroup", {}) is None
+
+
+def test_crowns_take_every_cell_once():
+    rng = np.random.default_rng(0)
+    heights = rng.uniform(0, 8, (17, 23))
+    taken = np.zeros(heights.shape, dtype=int)
+    for x0, y0, x1, y1, top in crowns(heights, 3.0, 3):
+        taken[x0:x1, y0:y1] += 1
+        assert x1 - x0 <= 3
+        assert y1 - y0 <= 3
+        assert top == heights[x0:x1, y0:y1].max()
+    np.testing.assert_array_equal(taken, (heights > 3.0).astype(int))
+
+
+@pytest.fixture(scope="module")
+def delft() -> BoxMap:
+    path = Path(__file__).resolve().parents[2] / "shared" / "data" / "delft-bgt-lod1" / "delft.json.gz"
+    if not path.is_file():
+        pytest.skip(f"the real map is not here: {path}")
+    return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(name="Delft", path=path)))
+
+
+def test_delft_is_cut_up(delft: BoxMap):
+    assert delft.header["num_objects"] == 570
+    assert delft.header["dropped_objects"] == {}
+    assert delft.header["building_covered_share"] > 0.995
+    assert 1.0 <= delft.header["building_area_ratio"] < 1.08
+    assert 2 * delft.half_extents.max() < 100
+    obstacles = boxes_of(delft, "Walls", "Vegetation", "Static")
+    standing = obstacles.select(obstacles.maxs[:, 2] > 0.1)
+    assert 2 * standing.half_extents[:, :2].max() < 30
+    surfaces = boxes_of(delft, "Roads", "Sidewalks", "Ground", "Terrain", "Water", "Bridge")
+    assert surfaces.maxs[:, 2].max() <= 0
+    assert 0.1 < delft.header["offset_m"]["z"] < 0.5
+    np.testing.assert_allclose(sum(delft.bounds())[:2], 0, atol=25)
+
+
+def test_delft_stays_walkable(delft: BoxMap):
+    walkable = cross_validate(delft, simplify(delft, SimplifyConfig()).box_map)
+    assert walkable["simplified_largest_part_m2"] > 0.9 * walkable["simplified_walkable_m2"]
+    assert walkable["iou"] > 0.9
+    paper = simplify(delft, SimplifyConfig(min_fill=0.0)).box_map
+    assert boxes_of(paper, "Buildings").half_extents.max() > 80, "the rule that the guard is for"
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
+    product = run(MapsConfig(), tmp_path / "one", seed=5)
+    run(MapsConfig(), tmp_path / "two", seed=5)
+    names = ("boxes_3d.json", "roi_polygon.json", "map.png")
+    first = [(tmp_path / "one" / name).read_bytes() for name in names]
+    assert first == [(tmp_path / "two" / name).read_bytes() for name in names]
+    for name in ("manifest.json", "map.png"):  # as a kill before the end leaves it
+        (tmp_path / "one" / name).unlink()
+    run(MapsConfig(), tmp_path / "one", seed=5)
+    assert first == [(tmp_path / "one" / name).read_bytes() for name in names]
+    with pytest.raises(ResumeError, match="seed was 5, is 6"):
+        run(MapsConfig(), tmp_path / "one", seed=6)
+    assert read_boxes(product).header["source"]["seed"] == 5
+    assert read_roi(tmp_path / "one/roi_polygon.json").rings()
+
+
+def test_stage_notices_a_changed_world(tmp_path: Path):
+    cfg = MapsConfig(source="simworld", simworld=write_world(tmp_path, node("BP_Building_01_C", 0, 0)))
+    run(cfg, tmp_path / "out")
+    write_world(tmp_path, node("BP_Building_01_C", 100, 0))
+    with pytest.raises(ResumeError, match="input world"):
+        run(cfg, tmp_path / "out")
+
+
+def test_stage_names_a_missing_file(tmp_path: Path):
+    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "nowhere.json"))
+    with pytest.raises(InputError, match=r"nowhere\.json"):
+        run(cfg, tmp_path / "out")
+
+
+def test_the_overview_is_north_up():
+    boxes = BoxList()
+    boxes.add_span("Terrain", (0, 0), (100, 100), -1, 0)
+    boxes.add_span("Water", (60, 80), (100, 100), -1, 0.1)
+    picture = draw_overview(boxes.box_map({}), size_px=104).astype(int)
+    assert picture[12, 90, 2] > picture[12, 90, 0] + 50  # blue, top right
+    assert picture[90, 90, 1] > picture[90, 90, 2] + 20  # green, bottom right

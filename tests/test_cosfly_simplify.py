@@ -1,0 +1,358 @@
+"""Step 2: each pass against hand-made tables, slow obvious versions, and properties; then the stage."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly.config import build
+from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.merge import MergeRule, clusters, fill_share, merge
+from cosfly.schema import KINDS, BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.simplify import SimplifyConfig, crop_below_ground, cross_validate, prune_nested, run, simplify
+
+VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
+PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
+
+
+def box_map(*rows, ids=None, header=None) -> BoxMap:
+    """Rows of kind, low corner, high corner and, optionally, yaw in degrees."""
+    lows, highs = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
+    rotations = [[0.0, row[3] if len(row) > 3 else 0.0, 0.0] for row in rows]
+    kinds = [KINDS[row[0]] for row in rows]
+    return make_box_map((lows + highs) / 2, (highs - lows) / 2, rotations, kinds, ids, header)
+
+
+def only(what: str, **settings_) -> SimplifyConfig:
+    """Settings with one pass switched on."""
+    passes = dict.fromkeys(("merge", "crop_tree", "crop_below_ground", "prune_nested"), False)
+    return SimplifyConfig(**{**passes, what: True, **settings_})
+
+
+def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform([0, 0, -4], [size_m, size_m, 8], (count, 3))
+    rotations = np.zeros((count, 3))
+    rotations[:, 1] = rng.choice([0.0, 0.0, 30.0, -65.0], count)
+    kinds = rng.choice([VEGETATION, BUILDINGS, STATIC, ROADS], count)
+    ids = rng.choice(10 * count, count, replace=False)
+    return make_box_map(centers, rng.uniform(0.2, 3.0, (count, 3)), rotations, kinds, ids)
+
+
+# --- merge ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "gap", "count"),
+    [
+        ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
+        ("Vegetation", (2.001, 0, 0), 2),
+        ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
+        ("Vegetation", (-0.5, -0.5, -0.5), 1),  # overlap
+        ("Buildings", (5.0, 0, 0), 1),
+        ("Buildings", (5.0, 5.1, 0), 2),
+        ("Static", (0.0, 0, 0), 2),  # not merged by default
+    ],
+)
+def test_merge_follows_the_gap_rule(kind, gap, count):
+    shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
+    pair = box_map((kind, (0, 0, 0), (1, 1, 1)), (kind, shift, shift + 1))
+    merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map
+    assert len(merged) == count
+    if count == 1:
+        assert merged.ids.tolist() == [1]
+        np.testing.assert_allclose(merged.mins[0], np.minimum(0, shift))
+        np.testing.assert_allclose(merged.maxs[0], np.maximum(1, shift + 1))
+
+
+def test_merge_keeps_the_rotation_of_what_stands_alone():
+    lone = box_map(("Buildings", (0, 0, 0), (9, 4, 5), 30.0), ("Buildings", (50, 0, 0), (59, 4, 5), 10.0))
+    merged = simplify(lone, only("merge")).box_map
+    assert merged.rotations_deg[:, 1].tolist() == [30.0, 10.0]
+
+
+def test_kinds_never_merge_with_each_other():
+    touching = box_map(("Buildings", (0, 0, 0), (4, 4, 5)), ("Vegetation", (4, 0, 0), (8, 4, 5)))
+    assert len(simplify(touching, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map) == 2
+
+
+def slow_clusters(mins, maxs, gap_m):
+    """All pairs, then spreading labels until nothing changes."""
+    labels = np.arange(len(mins))
+    gaps = np.maximum(mins[:, None] - maxs[None], mins[None] - maxs[:, None]).max(axis=-1)
+    near = gaps <= gap_m + 1e-9
+    while True:
+        spread = np.array([labels[near[i]].min() for i in range(len(mins))])
+        if (spread == labels).all():
+            return labels
+        labels = spread
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 60), gap_m=st.sampled_from([0.0, 0.5, 2.0, 5.0]))
+def test_clusters_equal_the_slow_version(seed, count, gap_m):
+    boxes = random_map(seed, count, 60.0)
+    np.testing.assert_array_equal(clusters(boxes.mins, boxes.maxs, gap_m), slow_clusters(boxes.mins, boxes.maxs, gap_m))
+
+
+def test_clusters_reject_bad_arguments():
+    with pytest.raises(ValueError, match="gap_m"):
+        clusters(np.zeros((1, 3)), np.ones((1, 3)), -1.0)
+    with pytest.raises(ValueError, match="mins and maxs"):
+        clusters(np.zeros((1, 2)), np.ones((1, 2)), 1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), min_fill=st.sampled_from([0.0, 0.5, 0.85, 1.0]))
+def test_merged_boxes_enclose_their_members_and_fill_enough(seed, min_fill):
+    boxes = random_map(seed, 60)
+    merged = merge(boxes, {VEGETATION: MergeRule(2.0, min_fill), BUILDINGS: MergeRule(5.0, min_fill)})
+    assert len(set(merged.ids.tolist())) == len(merged)
+    assert set(merged.ids.tolist()) <= set(boxes.ids.tolist())
+    for kind, low, high in zip(boxes.kinds, boxes.mins, boxes.maxs, strict=True):
+        same = merged.kinds == kind
+        assert ((merged.mins[same] <= low + 1e-9) & (merged.maxs[same] >= high - 1e-9)).all(axis=1).any()
+
+
+def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_does_not():
+    turn = np.radians(40.0)
+    rows = []
+    for side in (-6.0, 6.0):
+        for along in np.arange(-30, 31, 10.0):
+            x, y = along * np.cos(turn) - side * np.sin(turn), along * np.sin(turn) + side * np.cos(turn)
+            rows.append(("Buildings", (x - 5, y - 2.5, 0), (x + 5, y + 2.5, 8), 40.0))
+    street = box_map(*rows)
+    plain = simplify(street, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map
+    guarded = simplify(street, only("merge")).box_map
+    assert len(plain) == 1
+    assert len(guarded) > 1
+    walkable = [cross_validate(street, m)["simplified_walkable_m2"] for m in (plain, guarded)]
+    assert walkable[0] == 0.0
+    assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
+
+
+def test_the_parts_of_one_round_crown_become_one_box():
+    rng = np.random.default_rng(0)
+    angles, radii = rng.uniform(0, 2 * np.pi, 60), 3.0 * np.sqrt(rng.uniform(0, 1, 60))
+    parts = [
+        ("Vegetation", (x - 0.4, y - 0.4, z), (x + 0.4, y + 0.4, z + 0.8))
+        for x, y, z in zip(radii * np.cos(angles), radii * np.sin(angles), rng.uniform(3, 7, 60), strict=True)
+    ]
+    assert len(simplify(box_map(*parts), only("merge")).box_map) == 1
+
+
+def test_a_long_askew_row_of_trees_does_not():
+    row = [("Vegetation", (k, k, 0), (k + 4, k + 4, 8)) for k in range(0, 100, 5)]
+    merged = simplify(box_map(*row), only("merge")).box_map
+    assert len(merged) > 1
+    covered = sum(np.prod(4 * size[:2] * size[:2]) ** 0.5 for size in merged.half_extents)
+    assert covered < 0.5 * 104**2
+
+
+@pytest.mark.parametrize(
+    ("rectangle", "share"),
+    [
+        ((0.5, 0.5, 1.0, 0.0, 0.5, 0.5), 1.0),
+        ((0.25, 0.5, 1.0, 0.0, 0.25, 0.5), 0.5),
+        ((0.5, 0.5, np.sqrt(0.5), np.sqrt(0.5), np.sqrt(0.125), np.sqrt(0.125)), 0.5),  # a square on its corner
+        ((5.0, 5.0, 1.0, 0.0, 0.5, 0.5), 0.0),
+    ],
+)
+def test_fill_share(rectangle, share):
+    assert fill_share(np.array([rectangle]), np.zeros(2), np.ones(2)) == pytest.approx(share, abs=0.02)
+
+
+# --- crop_tree --------------------------------------------------------------------------------------------------------
+
+
+def test_full_trunks_are_the_papers_split():
+    tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ids=[77])
+    cropped = simplify(tree, only("crop_tree", trunk="full")).box_map
+    assert cropped.ids.tolist() == [77, 1]
+    np.testing.assert_allclose(cropped.mins, [(0, 0, 2.5), (0, 0, 0)])
+    np.testing.assert_allclose(cropped.maxs, [(4, 6, 10.5), (4, 6, 2)])
+
+
+def test_stems_let_people_walk_below_trees():
+    tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ("Roads", (-9, -9, -1), (9, 9, 0)))
+    stems = simplify(tree, only("crop_tree")).box_map
+    np.testing.assert_allclose(stems.maxs[2] - stems.mins[2], (0.5, 0.5, 2.0))
+    np.testing.assert_allclose(stems.centers[2], (2, 3, 1))
+    full = simplify(tree, only("crop_tree", trunk="full")).box_map
+    area = [cross_validate(tree, m)["simplified_walkable_m2"] for m in (stems, full)]
+    assert area[0] > area[1] + 20.0
+
+
+def test_what_does_not_span_the_cut_stays():
+    plants = box_map(("Vegetation", (0, 0, 0), (4, 1, 1.2)), ("Vegetation", (9, 9, 4), (12, 12, 9)))
+    cropped = simplify(plants, only("crop_tree")).box_map
+    np.testing.assert_array_equal(cropped.centers, plants.centers)
+    np.testing.assert_array_equal(cropped.half_extents, plants.half_extents)
+
+
+def test_a_hedge_beside_a_tree_is_still_an_obstacle():
+    garden = box_map(("Vegetation", (0, 0, 0), (4, 4, 8)), ("Vegetation", (5, 0, 0), (15, 0.8, 1.0)))
+    result = simplify(garden, SimplifyConfig()).box_map
+    assert ((result.mins <= (5, 0, 0)) & (result.maxs >= (15, 0.8, 1.0))).all(axis=1).any()
+
+
+def test_crops_are_done_once():
+    boxes = random_map(3, 80)
+    once = simplify(boxes, only("crop_tree", trunk="full")).box_map
+    twice = simplify(once, only("crop_tree", trunk="full")).box_map
+    np.testing.assert_array_equal(once.centers, twice.centers)
+    assert once.ids.tolist() == twice.ids.tolist()
+
+
+def test_new_ids_never_repeat_one_of_64_bits():
+    tree = box_map(("Vegetation", (0, 0, 0), (4, 4, 9)), ("Static", (9, 9, 0), (10, 10, 1)), ids=[2**64 - 1, 1])
+    assert sorted(simplify(tree, SimplifyConfig()).box_map.ids.tolist()) == [1, 2, 2**64 - 1]
+
+
+# --- removal ----------------------------------------------------------------------------------------------------------
+
+
+def test_below_ground_goes_by_the_top_face_and_spares_surfaces():
+    boxes = box_map(
+        ("Static", (0, 0, -3), (1, 1, -0.01)),  # goes
+        ("Static", (0, 0, -30), (1, 1, 0.2)),  # its middle is below, its top is not
+        ("Static", (0, 0, -3), (1, 1, 0)),  # touches the ground
+        ("Roads", (0, 0, -1), (9, 9, -0.06)),
+        ("Water", (0, 0, -2), (9, 9, -0.5)),
+    )
+    assert crop_below_ground(boxes, 0.0).ids.tolist() == [2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("inner", "kind", "kept"),
+    [
+        (((1, 1, 1), (2, 2, 2)), "Buildings", [1]),
+        (((1, 1, 1), (2, 2, 10.009)), "Buildings", [1]),  # within the tolerance of a centimetre
+        (((1, 1, 1), (2, 2, 10.011)), "Buildings", [1, 2]),
+        (((1, 1, 1), (2, 2, 2)), "Static", [1, 2]),  # another kind
+        (((0, 0, 0), (10, 10, 10)), "Buildings", [1]),  # equal: the smaller id stays
+    ],
+)
+def test_nested_boxes_of_one_kind_go(inner, kind, kept):
+    boxes = box_map(("Buildings", (0, 0, 0), (10, 10, 10)), (kind, *inner))
+    assert prune_nested(boxes, 0.01).ids.tolist() == kept
+
+
+def test_the_empty_corner_of_a_turned_box_holds_nothing():
+    corner = box_map(("Buildings", (-10, -10, 0), (10, 10, 10), 45.0), ("Buildings", (11, 11, 0), (12, 12, 5)))
+    assert len(prune_nested(corner, 0.01)) == 2
+    middle = box_map(("Buildings", (-10, -10, 0), (10, 10, 10), 45.0), ("Buildings", (5, 5, 0), (6, 6, 5)))
+    assert len(prune_nested(middle, 0.01)) == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 60))
+def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
+    boxes = random_map(seed, count, 8.0)
+    boxes = replace(boxes, rotations_deg=np.zeros((count, 3)))
+    mins, maxs, volumes = boxes.mins, boxes.maxs, np.prod(boxes.half_extents, axis=1)
+    kept = []
+    for i in range(count):
+        inside = [
+            j
+            for j in range(count)
+            if j != i
+            and boxes.kinds[i] == boxes.kinds[j]
+            and (mins[i] >= mins[j] - 0.01).all()
+            and (maxs[i] <= maxs[j] + 0.01).all()
+            and (volumes[j], -int(boxes.ids[j])) > (volumes[i], -int(boxes.ids[i]))
+        ]
+        if not inside:
+            kept.append(int(boxes.ids[i]))
+    assert prune_nested(boxes, 0.01).ids.tolist() == kept
+
+
+# --- all passes -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), paper=st.booleans())
+def test_the_whole_keeps_its_books(seed, paper):
+    boxes = random_map(seed, 80)
+    result = simplify(boxes, SimplifyConfig(**(PAPER if paper else {})))
+    ids = result.box_map.ids.tolist()
+    assert len(set(ids)) == len(ids)
+    assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
+    assert result.passes[0][1] == boxes.counts()
+    assert result.passes[-1][1] == result.box_map.counts()
+    after_crop, after_ground = (sum(counts.values()) for _, counts in result.passes[2:4])
+    assert sum(result.passes[1][1].values()) <= len(boxes)
+    assert after_ground <= after_crop
+
+
+def test_simplifying_is_deterministic_and_leaves_its_input_alone():
+    boxes = random_map(5, 100)
+    before = boxes.centers.copy()
+    one, two = (simplify(boxes, SimplifyConfig()).box_map for _ in range(2))
+    np.testing.assert_array_equal(one.centers, two.centers)
+    np.testing.assert_array_equal(boxes.centers, before)
+
+
+def test_settings_name_their_problems():
+    with pytest.raises(ConfigError, match=r"min_fill.*less than or equal to 1"):
+        build(SimplifyConfig, {"min_fill": 2}, "x")
+    with pytest.raises(ConfigError, match=r"merge_gap_m\.Vegetatoin.*Vegetation"):
+        build(SimplifyConfig, {"merge_gap_m": {"Vegetatoin": 2}}, "x")
+
+
+def test_a_kind_is_not_merged_when_its_gap_is_null():
+    pair = box_map(("Buildings", (0, 0, 0), (1, 1, 1)), ("Buildings", (1, 0, 0), (2, 1, 1)))
+    cfg = build(SimplifyConfig, {"merge_gap_m": {"Buildings": None}}, "x")
+    assert len(simplify(pair, cfg).box_map) == 2
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_stage_writes_map_report_and_picture(tmp_path: Path):
+    source = tmp_path / "boxes_3d.json"
+    boxes = random_map(1, 120)
+    write_boxes(source, boxes)
+    product = run(SimplifyConfig(), source, tmp_path / "out")
+    simplified = read_boxes(product)
+    assert [p["pass"] for p in simplified.header["passes"]] == [
+        "input",
+        "merge",
+        "crop_tree",
+        "crop_below_ground",
+        "prune_nested",
+    ]
+    report = json.loads((tmp_path / "out/simplify_report.json").read_text())
+    assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
+    assert report["passes"][-1]["counts"] == simplified.counts()
+    assert 0 < report["grid"]["iou"] <= 1
+    assert (tmp_path / "out/simplify.png").read_bytes()[:4] == b"\x89PNG"
+
+    written = product.read_bytes()
+    assert run(SimplifyConfig(), source, tmp_path / "out") == product  # complete: nothing to do
+    run(SimplifyConfig(), source, tmp_path / "again")
+    assert (tmp_path / "again/step2_simplified.json").read_bytes() == written
+    with pytest.raises(ResumeError, match="trunk was 'stem', is 'full'"):
+        run(SimplifyConfig(trunk="full"), source, tmp_path / "out")
+
+
+def test_a_kill_before_the_manifest_is_made_good(tmp_path: Path):
+    source = tmp_path / "boxes_3d.json"
+    write_boxes(source, random_map(2, 50))
+    product = run(SimplifyConfig(), source, tmp_path / "out")
+    written = product.read_bytes()
+    (tmp_path / "out/manifest.json").unlink()
+    product.unlink()
+    assert run(SimplifyConfig(), source, tmp_path / "out").read_bytes() == written
+
+
+def test_a_map_below_the_ground_is_an_error(tmp_path: Path):
+    source = tmp_path / "boxes_3d.json"
+    write_boxes(source, box_map(("Static", (0, 0, -3), (1, 1, -1))))
+    with pytest.raises(InputError, match="below the ground") as caught:
+        run(SimplifyConfig(), source, tmp_path / "out")
+    assert caught.value.where == source
