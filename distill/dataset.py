@@ -1,0 +1,326 @@
+"""Captions to a training set: one sample per window and language, in splits that share no trajectory.
+
+Needs no torch. Images are not copied: a sample names files of the playback tree relative to its root.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cosfly.coc import Caption, Language, Prompt, parse_answer, read_captions
+from cosfly.config import Config
+from cosfly.errors import InputError, VerifyError
+from cosfly.playback import frame_name
+from cosfly.store import Resume, StageFolder, Tally, dump_json, parse_json, storage_errors
+
+log = logging.getLogger(__name__)
+
+SAMPLE_VERSION: Literal["1.0"] = "1.0"
+SPLITS = ("train", "val", "test")  # the order in which scarce trajectories are handed out
+Modality = Literal["rgb", "depth", "instance"]
+MODALITY_FILES: dict[Modality, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
+
+
+class PrepareConfig(Config):
+    """Settings of `distill prepare`."""
+
+    languages: tuple[Language, ...] = Field(
+        ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
+    )
+    modalities: tuple[Modality, ...] = Field(
+        ("rgb",), min_length=1, description="images of each window frame, in this order: rgb, depth, instance"
+    )
+    split_by: Literal["trajectory", "town"] = Field(
+        "trajectory",
+        description="what may not be shared by two splits; both flights of a trajectory always stay together",
+    )
+    val_fraction: float = Field(
+        0.1, ge=0.0, lt=1.0, description="share of trajectories (towns) for validation; 0: none"
+    )
+    test_fraction: float = Field(0.1, ge=0.0, lt=1.0, description="share of trajectories (towns) for the test; 0: none")
+    too_few: Literal["refuse", "fill"] = Field(
+        "refuse",
+        description="with fewer trajectories (towns) than splits: refuse, or fill train, then val, and leave the rest empty",
+    )
+    repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
+    repaired_weight: float = Field(
+        1.0, gt=0.0, le=1.0, description="weight of a repaired sample in the loss; 1: as any"
+    )
+
+    @model_validator(mode="after")
+    def _fractions_leave_something(self) -> PrepareConfig:
+        if self.val_fraction + self.test_fraction >= 1.0:
+            raise ValueError("val_fraction + test_fraction must stay below 1, or nothing is left to train on")
+        if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
+            raise ValueError("languages and modalities may name each entry once")
+        return self
+
+    @property
+    def wanted_splits(self) -> tuple[str, ...]:
+        fractions = {"train": 1.0, "val": self.val_fraction, "test": self.test_fraction}
+        return tuple(name for name in SPLITS if fractions[name] > 0)
+
+
+class Sample(BaseModel):
+    """One line of a split file: what the student sees, and what it should answer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_version: Literal["1.0"] = SAMPLE_VERSION
+    sample_id: str
+    language: Language
+    town: str
+    trajectory: str
+    variant: str
+    images: list[str]  # files of the playback tree, frame by frame, the modalities of a frame together
+    prompt: Prompt
+    answer: str  # JSON text of the three fields
+    decision: str  # the answer's flight_decision
+    label: str | None  # the decision that the future geometry calls for; None: it cannot tell
+    repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
+    weight: float
+
+    @property
+    def key(self) -> str:
+        """Unique name of the sample: window and language."""
+        return f"{self.sample_id}/{self.language}"
+
+    def group(self, split_by: Literal["trajectory", "town"]) -> str:
+        return group_of(self.town, self.trajectory, split_by)
+
+
+def group_of(town: str, trajectory: str, split_by: Literal["trajectory", "town"]) -> str:
+    """Name what may not be shared by two splits. `Town03` and `Town03_Opt` are one town: the same map in two builds."""
+    return town.removesuffix("_Opt") if split_by == "town" else trajectory
+
+
+# --- splits -----------------------------------------------------------------------------------------------------------
+
+
+def assign_splits(groups: Iterable[str], cfg: PrepareConfig, seed: int) -> dict[str, str]:
+    """Hand out groups to splits: group -> split.
+
+    Groups are ranked by a hash of (seed, group); the first go to test, the next to val, the rest to train, in numbers as near
+    to the fractions as a whole group allows and at least one for each split that has a share.
+
+    Raises:
+        InputError: fewer groups than splits, and `too_few` is refuse.
+    """
+    ranked = sorted(set(groups), key=lambda group: hashlib.sha256(f"{seed}/distill.split/{group}".encode()).digest())
+    wanted = cfg.wanted_splits
+    if len(ranked) < len(wanted):
+        if cfg.too_few == "refuse" or not ranked:
+            raise InputError(
+                f"too few {cfg.split_by} groups with accepted captions to split without a leak",
+                got=str(len(ranked)),
+                expected=f"{len(wanted)} or more, one for each of {', '.join(wanted)}",
+                fix="caption more flights, set a fraction to 0, or set too_few=fill",
+            )
+        return dict(zip(ranked, wanted, strict=False))
+    num_test = max(1, round(cfg.test_fraction * len(ranked))) if cfg.test_fraction else 0
+    num_val = max(1, round(cfg.val_fraction * len(ranked))) if cfg.val_fraction else 0
+    while num_test + num_val >= len(ranked):  # rounding took all: the larger share gives one back
+        num_test, num_val = (num_test - 1, num_val) if num_test >= num_val else (num_test, num_val - 1)
+    names = ["test"] * num_test + ["val"] * num_val + ["train"] * (len(ranked) - num_test - num_val)
+    return dict(zip(ranked, names, strict=True))
+
+
+def check_no_leak(
+    splits: Mapping[str, Iterable[Sample]], split_by: Literal["trajectory", "town"] = "trajectory"
+) -> dict[str, int]:
+    """Check that no trajectory, town (if asked), image or sample stands in two splits, and no sample twice in one.
+
+    Returns:
+        split -> number of samples.
+    Raises:
+        VerifyError: names what is shared and by which splits.
+    """
+    owners: dict[tuple[str, str], str] = {}
+    seen: set[str] = set()
+    counts: dict[str, int] = {}
+    for split, samples in splits.items():
+        counts[split] = 0
+        for sample in samples:
+            counts[split] += 1
+            shared = [("trajectory", sample.trajectory), *(("image", image) for image in sample.images)]
+            if split_by == "town":
+                shared.append(("town", sample.group("town")))
+            for what, name in shared:
+                owner = owners.setdefault((what, name), split)
+                if owner != split:
+                    raise VerifyError(
+                        f"two splits share a {what}", where=sample.key, got=f"{name} in {owner} and in {split}"
+                    )
+            if sample.key in seen:
+                raise VerifyError("a sample stands twice in the training set", where=split, got=sample.key)
+            seen.add(sample.key)
+    return counts
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+def make_sample(caption: Caption, language: Language, cfg: PrepareConfig) -> Sample | str:
+    """Give the sample of a caption in one language, or the word for why there is none."""
+    if caption.status != "accepted":
+        return f"dropped_{caption.drop_reason or 'unknown'}"
+    if caption.repair is not None and cfg.repaired == "exclude":
+        return "repaired"
+    coc = caption.en if language == "en" else caption.zh
+    if coc is None or language not in caption.prompt:
+        return f"no_{language}"
+    answer = dump_json(coc.model_dump())
+    parsed = parse_answer(answer, language)
+    if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
+        return f"answer_{parsed.reason}"
+    folder = f"{caption.town}/{caption.trajectory}/{caption.variant}"
+    return Sample(
+        sample_id=caption.sample_id,
+        language=language,
+        town=caption.town,
+        trajectory=caption.trajectory,
+        variant=caption.variant,
+        images=[f"{folder}/{frame_name(i)}/{MODALITY_FILES[m]}" for i in caption.window for m in cfg.modalities],
+        prompt=caption.prompt[language],
+        answer=answer,
+        decision=parsed.coc.flight_decision,
+        label=caption.label,
+        repair=None if caption.repair is None else str(caption.repair.get("strategy", "unknown")),
+        weight=1.0 if caption.repair is None else cfg.repaired_weight,
+    )
+
+
+def _samples(cfg: PrepareConfig, captions: Path, data: Path) -> Iterator[Sample | str]:
+    """Yield, for each caption and wanted language, its sample or the reason for leaving it out."""
+    for caption in read_captions(captions):
+        for name in (caption.town, caption.trajectory, caption.variant):
+            if name != Path(name).name or name in ("", ".", ".."):
+                raise InputError("not a folder name", where=f"{captions}: {caption.sample_id}", got=name)
+        for language in cfg.languages:
+            sample = make_sample(caption, language, cfg)
+            if isinstance(sample, Sample) and not all((data / image).is_file() for image in sample.images):
+                sample = "missing_image"
+            yield sample
+
+
+def run(
+    cfg: PrepareConfig, captions: Path, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
+) -> Path:
+    """Read `captions.jsonl` and the playback tree `data`; write `train.jsonl`, `val.jsonl` and `test.jsonl` into `out`.
+
+    Returns:
+        `out`, the training set.
+    Raises:
+        InputError: no caption can be used, or there are too few trajectories to split.
+    """
+    stage = StageFolder.open(
+        out,
+        "distill.prepare",
+        config=cfg.model_dump(mode="json"),
+        inputs={"captions": captions, "data": data},
+        seed=seed,
+        resume=resume,
+    )
+    if stage.is_complete:
+        return out
+    excluded = Counter[str]()
+    groups = set()
+    for sample in _samples(
+        cfg, captions, data
+    ):  # two passes: the splits must be known before the first line is written
+        if isinstance(sample, str):
+            excluded[sample] += 1
+        else:
+            groups.add(sample.group(cfg.split_by))
+    if not groups:
+        raise InputError(
+            "no caption can be learned from",
+            where=captions,
+            got=", ".join(f"{reason} {count}" for reason, count in sorted(excluded.items())) or "an empty file",
+            fix="check --data when images are missing, and the settings languages and repaired",
+        )
+    split_of = assign_splits(groups, cfg, seed)
+    facts = _write_splits(cfg, captions, data, out, split_of)
+    counts = check_no_leak({split: read_split(out, split) for split in SPLITS}, cfg.split_by)
+    tally = Tally(num_input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=dict(excluded))
+    for split in SPLITS:
+        facts[split]["groups"] = sum(1 for owner in split_of.values() if owner == split)
+        if not counts[split]:
+            log.warning("distill.prepare: the split %s is empty", split)
+    stage.finish([split_path(out, split) for split in SPLITS], tally, splits=facts, split_by=cfg.split_by)
+    return out
+
+
+def _write_splits(
+    cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, str]
+) -> dict[str, dict]:
+    """Write the three files and give the counts of each: samples, by language, by decision, repaired."""
+    facts: dict[str, dict] = {}
+    counters: dict[str, dict[str, Counter[str]]] = {
+        split: {"language": Counter(), "decision": Counter(), "repair": Counter()} for split in SPLITS
+    }
+    partials = {split: out / f".{split}.jsonl.partial" for split in SPLITS}
+    with storage_errors(out), ExitStack() as stack:
+        files = {split: stack.enter_context(open(path, "w", encoding="utf-8")) for split, path in partials.items()}
+        for sample in _samples(cfg, captions, data):
+            if isinstance(sample, str):
+                continue
+            split = split_of[sample.group(cfg.split_by)]
+            files[split].write(dump_json(sample.model_dump(mode="json")) + "\n")
+            counter = counters[split]
+            counter["language"][sample.language] += 1
+            counter["decision"][sample.decision] += 1
+            counter["repair"][sample.repair or "none"] += 1
+        for file in files.values():
+            file.flush()
+            os.fsync(file.fileno())
+    for split, path in partials.items():
+        path.replace(split_path(out, split))
+        facts[split] = {
+            "samples": counters[split]["language"].total(),
+            **{f"by_{name}": dict(sorted(counter.items())) for name, counter in counters[split].items()},
+        }
+    return facts
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def split_path(dataset: Path, split: str) -> Path:
+    return dataset / f"{split}.jsonl"
+
+
+def read_split(dataset: Path, split: str) -> Iterator[Sample]:
+    """Yield the samples of a split.
+
+    Raises:
+        InputError: names the file, the line and the field.
+    """
+    path = split_path(dataset, split)
+    try:
+        file = open(path, encoding="utf-8")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise InputError(
+            "cannot read the training set", where=path, got=error.strerror, fix="run cosfly distill prepare first"
+        ) from None
+    with file:
+        for number, line in enumerate(file, 1):
+            try:
+                yield Sample.model_validate(parse_json(line))
+            except ValidationError as error:
+                detail = error.errors()[0]
+                field = ".".join(str(part) for part in detail["loc"])
+                raise InputError(
+                    detail["msg"], where=f"{path}:{number}: {field}", got=repr(detail["input"])[:80]
+                ) from None
+            except ValueError as error:
+                raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None

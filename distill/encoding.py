@@ -1,0 +1,205 @@
+"""Samples as tensors: images, prompt tokens, answer tokens, and batches of them.
+
+Prompt and answer are tokenized apart and joined, which is what inference sees: no token spans the border, so the mask that
+keeps the loss on the answer is exact by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from cosfly.errors import InputError
+from cosfly.playback import read_depth, read_instance
+from cosfly.schema import KIND_COLORS, KINDS
+from cosfly.store import inside
+from distill.dataset import Sample
+from distill.student import IMAGE_TOKEN, Student
+
+IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy
+DEPTH_NEAR_M, DEPTH_FAR_M = 1.0, 200.0  # range of the grey ramp; a ratio of distances is a step of grey
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """One sample as arrays: prompt_ids, answer_ids (n,) int64, the end token included in the answer; patches of all images
+    (p, d) float32 and their grids (k, 3) int64."""
+
+    key: str
+    prompt_ids: np.ndarray
+    answer_ids: np.ndarray
+    pixel_values: np.ndarray
+    image_grids: np.ndarray
+    weight: float
+
+    def __len__(self) -> int:
+        return len(self.prompt_ids) + len(self.answer_ids)
+
+
+def messages_of(sample: Sample) -> list[dict[str, Any]]:
+    """Give the chat of a sample: the system text, then the images in order and the question."""
+    images = [{"type": "image"} for _ in sample.images]
+    return [
+        {"role": "system", "content": sample.prompt.system},
+        {"role": "user", "content": [*images, {"type": "text", "text": sample.prompt.user}]},
+    ]
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def load_image(path: Path) -> Image.Image:
+    """Load one image of a frame as RGB; depth becomes a logarithmic grey ramp (near is bright), instance the class palette.
+
+    Raises:
+        InputError: missing or not an image.
+    """
+    if path.name == "depth.npy":
+        return Image.fromarray(_depth_picture(read_depth(path.parent)))
+    if path.name == "instance.png":
+        kinds, _ = read_instance(path.parent)
+        return Image.fromarray(_palette()[kinds])
+    try:
+        with Image.open(path) as image:
+            return image.convert("RGB")
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError("cannot read the image", where=path, got=str(error), fix="check --data") from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Give (height, width) px from the header alone."""
+    if path.name == "depth.npy":
+        height_px, width_px = read_depth(path.parent).shape
+        return height_px, width_px
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError("cannot read the image", where=path, got=str(error), fix="check --data") from None
+
+
+def _depth_picture(depth_m: np.ndarray) -> np.ndarray:
+    clipped = np.clip(
+        np.where(depth_m > 0, depth_m, DEPTH_FAR_M), DEPTH_NEAR_M, DEPTH_FAR_M
+    )  # 0 is invalid: as far away
+    grey = 1.0 - np.log(clipped / DEPTH_NEAR_M) / np.log(DEPTH_FAR_M / DEPTH_NEAR_M)
+    return np.repeat((grey * 255 + 0.5).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@cache
+def _palette() -> np.ndarray:
+    """(256, 3) uint8: the colour of each semantic kind, black where there is none."""
+    palette = np.zeros((256, 3), np.uint8)
+    for name, number in KINDS.items():
+        palette[number] = [int(KIND_COLORS[name][i : i + 2], 16) for i in (1, 3, 5)]
+    return palette
+
+
+# --- tokens -----------------------------------------------------------------------------------------------------------
+
+
+def _prompt_ids(student: Student, sample: Sample, tokens_per_image: Sequence[int]) -> np.ndarray:
+    text = student.tokenizer.apply_chat_template(
+        messages_of(sample), tokenize=False, add_generation_prompt=True, enable_thinking=False
+    )
+    pieces = text.split(IMAGE_TOKEN)
+    if len(pieces) != len(tokens_per_image) + 1:
+        raise InputError(
+            "the prompt and its images do not match",
+            where=sample.key,
+            got=f"{len(pieces) - 1} image marks",
+            expected=f"{len(tokens_per_image)}",
+            fix=f"the prompt text may not hold {IMAGE_TOKEN}",
+        )
+    expanded = pieces[0] + "".join(
+        IMAGE_TOKEN * count + piece for count, piece in zip(tokens_per_image, pieces[1:], strict=True)
+    )
+    return np.array(student.tokenizer(expanded, add_special_tokens=False)["input_ids"], dtype=np.int64)
+
+
+def _answer_ids(student: Student, sample: Sample) -> np.ndarray:
+    ids = student.tokenizer(sample.answer, add_special_tokens=False)["input_ids"]
+    return np.array([*ids, student.end_token_id], dtype=np.int64)
+
+
+def count_tokens(student: Student, sample: Sample, sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Give the real numbers of (prompt, answer) tokens, images included, without loading a pixel.
+
+    Args:
+        sizes: (height, width) px of each image.
+    """
+    processor = student.image_processor
+    counts = [processor.get_number_of_image_patches(*size, {}) // processor.merge_size**2 for size in sizes]
+    return len(_prompt_ids(student, sample, counts)), len(_answer_ids(student, sample))
+
+
+def encode(student: Student, sample: Sample, data: Path) -> Encoded:
+    """Make the arrays of one sample.
+
+    Raises:
+        InputError: an image of the playback tree `data` cannot be read.
+    """
+    images = [load_image(inside(data, name)) for name in sample.images]
+    vision = student.image_processor(images, return_tensors="np")
+    grids = np.asarray(vision["image_grid_thw"], dtype=np.int64)
+    counts = (grids.prod(axis=1) // student.image_processor.merge_size**2).tolist()
+    return Encoded(
+        key=sample.key,
+        prompt_ids=_prompt_ids(student, sample, counts),
+        answer_ids=_answer_ids(student, sample),
+        pixel_values=np.asarray(vision["pixel_values"], dtype=np.float32),
+        image_grids=grids,
+        weight=sample.weight,
+    )
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+def training_batch(student: Student, rows: Sequence[Encoded]) -> tuple[dict[str, Any], Any, Any]:
+    """Pad samples on the right: (model inputs, labels (b, n) with IGNORED outside the answers, weights (b,))."""
+    import torch
+
+    length = max(len(row) for row in rows)
+    ids = np.full((len(rows), length), student.pad_token_id, dtype=np.int64)
+    labels = np.full((len(rows), length), IGNORED, dtype=np.int64)
+    mask = np.zeros((len(rows), length), dtype=np.int64)
+    for i, row in enumerate(rows):
+        start = len(row.prompt_ids)
+        ids[i, : len(row)] = np.concatenate([row.prompt_ids, row.answer_ids])
+        labels[i, start : len(row)] = row.answer_ids
+        mask[i, : len(row)] = 1
+    weights = torch.tensor([row.weight for row in rows], dtype=torch.float32, device=student.device)
+    return _inputs(student, rows, ids, mask), torch.from_numpy(labels).to(student.device), weights
+
+
+def prompt_batch(student: Student, rows: Sequence[Encoded]) -> dict[str, Any]:
+    """Pad prompts on the left, so that all continue at the same place."""
+    length = max(len(row.prompt_ids) for row in rows)
+    ids = np.full((len(rows), length), student.pad_token_id, dtype=np.int64)
+    mask = np.zeros((len(rows), length), dtype=np.int64)
+    for i, row in enumerate(rows):
+        ids[i, length - len(row.prompt_ids) :] = row.prompt_ids
+        mask[i, length - len(row.prompt_ids) :] = 1
+    return _inputs(student, rows, ids, mask)
+
+
+def _inputs(student: Student, rows: Sequence[Encoded], ids: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
+    import torch
+
+    arrays = {
+        "input_ids": ids,
+        "attention_mask": mask,
+        "mm_token_type_ids": (ids == student.image_token_id).astype(np.int64),  # 1 marks image tokens
+        "pixel_values": np.concatenate([row.pixel_values for row in rows]),
+        "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
+    }
+    tensors = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
+    tensors["pixel_values"] = tensors["pixel_values"].to(student.model.dtype)
+    return tensors

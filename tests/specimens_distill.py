@@ -1,0 +1,71 @@
+"""Captions over the specimen playback tree, in both languages, with every kind of record that prepare must sort."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cosfly.coc import Caption, Coc, Prompt, write_captions
+from cosfly.playback import find_flights, read_flight, sample_id
+
+WINDOW = 5
+DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")
+ENGLISH = {
+    "track_straight": ("is centred in the view and walks on", "keeps its heading, so the drone tracks straight"),
+    "yaw_left_to_follow": ("drifts to the left of the view", "turns left, so the drone yaws left to keep it in view"),
+    "slow_down": ("stands still below the drone", "has stopped, so the drone slows down to keep its distance"),
+}
+CHINESE = {
+    "track_straight": ("位于画面中央并继续前行", "保持方向，因此无人机直线跟踪"),
+    "yaw_left_to_follow": ("向画面左侧偏移", "向左转弯，因此无人机左偏航跟随"),
+    "slow_down": ("在无人机下方静止", "已经停下，因此无人机减速保持距离"),
+}
+
+
+def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes: object) -> Caption:
+    """Give an accepted caption of the window that ends at `frame`; its decision goes round DECISIONS."""
+    decision = DECISIONS[(frame + len(variant)) % len(DECISIONS)]
+    english, chinese = ENGLISH[decision], CHINESE[decision]
+    fields = {
+        "sample_id": sample_id(f"{trajectory}_{variant}", frame),
+        "town": town,
+        "trajectory": trajectory,
+        "variant": variant,
+        "frame_index": frame,
+        "window": list(range(frame - WINDOW + 1, frame + 1)),
+        "future": list(range(frame + 1, frame + 1 + WINDOW)),
+        "prompt": {
+            "en": Prompt(system="You fly the drone.", user=f"Five frames end at {frame}. Answer with JSON."),
+            "zh": Prompt(system="你驾驶无人机。", user=f"五帧，最后一帧为{frame}。请用JSON回答。"),
+        },
+        "prompt_hash": "0" * 64,
+        "teacher": {"kind": "rules", "model": "rules", "settings": {}},
+        "usage": {"prompt_tokens": 0, "completion_tokens": 0},
+        "attempts": 1,
+        "en": Coc(
+            critical_components=f"The pedestrian {english[0]}, about {10 + frame} m ahead.",
+            reasoning_trace=f"The pedestrian {english[1]}.",
+            flight_decision=decision,
+        ),
+        "zh": Coc(
+            critical_components=f"行人{chinese[0]}，距离约{10 + frame}米。",
+            reasoning_trace=f"行人{chinese[1]}。",
+            flight_decision=decision,
+        ),
+        "label": None if frame % 3 == 0 else decision,
+        "verdict": "CONSISTENT",
+        "status": "accepted",
+    }
+    return Caption.model_validate({**fields, **changes})
+
+
+def make_captions(path: Path, tree: Path) -> list[Caption]:
+    """Write captions.jsonl for every window of every flight of the tree and give the captions."""
+    captions = []
+    for folder in find_flights(tree):
+        flight = read_flight(folder)
+        captions += [
+            make_caption(flight.town, flight.trajectory, flight.variant, frame)
+            for frame in range(WINDOW - 1, len(flight))
+        ]
+    write_captions(path, captions)
+    return captions

@@ -1,0 +1,238 @@
+"""distill/dataset.py: captions to leak-free splits."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from specimens_distill import make_caption, make_captions
+
+from cosfly.coc import parse_answer, write_captions
+from cosfly.errors import InputError, ResumeError, VerifyError
+from distill.dataset import (
+    SPLITS,
+    PrepareConfig,
+    Sample,
+    assign_splits,
+    check_no_leak,
+    group_of,
+    make_sample,
+    read_split,
+    run,
+)
+from specimens import make_playback_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("tree")
+    return make_playback_tree(root, num_flights=5, num_points=8, towns=("Town01", "Town03", "Town03_Opt"))
+
+
+@pytest.fixture(scope="module")
+def captions(tree, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("captions") / "captions.jsonl"
+    make_captions(path, tree)
+    return path
+
+
+def sample_of(trajectory="trajectory_1", variant="ORI", frame=4, town="Town01", language="en") -> Sample:
+    sample = make_sample(make_caption(town, trajectory, variant, frame), language, PrepareConfig())
+    assert isinstance(sample, Sample)
+    return sample
+
+
+# --- splits -----------------------------------------------------------------------------------------------------------
+
+
+@given(
+    num_groups=st.integers(3, 60),
+    val=st.sampled_from([0.0, 0.01, 0.1, 0.45]),
+    test=st.sampled_from([0.0, 0.01, 0.2, 0.45]),
+    seed=st.integers(0, 5),
+)
+def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
+    cfg = PrepareConfig(val_fraction=val, test_fraction=test)
+    groups = [f"trajectory_{i}" for i in range(num_groups)]
+    split_of = assign_splits(groups, cfg, seed)
+    assert set(split_of) == set(groups)
+    counts = Counter(split_of.values())
+    assert set(counts) == set(cfg.wanted_splits)
+    assert abs(counts["val"] - val * num_groups) <= 1
+    assert split_of == assign_splits(list(reversed(groups)) * 2, cfg, seed)  # order and repeats do not matter
+
+
+def test_another_seed_gives_other_splits():
+    groups = [f"trajectory_{i}" for i in range(30)]
+    assert assign_splits(groups, PrepareConfig(), 0) != assign_splits(groups, PrepareConfig(), 1)
+
+
+def test_too_few_groups_are_refused_unless_told():
+    with pytest.raises(InputError, match=r"too few.*got 2.*expected 3") as caught:
+        assign_splits(["a", "b"], PrepareConfig(), 0)
+    assert "too_few=fill" in str(caught.value)
+    assert sorted(assign_splits(["a", "b"], PrepareConfig(too_few="fill"), 0).values()) == ["train", "val"]
+    assert assign_splits(["a"], PrepareConfig(too_few="fill"), 0) == {"a": "train"}
+    assert set(assign_splits(["a"], PrepareConfig(val_fraction=0, test_fraction=0), 0).values()) == {"train"}
+
+
+def test_two_builds_of_a_town_are_one_group():
+    assert group_of("Town03_Opt", "t", "town") == group_of("Town03", "t", "town") == "Town03"
+
+
+def test_leak_check_passes_clean_splits_and_counts():
+    clean = {"train": [sample_of(), sample_of(language="zh"), sample_of(variant="aug_001")], "val": [sample_of("t2")]}
+    assert check_no_leak(clean) == {"train": 3, "val": 1}
+
+
+@pytest.mark.parametrize(
+    ("other", "split_by", "word"),
+    [
+        (sample_of(variant="aug_001"), "trajectory", "trajectory"),  # the perturbed flight of the same trajectory
+        (sample_of(frame=6), "trajectory", "trajectory"),
+        (sample_of(town="Town02"), "trajectory", "trajectory"),  # the same name in another town
+        (sample_of("t2", town="Town01_Opt"), "town", "town"),
+        (sample_of("t2").model_copy(update={"images": sample_of().images}), "trajectory", "image"),
+    ],
+)
+def test_leak_check_fails(other, split_by, word):
+    with pytest.raises(VerifyError, match=f"two splits share a {word}"):
+        check_no_leak({"train": [sample_of()], "val": [other]}, split_by)
+
+
+def test_leak_check_fails_on_a_double():
+    with pytest.raises(VerifyError, match="twice"):
+        check_no_leak({"train": [sample_of(), sample_of()]})
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+def test_sample_holds_what_the_student_needs():
+    sample = sample_of(frame=6)
+    assert sample.key == "trajectory_1_ORI_frame_00006/en"
+    assert sample.images == [f"Town01/trajectory_1/ORI/frames_playback/frame_{i:05d}/rgb.png" for i in (2, 3, 4, 5, 6)]
+    assert parse_answer(sample.answer).coc is not None
+    assert parse_answer(sample.answer).recovered == ()
+    assert json.loads(sample.answer)["flight_decision"] == sample.decision
+    assert "行人" in sample_of(language="zh").answer  # not escaped: escapes would cost tokens
+
+
+def test_modalities_are_interleaved_by_frame():
+    caption = make_caption("Town01", "trajectory_1", "ORI", 4)
+    sample = make_sample(caption, "en", PrepareConfig(modalities=("rgb", "depth")))
+    assert isinstance(sample, Sample)
+    assert [Path(image).name for image in sample.images[:4]] == ["rgb.png", "depth.npy", "rgb.png", "depth.npy"]
+
+
+REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "expected"),
+    [
+        ({"status": "dropped", "drop_reason": "hard_conflict"}, {}, "dropped_hard_conflict"),
+        ({"repair": REPAIRED}, {"repaired": "exclude"}, "repaired"),
+        ({"zh": None}, {}, "no_zh"),
+    ],
+)
+def test_reasons_for_leaving_out(changes, settings, expected):
+    caption = make_caption("Town01", "trajectory_1", "ORI", 4, **changes)
+    assert make_sample(caption, "zh", PrepareConfig(**settings)) == expected
+
+
+def test_repaired_samples_are_weighed_and_named():
+    caption = make_caption("Town01", "trajectory_1", "ORI", 4, repair=REPAIRED)
+    sample = make_sample(caption, "en", PrepareConfig(repaired_weight=0.5))
+    assert isinstance(sample, Sample)
+    assert (sample.weight, sample.repair) == (0.5, "anchored")
+    assert (sample_of().weight, sample_of().repair) == (1.0, None)
+
+
+# --- run --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split_by", ["trajectory", "town"])
+def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_path, split_by):
+    cfg = PrepareConfig(split_by=split_by, too_few="fill")
+    out = run(cfg, captions, tree, tmp_path / "set")
+    splits = {split: list(read_split(out, split)) for split in SPLITS}
+    owners = {}  # a slow obvious oracle: group -> splits
+    for split, samples in splits.items():
+        for sample in samples:
+            owners.setdefault(sample.group(split_by), set()).add(split)
+            assert all((tree / image).is_file() for image in sample.images)
+    assert all(len(found) == 1 for found in owners.values())
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert (
+        manifest["counts"]["kept"] == sum(map(len, splits.values())) == 5 * 2 * 4 * 2
+    )  # flights, variants, windows, languages
+    assert {split: facts["samples"] for split, facts in manifest["splits"].items()} == {
+        split: len(samples) for split, samples in splits.items()
+    }
+    if split_by == "trajectory":
+        assert splits["val"]
+        assert splits["test"]
+
+
+def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):
+    first, second = (run(PrepareConfig(), captions, tree, tmp_path / name) for name in "ab")
+    for split in SPLITS:
+        assert (first / f"{split}.jsonl").read_bytes() == (second / f"{split}.jsonl").read_bytes()
+    assert run(PrepareConfig(), captions, tree, first) == first
+    with pytest.raises(ResumeError, match="languages"):
+        run(PrepareConfig(languages=("en",)), captions, tree, first)
+
+
+def test_run_counts_what_it_leaves_out(tree, tmp_path):
+    records = make_captions(tmp_path / "all.jsonl", tree)
+    records[0] = records[0].model_copy(update={"status": "dropped", "drop_reason": "hard_conflict"})
+    records[1] = records[1].model_copy(update={"window": [90, 91, 92, 93, 94]})
+    records[2] = records[2].model_copy(update={"zh": None})
+    write_captions(tmp_path / "captions.jsonl", records)
+    out = run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+    counts = json.loads((out / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"dropped_hard_conflict": 2, "missing_image": 2, "no_zh": 1}
+    assert counts["input"] == counts["kept"] + 5
+
+
+def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
+    bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
+    with pytest.raises(InputError, match=r"no caption can be learned from.*missing_image 80.*--data"):
+        run(PrepareConfig(), captions, bare, tmp_path / "set")
+
+
+def test_run_refuses_a_name_that_leads_out(tree, tmp_path):
+    write_captions(tmp_path / "captions.jsonl", [make_caption("..", "trajectory_1", "ORI", 4)])
+    with pytest.raises(InputError, match="not a folder name"):
+        run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+
+
+def test_reading_names_the_line(tree, captions, tmp_path):
+    out = run(PrepareConfig(), captions, tree, tmp_path / "set")
+    with open(out / "train.jsonl", "a") as file:
+        file.write('{"sample_id": 3}\n')
+    with pytest.raises(InputError, match=r"train\.jsonl:\d+: sample_id"):
+        list(read_split(out, "train"))
+    with pytest.raises(InputError, match="distill prepare"):
+        list(read_split(tmp_path, "train"))
+
+
+def test_settings_that_leave_nothing_are_refused():
+    with pytest.raises(ValidationError, match="nothing is left to train on"):
+        PrepareConfig(val_fraction=0.5, test_fraction=0.5)
+
+
+def test_imports_without_torch():
+    code = (
+        "import sys; sys.modules['torch'] = sys.modules['transformers'] = sys.modules['peft'] = None\n"
+        "import distill.dataset, distill.train, distill.infer, distill.evaluate"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
