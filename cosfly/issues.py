@@ -1,0 +1,77 @@
+"""What is wrong with a product: one type for inspection (qc) and verification (release), printed in one way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+
+class Issue(BaseModel):
+    """One finding. `count` says how often it occurred; `where` and `got` are the first occurrence's."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    severity: Severity
+    code: str
+    where: str
+    got: str
+    expected: str
+    count: int = 1
+
+    def __str__(self) -> str:
+        times = f" ({self.count} times, this is the first)" if self.count > 1 else ""
+        text = f"{self.severity}: {self.code}: {self.where}: got {self.got}; expected {self.expected}{times}"
+        return " ".join(text.split())
+
+
+def sort_key(issue: Issue) -> tuple:
+    """Worst first, then by code and place."""
+    return SEVERITIES.index(issue.severity), issue.code, issue.where, issue.got
+
+
+@dataclass
+class Report:
+    """Findings of one check run; `facts` are lines that tell what was checked."""
+
+    issues: list[Issue] = field(default_factory=list)
+    facts: list[str] = field(default_factory=list)
+
+    def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
+        """Put a finding on the list."""
+        self.issues.append(Issue(severity=severity, code=code, where=str(where), got=str(got), expected=expected))
+
+    def error(self, code: str, where: object, got: object, expected: str) -> None:
+        self.add("error", code, where, got, expected)
+
+    def extend(self, issues: Iterable[Issue]) -> None:
+        self.issues.extend(issues)
+
+    @property
+    def is_ok(self) -> bool:
+        """True when nothing is wrong; warnings and notes are not wrong."""
+        return not self.num("error")
+
+    def num(self, severity: Severity) -> int:
+        return sum(issue.count for issue in self.issues if issue.severity == severity)
+
+    def merged(self) -> list[Issue]:
+        """Give one issue per severity and code, the first occurrence's, with the number of occurrences; sorted."""
+        first: dict[tuple[str, str], Issue] = {}
+        for issue in self.issues:
+            key = (issue.severity, issue.code)
+            known = first.get(key)
+            first[key] = issue if known is None else known.model_copy(update={"count": known.count + issue.count})
+        return sorted(first.values(), key=sort_key)
+
+    def __str__(self) -> str:
+        counts = ", ".join(
+            f"{self.num(severity)} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
+        )
+        verdict = "OK" if self.is_ok else "NOT OK"
+        return "\n".join([*self.facts, *map(str, sorted(self.issues, key=sort_key)), f"{verdict}: {counts}"])

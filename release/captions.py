@@ -1,0 +1,67 @@
+"""Which captions go into a release: the accepted ones, by flight and frame, and an account of all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cosfly.coc import FIELDS, Caption, read_captions
+from cosfly.errors import InputError
+from release.columns import CAPTION_FIELDS, ReleasedCaption
+
+
+@dataclass
+class Captions:
+    """Accepted captions by flight folder key and frame, and the account of all."""
+
+    by_flight: dict[tuple[str, str, str], dict[int, ReleasedCaption]] = field(default_factory=dict)
+    num_read: int = 0
+    num_accepted: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+
+def load_captions(path: Path) -> Captions:
+    """Read the captions, without their prompts.
+
+    Raises:
+        InputError: a frame has two accepted captions, or an accepted one lacks a language or disagrees with itself.
+    """
+    captions = Captions()
+    for caption in read_captions(path):
+        captions.num_read += 1
+        if caption.status != "accepted":
+            captions.dropped[caption.drop_reason or "no reason given"] += 1
+            continue
+        captions.num_accepted += 1
+        frames = captions.by_flight.setdefault((caption.town, caption.trajectory, caption.variant), {})
+        if caption.frame_index in frames:
+            raise InputError("a frame has two accepted captions", where=path, got=caption.sample_id)
+        frames[caption.frame_index] = _released(caption, path)
+    return captions
+
+
+def _released(caption: Caption, path: Path) -> ReleasedCaption:
+    if caption.en is None or caption.zh is None:
+        raise InputError("an accepted caption lacks a language", where=f"{path}: {caption.sample_id}")
+    if caption.en.flight_decision != caption.zh.flight_decision:
+        got = f"{caption.en.flight_decision} and {caption.zh.flight_decision}"
+        raise InputError("the two languages decide differently", where=f"{path}: {caption.sample_id}", got=got)
+    answers = {"en": caption.en, "zh": caption.zh}
+    texts = {f"caption_{lang}_{name}": getattr(answer, name) for lang, answer in answers.items() for name in FIELDS}
+    assert set(texts) == set(CAPTION_FIELDS)
+    model = caption.teacher.get("model")
+    return ReleasedCaption(
+        tuple(caption.window),
+        texts,
+        {
+            "decision": caption.en.flight_decision,
+            "label": caption.label,
+            "verdict": caption.verdict,
+            "repair_strategy": str(caption.repair["strategy"])
+            if caption.repair and "strategy" in caption.repair
+            else None,
+            "teacher_kind": str(caption.teacher.get("kind", "unknown")),
+            "teacher_model": None if model is None else str(model),
+        },
+    )

@@ -1,0 +1,371 @@
+"""The data-set card: every number is computed from the parquet shards, none is typed.
+
+`compute_numbers` reads the shards; build writes its answer into release.json, verify computes it again and compares.
+`render_card` turns release.json into README.md, so that a card which says anything else is found.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import itertools
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import yaml
+
+from release.columns import CAPTION_FIELDS, FILES, MODALITIES, WINDOW, scalar_names, schema
+
+DIGITS = 4
+MODALITY_TEXT = {
+    "rgb": "`image`: colour, PNG",
+    "depth": "`depth`: z-depth in metres, float32 `.npy` bytes, lossless",
+    "instance": "`instance`: semantic number and instance id, PNG",
+}
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def read_rows(shards: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of all shards without pictures and depth."""
+    for shard in shards:
+        with pq.ParquetFile(shard) as file:
+            for k in range(file.num_row_groups):
+                yield from file.read_row_group(k, columns=scalar_names()).to_pylist()
+
+
+def compute_numbers(shards: list[Path], num_frames: int) -> dict[str, Any]:
+    """Compute every number of the card.
+
+    Args:
+        shards: parquet files in their order.
+        num_frames: the release's frames per flight; flights with fewer are counted as short.
+    Returns:
+        JSON-able; sums are exact (fsum), so that the same rows give the same digits everywhere.
+    """
+    counts: dict[str, Counter[str]] = {
+        name: Counter() for name in ("town", "track", "fov_deg", "image_px", *CAPTION_COUNTS)
+    }
+    totals: Counter[str] = Counter()
+    flights: dict[tuple[str, str, str], list[tuple[float, float, float, float]]] = {}
+    samples: dict[str, list[float]] = {name: [] for name in ("height_m", "distance_m", "visibility")}
+    fovs: dict[tuple[str, str], str] = {}  # a trajectory keeps its field of view
+    characters: Counter[str] = Counter()
+    example: dict[str, str] = {}
+    for row in read_rows(shards):
+        totals["frames"] += 1
+        for name in ("is_perturbed", "target_in_view", "target_visible", "has_caption"):
+            totals[name] += bool(row[name])
+        counts["town"][row["town"]] += 1
+        counts["track"][row["track"]] += 1
+        counts["fov_deg"][f"{row['fov_deg']:g}"] += 1
+        fovs[row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
+        counts["image_px"][f"{row['width_px']} x {row['height_px']}"] += 1
+        pose, target = row["pose"], row["target"]
+        flight = flights.setdefault((row["town"], row["trajectory"], row["variant"]), [])
+        flight.append((row["time_s"], pose["x_m"], pose["y_m"], pose["z_m"]))
+        if target is not None:
+            offset = [pose[axis] - target[axis] for axis in ("x_m", "y_m", "z_m")]
+            samples["height_m"].append(offset[2])
+            samples["distance_m"].append(math.hypot(*offset))
+        if row["visibility"] is not None:
+            samples["visibility"].append(row["visibility"])
+        if row["has_caption"]:
+            for name in CAPTION_COUNTS:
+                counts[name]["none" if row[name] is None else row[name]] += 1
+            totals["has_label"] += row["label"] is not None
+            totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
+            example = example or {"sample_id": row["sample_id"], **{name: row[name] for name in CAPTION_FIELDS}}
+            for name in CAPTION_FIELDS:
+                characters[name] += len(row[name] or "")
+    return {
+        "frames": totals["frames"],
+        "flights": len(flights),
+        "trajectories": len({key[:2] for key in flights}),
+        "frames_by": {name: _sorted(counts[name]) for name in ("town", "track", "fov_deg", "image_px")},
+        "trajectories_by_fov_deg": _sorted(Counter(fovs.values())),
+        "flights_by_track": _sorted(Counter("clean" if key[2] == "ORI" else "perturbed" for key in flights)),
+        "frames_per_flight": _spread([float(len(points)) for points in flights.values()]),
+        "flights_shorter_than_num_frames": sum(len(points) < num_frames for points in flights.values()),
+        "flight_duration_s": _spread([points[-1][0] - points[0][0] for points in flights.values()]),
+        "flight_length_m": _spread([_length(points) for points in flights.values()]),
+        "height_over_target_m": _spread(samples["height_m"]),
+        "distance_to_target_m": _spread(samples["distance_m"]),
+        "visibility": _spread(samples["visibility"]),
+        "frames_perturbed": totals["is_perturbed"],
+        "frames_target_in_view": totals["target_in_view"],
+        "frames_target_visible": totals["target_visible"],
+        "captions": {
+            "frames_with": totals["has_caption"],
+            "frames_without": totals["frames"] - totals["has_caption"],
+            "with_label": totals["has_label"],
+            "decision_equals_label": totals["decision_equals_label"],
+            **{name: _sorted(counts[name]) for name in CAPTION_COUNTS},
+            "mean_characters": {
+                name: round(characters[name] / totals["has_caption"], 1) if totals["has_caption"] else None
+                for name in CAPTION_FIELDS
+            },
+            "example": example,
+        },
+        "files": {
+            "shards": len(shards),
+            "bytes": sum(shard.stat().st_size for shard in shards),
+            "bytes_by_modality": bytes_by_modality(shards),
+        },
+    }
+
+
+CAPTION_COUNTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
+
+
+def bytes_by_modality(shards: Iterable[Path]) -> dict[str, int]:
+    """Give stored bytes of each modality, from the parquet footers; all small columns together as `annotations`."""
+    owner = {FILES[modality][0]: modality for modality in MODALITIES}
+    sizes: Counter[str] = Counter()
+    for shard in shards:
+        metadata = pq.read_metadata(shard)
+        for group in range(metadata.num_row_groups):
+            for column in range(metadata.num_columns):
+                chunk = metadata.row_group(group).column(column)
+                sizes[owner.get(chunk.path_in_schema.split(".")[0], "annotations")] += chunk.total_compressed_size
+    return dict(sorted(sizes.items()))
+
+
+def _length(points: list[tuple[float, float, float, float]]) -> float:
+    return math.fsum(math.dist(a[1:], b[1:]) for a, b in itertools.pairwise(points))
+
+
+def _spread(values: list[float]) -> dict[str, float | int | None]:
+    """Mean, standard deviation (of the population), least, greatest and number of values."""
+    if not values:
+        return {"count": 0, "mean": None, "std": None, "min": None, "max": None}
+    mean = math.fsum(values) / len(values)
+    std = math.sqrt(math.fsum((value - mean) ** 2 for value in values) / len(values))
+    numbers = {"mean": mean, "std": std, "min": min(values), "max": max(values)}
+    return {"count": len(values), **{name: round(value, DIGITS) for name, value in numbers.items()}}
+
+
+def _sorted(counts: Counter[str]) -> dict[str, int]:
+    """Largest first, then by name: the order does not depend on the rows' order."""
+    return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))
+
+
+# --- the card ---------------------------------------------------------------------------------------------------------
+
+
+def render_card(record: dict[str, Any]) -> str:
+    """Give README.md for a release.json."""
+    template = (importlib.resources.files("release") / "card_template.md").read_text(encoding="utf-8")
+    values = _values(record)
+    names = set(re.findall(r"\{\{(\w+)\}\}", template))
+    assert names == set(values), f"template and values differ: {sorted(names ^ set(values))}"
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match.group(1)], template)
+
+
+def size_category(num_frames: int) -> str:
+    """Give the hub's size category."""
+    names = (
+        (1_000, "n<1K"),
+        (10_000, "1K<n<10K"),
+        (100_000, "10K<n<100K"),
+        (1_000_000, "100K<n<1M"),
+        (10_000_000, "1M<n<10M"),
+    )
+    return next((name for limit, name in names if num_frames < limit), "n>10M")
+
+
+def _values(record: dict[str, Any]) -> dict[str, str]:
+    numbers, history, settings = record["numbers"], record["history"], record["settings"]
+    captions, frames = numbers["captions"], numbers["frames"]
+    visible = f"{_share(numbers['frames_target_visible'], frames)} of the frames"
+    return {
+        "front_matter": _front_matter(record),
+        "name": record["name"],
+        "summary": _summary(record),
+        "frames_table": _table(("", "frames"), _groups(numbers["frames_by"])),
+        "fov_trajectories": ", ".join(f"{fov}: {n:,}" for fov, n in numbers["trajectories_by_fov_deg"].items()),
+        "flights_table": _spreads(numbers),
+        "visible": visible,
+        "perturbed": f"{numbers['frames_perturbed']:,} ({_share(numbers['frames_perturbed'], frames)})",
+        "num_frames": str(settings["num_frames"]),
+        "frame_rule": record["frame_selection"],
+        "short_flights": str(numbers["flights_shorter_than_num_frames"]),
+        "captions_with": f"{captions['frames_with']:,}",
+        "captions_without": f"{captions['frames_without']:,}",
+        "agreement": _share(captions["decision_equals_label"], captions["with_label"]),
+        "with_label": f"{captions['with_label']:,}",
+        "example": _example(captions["example"]),
+        "decisions_table": _table(("decision", "frames", "share"), _histogram(captions["decision"])),
+        "provenance_table": _table(
+            ("", "", "frames"),
+            [(title, f"`{value}`", f"{n:,}") for title, key in PROVENANCE for value, n in captions[key].items()],
+        ),
+        "characters_table": _characters(captions["mean_characters"]),
+        "files_table": _table(
+            ("", "bytes"),
+            [(name, f"{size:,}") for name, size in numbers["files"]["bytes_by_modality"].items()]
+            + [("all shards", f"{numbers['files']['bytes']:,}")],
+        ),
+        "funnel_table": _funnel(history),
+        "modalities": "\n".join(f"- {MODALITY_TEXT[name]}" for name in settings["modalities"]),
+        "decode": _decode_snippet(settings["modalities"]),
+        "columns_table": _columns(settings["modalities"]),
+        "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record["coordinates"].items()]),
+        "licence": record["licence"],
+        "credits": f"\n\n{record['credits']}" if record["credits"] else "",
+        "made_by": record["made_by"],
+    }
+
+
+PROVENANCE = (
+    ("verdict against the geometry", "verdict"),
+    ("repair", "repair_strategy"),
+    ("kind of teacher", "teacher_kind"),
+    ("teacher model", "teacher_model"),
+)
+
+
+def _front_matter(record: dict[str, Any]) -> str:
+    matter = {
+        "license": record["licence"],
+        "language": ["en", "zh"],
+        "pretty_name": record["name"],
+        "size_categories": [size_category(record["numbers"]["frames"])],
+        "task_categories": ["image-text-to-text", "robotics"],
+        "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
+        "configs": [
+            {"config_name": "default", "data_files": [{"split": "train", "path": "data/train-*.parquet"}]},
+        ],
+    }
+    return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
+
+
+def _summary(record: dict[str, Any]) -> str:
+    numbers = record["numbers"]
+    tracks = ", ".join(f"{count} {name}" for name, count in numbers["flights_by_track"].items())
+    towns = len(numbers["frames_by"]["town"])
+    return (
+        f"{numbers['frames']:,} frames of {numbers['flights']:,} flights ({tracks}) "
+        f"over {numbers['trajectories']:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
+        f"{numbers['captions']['frames_with']:,} frames carry a reason in English and in Chinese."
+    )
+
+
+def _groups(frames_by: dict[str, dict[str, int]]) -> list[tuple[str, str]]:
+    titles = {"town": "town", "track": "track", "fov_deg": "field of view (degrees)", "image_px": "image (px)"}
+    return [
+        (f"{titles[name]} {value}", f"{count:,}")
+        for name, counts in frames_by.items()
+        for value, count in counts.items()
+    ]
+
+
+def _spreads(numbers: dict[str, Any]) -> str:
+    titles = (
+        ("frames per flight", "frames_per_flight"),
+        ("duration of a flight, s", "flight_duration_s"),
+        ("length of a flight over its released frames, m", "flight_length_m"),
+        ("height over the target's hip, m", "height_over_target_m"),
+        ("distance to the target, m", "distance_to_target_m"),
+        ("rendered visibility of the target", "visibility"),
+    )
+    rows = []
+    for title, key in titles:
+        spread = numbers[key]
+        cells = ("-" if spread[name] is None else f"{spread[name]:,.3f}" for name in ("mean", "std", "min", "max"))
+        rows.append((title, *cells, f"{spread['count']:,}"))
+    return _table(("", "mean", "std", "min", "max", "values"), rows)
+
+
+def _histogram(counts: dict[str, int]) -> list[tuple[str, str, str]]:
+    total = sum(counts.values())
+    return [(f"`{name}`", f"{count:,}", _share(count, total)) for name, count in counts.items()]
+
+
+def _characters(mean: dict[str, float | None]) -> str:
+    rows = []
+    for english in CAPTION_FIELDS[: len(CAPTION_FIELDS) // 2]:
+        chinese = english.replace("_en_", "_zh_")
+        cells = ("-" if mean[name] is None else f"{mean[name]:.1f}" for name in (english, chinese))
+        rows.append((english.removeprefix("caption_en_"), *cells))
+    return _table(("mean characters", "English", "Chinese"), rows)
+
+
+def _example(example: dict[str, str]) -> str:
+    if not example:
+        return "No frame has a caption."
+    half = len(CAPTION_FIELDS) // 2
+    rows = [
+        (english.removeprefix("caption_en_"), example[english], example[chinese])
+        for english, chinese in zip(CAPTION_FIELDS[:half], CAPTION_FIELDS[half:], strict=True)
+    ]
+    return f"`{example['sample_id']}`:\n\n{_table(('', 'English', 'Chinese'), rows)}"
+
+
+def _funnel(history: dict[str, Any]) -> str:
+    planned, flights, captions = history["trajectories"], history["flights"], history["captions"]
+    rows = [("trajectories planned", planned["planned"])]
+    rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned["dropped"].items()]
+    rows += [("trajectories not rendered", planned["not_rendered"]), ("trajectories rendered", planned["rendered"])]
+    rows += [("flights inspected", flights["inspected"])]
+    rows += [(f"flights left out: {reason}", count) for reason, count in flights["left_out"].items()]
+    rows += [("flights released", flights["released"]), ("captions made", captions["read"])]
+    rows += [(f"captions dropped: {reason}", count) for reason, count in captions["dropped"].items()]
+    rows += [
+        ("captions accepted, frame not selected", captions["frame_not_selected"]),
+        ("captions accepted, flight left out", captions["flight_left_out"]),
+        ("captions released", captions["released"]),
+    ]
+    return _table(("step", "number"), [(name.replace("_", " "), f"{count:,}") for name, count in rows])
+
+
+def _columns(modalities: list[str]) -> str:
+    rows = []
+    for member in schema(modalities):  # type: ignore[arg-type]
+        kind = "float64" if str(member.type) == "double" else str(member.type)
+        if member.name in (FILES["rgb"][0], FILES["instance"][0]):
+            kind = "image"
+        elif kind.startswith("struct"):
+            kind = "numbers " + ", ".join(f"`{child.name}`" for child in member.type)
+        elif member.name == WINDOW:
+            kind = "list of int32"
+        rows.append((f"`{member.name}`", kind))
+    return _table(("column", "type"), rows)
+
+
+def _decode_snippet(modalities: list[str]) -> str:
+    lines = ["import io", "import numpy as np", "from datasets import load_dataset", ""]
+    lines += ['data = load_dataset(FOLDER, split="train")  # this folder, or its name on the hub', "row = data[0]"]
+    if "rgb" in modalities:
+        lines.append('rgb = np.asarray(row["image"].convert("RGB"))')
+    if "depth" in modalities:
+        lines.append('depth_m = np.load(io.BytesIO(row["depth"]))  # float32 (height, width)')
+    if "instance" in modalities:
+        lines += [
+            'coded = np.asarray(row["instance"].convert("RGB")).astype(np.uint16)',
+            "semantic, instance_id = coded[..., 0], coded[..., 1] | (coded[..., 2] << 8)",
+        ]
+    lines += [
+        'intrinsics, pose = row["intrinsics"], row["pose"]',
+        'reason = row["caption_en_reasoning_trace"]  # or _zh_',
+    ]
+    return "\n".join(lines)
+
+
+def _share(count: int, total: int) -> str:
+    return f"{100.0 * count / total:.1f} %" if total else "-"
+
+
+def _table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Give a Markdown table; numbers to the right."""
+    lines = [
+        "| " + " | ".join(heads) + " |",
+        "|" + "|".join("---" if i == 0 else "---:" for i in range(len(heads))) + "|",
+    ]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |" for cells in rows]
+    return "\n".join(lines)

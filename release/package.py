@@ -1,0 +1,365 @@
+"""`cosfly release build`: accepted flights and captions to a folder that `datasets.load_dataset` opens.
+
+Reads the playback tree, `captions.jsonl` and `inspect.json`; writes `dataset/` (parquet shards, README.md, release.json,
+checksums.sha256), which is what gets published. Around it stand the stage's own records, which hold local paths and do not.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import Field, field_validator
+
+import cosfly
+from cosfly.config import Config
+from cosfly.errors import InputError, VerifyError
+from cosfly.inspection import FlightInspection, Inspection, read_inspection
+from cosfly.playback import read_flight
+from cosfly.runner import Finished, Item, Outcome, Work, run_items
+from cosfly.store import (
+    CHECKSUMS,
+    Resume,
+    StageFolder,
+    atomic_folder,
+    inside,
+    sha256_file,
+    storage_errors,
+    write_bytes,
+    write_checksums,
+    write_json,
+)
+from release import columns
+from release.captions import Captions, load_captions
+from release.card import compute_numbers, render_card
+from release.columns import Modality, ReleasedCaption
+from release.record import RELEASE_SCHEMA, RELEASE_VERSION
+from release.subsample import RULE, select_frames
+
+MB = 1024 * 1024
+DATASET, PARTS = "dataset", "parts"
+Track = Literal["clean", "perturbed"]
+
+
+class ReleaseConfig(Config):
+    """What is published, and how it is cut into files."""
+
+    name: str = Field("CosFly flights", min_length=1, description="title of the data-set card")
+    licence: str = Field(
+        "cc-by-4.0", min_length=1, description="licence identifier of the data set, as the hub spells it"
+    )
+    credits: str = Field(
+        "", description="who must be named: the source of the map and its licence, one sentence or more"
+    )
+    num_frames: int = Field(
+        400, ge=1, description="frames per flight by stride selection; shorter flights are kept whole, never padded"
+    )
+    tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
+    include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
+    modalities: tuple[Modality, ...] = Field(
+        columns.MODALITIES, min_length=1, description="pictures to include: rgb, depth (lossless float32), instance"
+    )
+    shard_mb: int = Field(500, ge=1, description="size that a parquet file should not pass by more than one flight, MB")
+    row_group_mb: int = Field(
+        64, ge=1, description="size of a row group before compression, MB; viewers load one at a time"
+    )
+
+    @field_validator("tracks", "modalities")
+    @classmethod
+    def _distinct(cls, values: tuple) -> tuple:
+        if len(set(values)) != len(values):
+            raise ValueError("an entry is listed twice")
+        return values
+
+
+# --- what goes in -----------------------------------------------------------------------------------------------------
+
+
+def choose_flights(inspection: Inspection, cfg: ReleaseConfig) -> tuple[list[FlightInspection], dict[str, int]]:
+    """Give the flights to release, and why the others are left out: reason -> count."""
+    wanted = {"accepted", "review"} if cfg.include_review else {"accepted"}
+    chosen, left_out = [], Counter[str]()
+    for flight in inspection.flights:
+        track: Track = "clean" if flight.variant == "ORI" else "perturbed"
+        if flight.result not in wanted:
+            left_out[f"{flight.result}: {flight.reason}"] += 1
+        elif track not in cfg.tracks:
+            left_out[f"track {track} not wanted"] += 1
+        else:
+            chosen.append(flight)
+    return chosen, dict(sorted(left_out.items()))
+
+
+# --- one flight -------------------------------------------------------------------------------------------------------
+
+
+def part_name(item_id: str) -> str:
+    return item_id.replace("/", "__") + ".parquet"
+
+
+def write_part(path: Path, folder: Path, captions: dict[int, ReleasedCaption], cfg: ReleaseConfig) -> dict[str, int]:
+    """Write one flight's selected frames as parquet, in row groups; give its counts.
+
+    Raises:
+        InputError: the flight or a file of it cannot be read, or a caption belongs to no frame of it.
+    """
+    flight = read_flight(folder)
+    beyond = [index for index in captions if not 0 <= index < len(flight)]
+    if beyond:
+        expected = f"0 to {len(flight) - 1}: make the captions again from this tree"
+        raise InputError("a caption belongs to no frame", where=folder, got=f"frame {beyond[0]}", expected=expected)
+    selected = select_frames(len(flight), cfg.num_frames).tolist()
+    schema = columns.schema(cfg.modalities)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open_writer(partial, schema) as writer:
+            for rows in _batches((columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected), cfg):
+                writer.write_table(pa.Table.from_pylist(rows, schema=schema), row_group_size=len(rows))
+        os.replace(partial, path)
+    num_captions = sum(i in captions for i in selected)
+    return {
+        "frames": len(selected),
+        "frames_available": len(flight),
+        "captions": num_captions,
+        "captions_not_selected": len(captions) - num_captions,
+        "bytes": path.stat().st_size,
+    }
+
+
+def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[list[dict[str, Any]]]:
+    """Cut rows into groups of about `row_group_mb`."""
+    batch: list[dict[str, Any]] = []
+    num_bytes = 0
+    for row in rows:
+        batch.append(row)
+        for modality in cfg.modalities:
+            value = row[columns.FILES[modality][0]]
+            num_bytes += len(value if modality == "depth" else value["bytes"])
+        if num_bytes >= cfg.row_group_mb * MB:
+            yield batch
+            batch, num_bytes = [], 0
+    if batch:
+        yield batch
+
+
+def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Open a parquet file whose bytes depend on the rows alone.
+
+    PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
+    repeat their first bytes.
+    """
+    compression, small = {}, []
+    for name in _leaves(schema):
+        is_png = name.endswith(".bytes")
+        compression[name] = "none" if is_png else "zstd"
+        if not is_png and name != "depth":
+            small.append(name)
+    repeated = [name for name in small if schema.field(name.split(".")[0]).type == pa.string()]
+    return pq.ParquetWriter(
+        path, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6"
+    )
+
+
+def _leaves(schema: pa.Schema) -> list[str]:
+    """Give the parquet paths of the primitive columns."""
+    names: list[str] = []
+    for member in schema:
+        if pa.types.is_struct(member.type):
+            names += [f"{member.name}.{child.name}" for child in member.type]
+        elif pa.types.is_list(member.type):
+            names.append(f"{member.name}.list.element")
+        else:
+            names.append(member.name)
+    return names
+
+
+# --- the shards -------------------------------------------------------------------------------------------------------
+
+
+def plan_shards(sizes: list[int], target_bytes: int) -> list[list[int]]:
+    """Group consecutive parts: a shard is closed as soon as it reaches the target."""
+    groups: list[list[int]] = []
+    total = 0
+    for index, size in enumerate(sizes):
+        if not groups or total >= target_bytes:
+            groups.append([])
+            total = 0
+        groups[-1].append(index)
+        total += size
+    return groups
+
+
+def assemble_shards(parts: list[Path], folder: Path, cfg: ReleaseConfig) -> list[Path]:
+    """Copy the parts' row groups into `data/train-i-of-n.parquet`; memory holds one row group.
+
+    A part that fills a shard alone is linked, not copied.
+    """
+    groups = plan_shards([part.stat().st_size for part in parts], cfg.shard_mb * MB)
+    schema = columns.schema(cfg.modalities)
+    shards = []
+    (folder / "data").mkdir()
+    for number, group in enumerate(groups):
+        shard = folder / "data" / f"train-{number:05d}-of-{len(groups):05d}.parquet"
+        shards.append(shard)
+        if len(group) == 1:
+            _link(parts[group[0]], shard)
+            continue
+        with open_writer(shard, schema) as writer:
+            for index in group:
+                with pq.ParquetFile(parts[index]) as source:
+                    for k in range(source.num_row_groups):
+                        table = source.read_row_group(k)
+                        writer.write_table(table, row_group_size=table.num_rows)
+    return shards
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file a second name, or a copy where the file system has no links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def make_work(cfg: ReleaseConfig, data: Path, parts: Path) -> Work:
+    """Worker factory: give the function that packages one flight."""
+
+    def work(item: Item) -> Outcome:
+        return Outcome(write_part(parts / part_name(item.item_id), inside(data, item.item_id), item.payload, cfg))
+
+    return work
+
+
+def run(
+    cfg: ReleaseConfig,
+    data: Path,
+    captions: Path,
+    inspect: Path,
+    out: Path,
+    *,
+    workers: int = 1,
+    resume: Resume = "if-same",
+) -> Path:
+    """Read the playback tree, the captions and the inspection; write `dataset/` and give its path."""
+    stage = StageFolder.open(
+        out,
+        "release",
+        config=cfg.model_dump(mode="json"),
+        inputs={"data": data, "captions": captions, "inspect": inspect},
+        seed=0,
+        resume=resume,
+    )
+    dataset, parts = out / DATASET, out / PARTS
+    if stage.is_complete:
+        shutil.rmtree(parts, ignore_errors=True)
+        return dataset
+    inspection = read_inspection(inspect)
+    chosen, left_out = choose_flights(inspection, cfg)
+    if not chosen:
+        got = ", ".join(f"{reason} {count}" for reason, count in left_out.items()) or "no flights"
+        raise InputError("there is no flight to release", where=inspect, got=got, fix="look at report.html beside it")
+    loaded = load_captions(captions)
+    items = [
+        Item(flight.folder, loaded.by_flight.get((flight.town, flight.trajectory, flight.variant), {}))
+        for flight in chosen
+    ]
+    finished = run_items(stage, items, make_work, (cfg, data, parts), workers=workers, label="release")
+    results = dict(finished.results())
+    if not results:
+        raise InputError("no flight could be packaged", where=data, fix=f"see {out / 'failures.jsonl'}")
+    _check_parts(parts, results)
+    history = account(inspection, left_out, loaded, finished)
+    with atomic_folder(dataset) as folder:
+        shards = assemble_shards([parts / part_name(item_id) for item_id in results], folder, cfg)
+        write_records(folder, shards, results, history, cfg)
+    # checksums.sha256 speaks for the shards: hashing them again would only cost time.
+    outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
+    stage.finish(outputs, finished.tally, history=history)
+    shutil.rmtree(parts, ignore_errors=True)
+    return dataset
+
+
+def _check_parts(parts: Path, results: dict[str, dict]) -> None:
+    for item_id, result in results.items():
+        path = parts / part_name(item_id)
+        if not path.is_file() or path.stat().st_size != result["bytes"]:
+            raise VerifyError(
+                "a part that was finished before is missing or has another size",
+                where=path,
+                expected=f"{result['bytes']} bytes",
+                fix=f"remove {parts.parent} and run again",
+            )
+
+
+def account(inspection: Inspection, left_out: dict[str, int], captions: Captions, finished: Finished) -> dict[str, Any]:
+    """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
+    results = dict(finished.results())
+    gone = dict(left_out)
+    for code, count in finished.tally.failed.items():
+        gone[f"failed: {code}"] = count
+    released = sum(result["captions"] for result in results.values())
+    not_selected = sum(result["captions_not_selected"] for result in results.values())
+    history = {
+        "trajectories": inspection.funnel.trajectories.model_dump(mode="json"),
+        "flights": {"inspected": len(inspection.flights), "released": len(results), "left_out": gone},
+        "captions": {
+            "read": captions.num_read,
+            "dropped": dict(sorted(captions.dropped.items())),
+            "accepted": captions.num_accepted,
+            "released": released,
+            "frame_not_selected": not_selected,
+            "flight_left_out": captions.num_accepted - released - not_selected,
+        },
+    }
+    assert history["flights"]["inspected"] == len(results) + sum(gone.values()), history
+    assert history["captions"]["flight_left_out"] >= 0, history
+    return history
+
+
+def write_records(
+    folder: Path, shards: list[Path], results: dict[str, dict], history: dict[str, Any], cfg: ReleaseConfig
+) -> None:
+    """Write release.json, the card and the checksums of a folder that holds its shards."""
+    listed = [
+        {
+            "path": shard.relative_to(folder).as_posix(),
+            "rows": pq.read_metadata(shard).num_rows,
+            "bytes": shard.stat().st_size,
+            "sha256": sha256_file(shard),
+        }
+        for shard in shards
+    ]
+    record = {
+        "schema": RELEASE_SCHEMA,
+        "schema_version": RELEASE_VERSION,
+        "name": cfg.name,
+        "licence": cfg.licence,
+        "credits": cfg.credits,
+        "made_by": f"cosfly {cosfly.__version__}",
+        "settings": {"num_frames": cfg.num_frames, "tracks": list(cfg.tracks), "modalities": list(cfg.modalities)},
+        "frame_selection": RULE,
+        "coordinates": columns.CONTRACT,
+        "numbers": compute_numbers(shards, cfg.num_frames),
+        "history": history,
+        "flights": [
+            {"flight": item_id, "frames": result["frames"], "frames_available": result["frames_available"]}
+            for item_id, result in results.items()
+        ],
+        "shards": listed,
+    }
+    write_json(folder / "release.json", record)
+    write_bytes(folder / "README.md", render_card(record).encode())
+    digests = {str(entry["path"]): str(entry["sha256"]) for entry in listed}
+    for name in ("release.json", "README.md"):
+        digests[name] = sha256_file(folder / name)
+    write_checksums(folder, digests)

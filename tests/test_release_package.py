@@ -1,0 +1,513 @@
+"""Packaging: what is in the folder, that other people's tools open it, and that verify finds what is wrong with it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly.coc import Caption, Coc, Prompt, write_captions
+from cosfly.errors import InputError
+from cosfly.inspection import FlightFunnel, FlightInspection, Funnel, Inspection, TrajectoryFunnel, write_inspection
+from cosfly.issues import Issue
+from cosfly.playback import find_flights, read_depth, read_flight, read_instance, read_rgb, sample_id
+from cosfly.store import read_json, sha256_file, write_json
+from release.card import render_card, size_category
+from release.package import ReleaseConfig, plan_shards, run
+from release.validate import picture_problem, verify
+from specimens import make_playback_tree
+
+NUM_POINTS = 12
+CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.")
+
+
+def make_caption(flight, index: int, **change) -> Caption:
+    decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
+    prompt = Prompt(system="s", user="u")
+    values = {
+        "sample_id": sample_id(flight.flight_id, index),
+        "town": flight.town,
+        "trajectory": flight.trajectory,
+        "variant": flight.variant,
+        "frame_index": index,
+        "window": list(range(index - 4, index + 1)),
+        "future": [index + 1],
+        "prompt": {"en": prompt, "zh": prompt},
+        "prompt_hash": "0" * 64,
+        "teacher": {"kind": "rules", "model": "rules-1", "settings": {}},
+        "usage": {"prompt_tokens": 0, "completion_tokens": 0},
+        "attempts": 1,
+        "en": Coc(
+            critical_components=f"A person {index} m ahead",
+            reasoning_trace="The person walks on, so go",
+            flight_decision=decision,
+        ),
+        "zh": Coc(
+            critical_components=f"前方 {index} 米处的行人",
+            reasoning_trace="行人继续直行, 因此跟随",
+            flight_decision=decision,
+        ),
+        "label": "track_straight",
+        "verdict": "CONSISTENT",
+        "repair": {"strategy": "anchored", "asks": 1} if index % 4 == 0 else None,
+        "status": "accepted",
+    }
+    return Caption(**{**values, **change})
+
+
+def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:
+    """An inspection of a specimen tree; `rejected` maps a folder name to (result, code)."""
+    flights = []
+    for folder in find_flights(tree):
+        name = folder.relative_to(tree).as_posix()
+        town, trajectory, variant = folder.parts[-3:]
+        result, code = rejected.get(name, ("accepted", ""))
+        issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
+        place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
+        flights.append(FlightInspection(**place, result=result, issues=issues, metrics={}))
+    n = len({flight.trajectory for flight in flights})
+    trajectories = TrajectoryFunnel(
+        planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, accepted=n, review=0, rejected=0
+    )
+    counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
+    funnel = FlightFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
+    return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> Path:
+    """tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
+    root = tmp_path_factory.mktemp("inputs")
+    tree = make_playback_tree(
+        root / "tree", num_flights=3, num_points=NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02")
+    )
+    captions = []
+    for folder in find_flights(tree):
+        flight = read_flight(folder)
+        captions += [make_caption(flight, index) for index in range(4, NUM_POINTS - 1)]
+        captions.append(make_caption(flight, 11, status="dropped", drop_reason="hard_conflict", en=None, zh=None))
+    write_captions(root / "captions.jsonl", captions)
+    names = [folder.relative_to(tree).as_posix() for folder in find_flights(tree)]
+    gone = {names[1]: ("rejected", "missing_file"), names[4]: ("review", "stray_frame")}
+    write_inspection(root / "inspect.json", make_inspection(tree, gone))
+    return root
+
+
+def build(inputs: Path, out: Path, cfg: ReleaseConfig = CFG, **more) -> Path:
+    return run(cfg, inputs / "tree", inputs / "captions.jsonl", inputs / "inspect.json", out, **more)
+
+
+@pytest.fixture(scope="module")
+def built(inputs, tmp_path_factory) -> Path:
+    return build(inputs, tmp_path_factory.mktemp("built") / "release")
+
+
+@pytest.fixture
+def dataset(built, tmp_path) -> Path:
+    """A copy that may be broken."""
+    return shutil.copytree(built, tmp_path / "dataset")
+
+
+@pytest.fixture(scope="module")
+def loaded(built, tmp_path_factory):
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    datasets = pytest.importorskip("datasets")
+    cache = tmp_path_factory.mktemp("cache")
+    return datasets.load_dataset(str(built), split="train", cache_dir=str(cache))
+
+
+def all_bytes(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# --- what is in it ----------------------------------------------------------------------------------------------------
+
+
+def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, inputs):
+    assert len(loaded) == 4 * 8
+    assert set(loaded["town"]) == {"Town01", "Town02"}
+    for row in (loaded[0], loaded[9], loaded[31]):
+        folder = inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
+        flight, i = read_flight(folder), row["frame_index"]
+        frame = flight.frame_folder(i)
+        assert (np.asarray(row["image"]) == read_rgb(frame)).all()
+        coded = np.asarray(row["instance"]).astype(np.uint16)
+        kinds, ids = read_instance(frame)
+        assert (coded[..., 0] == kinds).all()
+        assert ((coded[..., 1] | coded[..., 2] << 8) == ids).all()
+        depth = np.load(io.BytesIO(row["depth"]))
+        assert depth.dtype == np.float32
+        assert depth.tobytes() == read_depth(frame).tobytes()
+        assert [row["pose"][k] for k in ("x_m", "y_m", "z_m")] == flight.positions_m[i].tolist()
+        assert [row["pose"][k] for k in ("pitch_deg", "yaw_deg", "roll_deg")] == flight.rotations_deg[i].tolist()
+        assert [row["target"][k] for k in ("x_m", "y_m", "z_m")] == flight.targets_m[i].tolist()
+        assert row["time_s"] == flight.time_s[i]
+        assert row["is_perturbed"] == flight.is_perturbed[i]
+        assert row["track"] == ("clean" if row["variant"] == "ORI" else "perturbed")
+    captioned = loaded.filter(lambda row: row["has_caption"])
+    row = captioned[0]
+    assert "行人" in row["caption_zh_reasoning_trace"]
+    assert row["caption_en_critical_components"] == f"A person {row['frame_index']} m ahead"
+    assert row["caption_window"] == list(range(row["frame_index"] - 4, row["frame_index"] + 1))
+    assert row["decision"] == row["caption_en_flight_decision"] == row["caption_zh_flight_decision"]
+    assert row["teacher_kind"] == "rules"
+    bare = loaded.filter(lambda row: not row["has_caption"])
+    assert bare[0]["caption_en_reasoning_trace"] is None
+    assert bare[0]["caption_window"] is None
+
+
+def test_the_decode_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
+    datasets = pytest.importorskip("datasets")
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+    code = re.search(r"```python\n(.*?)```", (built / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    values: dict = {"FOLDER": str(built)}
+    exec(code.group(1), values)
+    assert values["depth_m"].shape == (54, 96)
+    assert values["depth_m"].dtype == np.float32
+    assert values["rgb"].shape == (54, 96, 3)
+    assert 0x1234 in values["instance_id"]
+    assert 12 in values["semantic"]
+
+
+def test_numbers_against_a_slow_oracle(loaded, built):
+    """The record's numbers, counted again from what `datasets` gives."""
+    numbers = read_json(built / "release.json")["numbers"]
+    rows = list(loaded.remove_columns(["image", "instance", "depth"]))
+    with_caption = [row for row in rows if row["has_caption"]]
+    assert numbers["frames"] == len(rows)
+    assert numbers["flights"] == len({(r["town"], r["trajectory"], r["variant"]) for r in rows}) == 4
+    assert numbers["trajectories"] == len({(r["town"], r["trajectory"]) for r in rows})
+    assert numbers["captions"]["frames_with"] == len(with_caption)
+    assert numbers["captions"]["frames_without"] == len(rows) - len(with_caption)
+    for decision, count in numbers["captions"]["decision"].items():
+        assert count == sum(row["decision"] == decision for row in with_caption)
+    assert sum(numbers["captions"]["decision"].values()) == len(with_caption)
+    heights = np.array([row["pose"]["z_m"] - row["target"]["z_m"] for row in rows])
+    assert numbers["height_over_target_m"]["mean"] == pytest.approx(heights.mean(), abs=1e-4)
+    assert numbers["height_over_target_m"]["std"] == pytest.approx(heights.std(), abs=1e-4)
+    characters = np.mean([len(row["caption_zh_reasoning_trace"]) for row in with_caption])
+    assert numbers["captions"]["mean_characters"]["caption_zh_reasoning_trace"] == pytest.approx(characters, abs=0.06)
+    assert numbers["frames_perturbed"] == sum(row["is_perturbed"] for row in rows)
+    assert numbers["files"]["bytes"] == sum(p.stat().st_size for p in (built / "data").iterdir())
+
+
+def test_the_account_names_every_flight_and_caption(built):
+    history = read_json(built / "release.json")["history"]
+    assert history["flights"] == {
+        "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
+    }  # fmt: skip
+    captions = history["captions"]
+    assert captions["read"] == 6 * 8
+    assert captions["dropped"] == {"hard_conflict": 6}
+    assert captions["flight_left_out"] == 2 * 7
+    assert captions["released"] + captions["frame_not_selected"] == 4 * 7
+    chosen = {0, 1, 3, 4, 6, 7, 9, 11}  # floor(k * 11 / 7)
+    assert captions["released"] == 4 * len(chosen & set(range(4, 11)))
+
+
+def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
+    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",)))
+    record = read_json(folder / "release.json")
+    assert [flight["frames"] for flight in record["flights"]] == [NUM_POINTS] * 4
+    assert record["numbers"]["flights_shorter_than_num_frames"] == 4
+    assert set(pq.read_schema(folder / record["shards"][0]["path"]).names) & {"image", "depth", "instance"} == {"image"}
+    assert verify(folder).is_ok
+
+
+def test_tracks_and_review_are_settings(inputs, tmp_path):
+    cfg = CFG.model_copy(update={"tracks": ("clean",), "include_review": True, "modalities": ("depth",)})
+    record = read_json(build(inputs, tmp_path / "r", cfg) / "release.json")
+    assert record["numbers"]["flights_by_track"] == {"clean": 3}
+    assert sum(record["history"]["flights"]["left_out"].values()) == 3
+
+
+def test_coordinates_stand_in_the_record_for_programs(built):
+    record = read_json(built / "release.json")
+    assert record["coordinates"]["handedness"] == "right"
+    assert record["coordinates"]["body_from_camera"] == [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+
+
+def test_nothing_local_is_published(built, inputs):
+    for name, data in all_bytes(built).items():
+        assert str(inputs).encode() not in data, name
+    assert {p.name for p in built.iterdir()} == {"README.md", "release.json", "checksums.sha256", "data"}
+
+
+def test_shards_hold_whole_row_groups_in_order(built):
+    record = read_json(built / "release.json")
+    assert len(record["shards"]) > 0
+    for entry in record["shards"]:
+        file = pq.ParquetFile(built / entry["path"])
+        assert b"huggingface" in file.schema_arrow.metadata
+        assert file.metadata.num_rows == entry["rows"]
+
+
+@given(st.lists(st.integers(1, 50), max_size=30), st.integers(1, 120))
+def test_shards_lose_nothing_and_keep_the_order(sizes, target):
+    groups = plan_shards(sizes, target)
+    assert [index for group in groups for index in group] == list(range(len(sizes)))
+    for group in groups[:-1]:
+        assert sum(sizes[i] for i in group) >= target
+        assert sum(sizes[i] for i in group[:-1]) < target
+
+
+@pytest.mark.parametrize(
+    ("frames", "name"), [(0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (100_000, "100K<n<1M"), (10**8, "n>10M")]
+)
+def test_size_category(frames, name):
+    assert size_category(frames) == name
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_same_bytes_with_two_workers(inputs, built, tmp_path):
+    assert all_bytes(build(inputs, tmp_path / "two", workers=2)) == all_bytes(built)
+
+
+def test_a_second_run_has_nothing_to_do(inputs, built):
+    before = {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")}
+    assert build(inputs, built.parent) == built
+    assert {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")} == before
+    assert not (built.parent / "parts").exists()
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+import release.package as package
+original = package.write_part
+def delayed(*args):
+    result = original(*args)
+    time.sleep(0.5)
+    return result
+package.write_part = delayed
+root, out = Path(sys.argv[1]), Path(sys.argv[2])
+cfg = package.ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.")
+package.run(cfg, root / "tree", root / "captions.jsonl", root / "inspect.json", out)
+"""
+
+
+def test_kill_and_resume_gives_the_same_bytes(inputs, built, tmp_path):
+    journal = tmp_path / "killed" / "items.jsonl"
+    child = subprocess.Popen([sys.executable, "-c", KILLED, str(inputs), str(tmp_path / "killed")])
+    deadline = time.monotonic() + 60
+    while not (journal.exists() and journal.read_bytes().count(b"\n") >= 2) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert journal.read_bytes().count(b"\n") >= 2
+    assert not (tmp_path / "killed" / "dataset").exists()
+    assert all_bytes(build(inputs, tmp_path / "killed")) == all_bytes(built)
+
+
+def test_a_flight_that_cannot_be_read_is_counted_and_the_others_go_on(inputs, tmp_path):
+    copy = shutil.copytree(inputs, tmp_path / "inputs")
+    first = find_flights(copy / "tree")[0]
+    (first / "frames_playback" / "frame_00000" / "depth.npy").unlink()
+    folder = build(copy, tmp_path / "r")
+    record = read_json(folder / "release.json")
+    assert record["history"]["flights"]["left_out"]["failed: input"] == 1
+    assert record["numbers"]["flights"] == 3
+    assert "depth.npy" in (tmp_path / "r" / "failures.jsonl").read_text()
+    assert verify(folder).is_ok
+
+
+def rewrite_captions(root: Path, change) -> None:
+    lines = [json.loads(line) for line in (root / "captions.jsonl").read_text(encoding="utf-8").splitlines()]
+    change(lines)
+    (root / "captions.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda lines: lines.append(lines[0]), "two accepted captions"),
+        (lambda lines: lines[0].update(zh=None), "lacks a language"),
+        (lambda lines: lines[0]["zh"].update(flight_decision="hover"), "decide differently"),
+        (lambda lines: lines[0].update(frame_index="x"), "frame_index"),
+    ],
+)
+def test_captions_that_cannot_be_are_one_clear_error(inputs, tmp_path, change, word):
+    copy = shutil.copytree(inputs, tmp_path / "inputs")
+    rewrite_captions(copy, change)
+    with pytest.raises(InputError, match=word) as caught:
+        build(copy, tmp_path / "r")
+    assert "captions.jsonl" in str(caught.value)
+
+
+def test_no_accepted_flight_is_one_clear_error(inputs, tmp_path):
+    names = [folder.relative_to(inputs / "tree").as_posix() for folder in find_flights(inputs / "tree")]
+    everything = make_inspection(inputs / "tree", dict.fromkeys(names, ("rejected", "jerk")))
+    write_inspection(tmp_path / "inspect.json", everything)
+    with pytest.raises(InputError, match="no flight to release") as caught:
+        run(CFG, inputs / "tree", inputs / "captions.jsonl", tmp_path / "inspect.json", tmp_path / "r")
+    assert "jerk 6" in str(caught.value)
+
+
+# --- verify -----------------------------------------------------------------------------------------------------------
+
+
+def codes(folder: Path) -> set[str]:
+    return {issue.code for issue in verify(folder).issues}
+
+
+def test_a_built_release_verifies(built):
+    report = verify(built)
+    assert report.is_ok, str(report)
+    assert report.issues == []
+    assert verify(built.parent).is_ok  # the stage's folder does as well
+    assert str(report).endswith("OK: 0 errors, 0 warnings, 0 notes")
+
+
+def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
+    card = dataset / "README.md"
+    text = card.read_text(encoding="utf-8")
+    places = [match.start() for match in re.finditer(r"\d", text)]
+    record = read_json(dataset / "release.json")
+    expected = render_card(record)
+    assert text == expected
+    for place in places[:: max(1, len(places) // 12)]:
+        digit = str((int(text[place]) + 1) % 10)
+        card.write_text(text[:place] + digit + text[place + 1 :], encoding="utf-8")
+        report = verify(dataset, pixels="none")
+        line = text[:place].count("\n") + 1
+        assert [i.where for i in report.issues if i.code == "card"] == [f"README.md:{line}"]
+
+
+def test_a_changed_number_is_found_even_with_fresh_checksums(dataset):
+    """Someone who edits record, card and checksums alike still meets the shards."""
+    record = read_json(dataset / "release.json")
+    record["numbers"]["captions"]["frames_with"] += 1
+    write_json(dataset / "release.json", record)
+    (dataset / "README.md").write_text(render_card(record), encoding="utf-8")
+    text = (dataset / "checksums.sha256").read_text()
+    for name in ("release.json", "README.md"):
+        text = re.sub(rf"^\S+  {name}$", f"{sha256_file(dataset / name)}  {name}", text, flags=re.MULTILINE)
+    (dataset / "checksums.sha256").write_text(text)
+    report = verify(dataset)
+    assert {issue.code for issue in report.issues} == {"number", "sum"}
+    assert "captions.frames_with" in str(report)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.8, 0.999])
+def test_a_flipped_byte_anywhere_fails(dataset, share):
+    shard = sorted((dataset / "data").iterdir())[0]
+    data = bytearray(shard.read_bytes())
+    data[int(share * len(data))] ^= 1
+    shard.write_bytes(data)
+    report = verify(dataset)
+    assert not report.is_ok
+    assert any(issue.code == "checksum" and shard.name in issue.where for issue in report.issues)
+
+
+def edit_record(dataset: Path, change) -> None:
+    record = read_json(dataset / "release.json")
+    change(record)
+    write_json(dataset / "release.json", record)
+
+
+def rewrite_shard(dataset: Path, change) -> None:
+    """Change rows of the first shard and make sizes and digests right again, so that only the meaning is wrong."""
+    record = read_json(dataset / "release.json")
+    path = dataset / record["shards"][0]["path"]
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(type(table).from_pylist(rows, schema=table.schema), path)
+    record["shards"][0].update(bytes=path.stat().st_size, sha256=sha256_file(path), rows=len(rows))
+    write_json(dataset / "release.json", record)
+
+
+def move_drone(rows):
+    rows[3]["pose"]["x_m"] += 0.5
+
+
+def swap_axes(rows):
+    for row in rows:
+        row["pose"]["y_m"] *= -1
+        row["pose"]["yaw_deg"] *= -1
+
+
+DAMAGES = {
+    "missing": lambda d: (d / "checksums.sha256").unlink(),
+    "unexpected": lambda d: (d / "data" / "notes.txt").write_text("hello"),
+    "size": lambda d: next((d / "data").iterdir()).write_bytes(b"PAR1"),
+    "record": lambda d: (d / "release.json").write_text("{}"),
+    "record without shards": lambda d: edit_record(d, lambda r: r.pop("shards")),
+    "record of odd rows": lambda d: edit_record(d, lambda r: r["shards"][0].update(rows="many")),
+    "number": lambda d: edit_record(d, lambda r: r["numbers"].update(frames=7)),
+    "sum": lambda d: edit_record(d, lambda r: r["history"]["flights"].update(inspected=99)),
+    "flight": lambda d: edit_record(d, lambda r: r["flights"].pop()),
+    "frames": lambda d: edit_record(d, lambda r: r["flights"][0].update(frames_available=500)),
+    "rows": lambda d: edit_record(d, lambda r: r["shards"][0].update(rows=5)),
+    "projection": lambda d: rewrite_shard(d, move_drone),
+    "projection of other axes": lambda d: rewrite_shard(d, swap_axes),
+    "caption": lambda d: rewrite_shard(
+        d, lambda rows: rows[4].update(caption_zh_reasoning_trace=None, has_caption=True)
+    ),
+    "caption of another set": lambda d: rewrite_shard(d, lambda rows: [r.update(decision="land") for r in rows]),
+    "duplicate": lambda d: rewrite_shard(d, lambda rows: rows.__setitem__(1, rows[0])),
+    "picture": lambda d: rewrite_shard(d, lambda rows: rows[2]["image"].update(bytes=b"\x89PNG")),
+    "picture of depth": lambda d: rewrite_shard(d, lambda rows: rows[2].update(depth=rows[2]["depth"][:-8])),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_planted_damage_is_found(dataset, damage):
+    DAMAGES[damage](dataset)
+    report = verify(dataset)
+    assert damage.split()[0] in {issue.code for issue in report.issues}, str(report)
+    assert not report.is_ok
+
+
+def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
+    assert codes(tmp_path / "nowhere") == {"missing"}
+    assert codes(tmp_path) == {"record"}
+
+
+def test_pictures_of_the_wrong_size_are_named(inputs):
+    frame = find_flights(inputs / "tree")[0] / "frames_playback" / "frame_00000"
+    rgb = {"bytes": (frame / "rgb.png").read_bytes()}
+    assert picture_problem("rgb", rgb, (54, 96)) is None
+    assert picture_problem("rgb", rgb, (96, 54)) is not None
+    assert picture_problem("rgb", None, (54, 96)) is not None
+    assert picture_problem("depth", (frame / "depth.npy").read_bytes(), (54, 96)) is None
+    assert picture_problem("depth", b"", (54, 96)) is not None
+
+
+def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
+    """Parts that fill a shard are linked; the rows and their order are those of the copied shards."""
+    import release.package as package
+
+    monkeypatch.setattr(package, "MB", 1000)  # so that the specimen's small flights pass shard_mb
+    folder = build(inputs, tmp_path / "r")
+    record = read_json(folder / "release.json")
+    assert len(record["shards"]) == 4
+    assert [flight["frames"] for flight in record["flights"]] == [entry["rows"] for entry in record["shards"]]
+    assert verify(folder).is_ok
+
+
+def test_a_disk_without_links_gets_copies(inputs, built, tmp_path, monkeypatch):
+    import release.package as package
+
+    def refuse(*args):
+        raise OSError("no links here")
+
+    monkeypatch.setattr(package, "MB", 1000)
+    linked = build(inputs, tmp_path / "linked")
+    monkeypatch.setattr(os, "link", refuse)
+    assert all_bytes(build(inputs, tmp_path / "copied")) == all_bytes(linked)
