@@ -45,6 +45,7 @@ ResumeOption = Annotated[
         help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
     ),
 ]
+OutOption = Annotated[Path, typer.Option(help="Output folder.")]
 MapOption = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
 DataOption = Annotated[
     Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
@@ -150,16 +151,23 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
 
     table = Table(title=f"What was made in {out}", title_justify="left")
     for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
-        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
+        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left")
+    num_failed = 0
     for result in results:
         counts = result.manifest["counts"]
-        reasons = (", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed"))
-        seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
-        table.add_row(
-            result.stage, f"{counts['kept']} of {counts['input']}", *reasons, seconds, os.path.relpath(result.product)
+        dropped, failed = (
+            ", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed")
         )
+        num_failed += sum(counts["failed"].values())
+        seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
+        product = os.path.relpath(result.product, out)
+        table.add_row(result.stage, f"{counts['kept']} of {counts['input']}", dropped, failed, seconds, product)
     console.print(table)
-    for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/README.md"):
+    if num_failed:
+        console.print(
+            f"  {num_failed} items failed; why stands in <stage>/failures.jsonl", style="yellow", highlight=False
+        )
+    for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
         console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)
 
 
@@ -168,7 +176,7 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
 
 @app.command()
 def maps(
-    out: Annotated[Path, typer.Option(help="Output folder.")],
+    out: OutOption,
     source: Annotated[
         str | None, typer.Option(help="synthetic, simworld or cityjson; short for --set maps.source=...")
     ] = None,
@@ -187,7 +195,7 @@ def maps(
 @app.command()
 def simplify(
     map_: MapOption,
-    out: Annotated[Path, typer.Option(help="Output folder.")],
+    out: OutOption,
     config: ConfigFile = None,
     overrides: Overrides = None,
     resume: ResumeOption = ResumeMode.if_same,
@@ -202,7 +210,7 @@ def simplify(
 @app.command()
 def pedestrians(
     map_: MapOption,
-    out: Annotated[Path, typer.Option(help="Output folder.")],
+    out: OutOption,
     roi: Annotated[Path | None, typer.Option(help="Region of interest: roi_polygon.json.")] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
@@ -214,19 +222,15 @@ def pedestrians(
     import cosfly.pedestrians
 
     cfg = _settings(config, overrides, seed, workers)
-    spread = {"workers": _spread(cfg), "resume": resume.value}
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
     typer.echo(cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **spread))
 
 
-plan_app = typer.Typer(invoke_without_command=True, help="Step 4: a drone flight for every walk, drone_trace.json.")
-app.add_typer(plan_app, name="plan")
-
-
-@plan_app.callback()
+@app.command()
 def plan(
     map_: MapOption,
     paths: Annotated[Path, typer.Option(help="Walks: path.json.")],
-    out: Annotated[Path, typer.Option(help="Output folder.")],
+    out: OutOption,
     config: ConfigFile = None,
     overrides: Overrides = None,
     seed: Seed = None,
@@ -282,7 +286,7 @@ def gallery(
 @app.command()
 def inspect(
     traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: Annotated[Path, typer.Option(help="Output folder.")],
+    out: OutOption,
     data: DataOption = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
@@ -321,15 +325,15 @@ def caption(
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
     if context.invoked_subcommand is not None:
         return
-    import caption.regenerate
+    import caption.stage
 
-    chosen = {"caption.teacher": teacher, "caption.model": model}
+    chosen = {"caption.teacher": teacher, "caption.endpoint.model": model}
     extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
     cfg = _settings(config, [*(overrides or []), *extra], seed, workers)
     tree = _data(data)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
     target = out or tree.resolve().parent / "caption"
-    typer.echo(caption.regenerate.run(cfg.caption, tree, target, seed=cfg.seed, **spread))
+    typer.echo(caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, **spread))
 
 
 # --- release ----------------------------------------------------------------------------------------------------------
@@ -374,6 +378,96 @@ def release_verify(folder: Annotated[Path, typer.Argument(help="Release folder."
 
 distill_app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set, LoRA, inference, evaluation.")
 app.add_typer(distill_app, name="distill")
+
+
+DatasetOption = Annotated[Path, typer.Option(help="Training set, the output of `distill prepare`.")]
+ModelOption = Annotated[Path, typer.Option(help="Folder of the student's base model.")]
+
+
+@distill_app.command("tiny-student")
+def distill_tiny_student(out: OutOption, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
+    """Make a tiny, randomly initialised student, to try the way without weights."""
+    import distill.student
+
+    typer.echo(distill.student.make_tiny_student(out, seed))
+
+
+@distill_app.command("prepare")
+def distill_prepare(
+    captions: Annotated[Path, typer.Option(help="captions.jsonl")],
+    out: OutOption,
+    data: DataOption = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Captions to a training set with splits that share no trajectory."""
+    import distill.dataset
+
+    cfg = _settings(config, overrides, seed)
+    typer.echo(distill.dataset.run(cfg.distill.prepare, captions, _data(data), out, seed=cfg.seed, resume=resume.value))
+
+
+@distill_app.command("train")
+def distill_train(
+    dataset: DatasetOption,
+    model: ModelOption,
+    out: OutOption,
+    data: DataOption = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Train LoRA adapters; continues from its last checkpoint."""
+    import distill.train
+
+    cfg = _settings(config, overrides, seed)
+    typer.echo(
+        distill.train.run(cfg.distill.train, dataset, _data(data), model, out, seed=cfg.seed, resume=resume.value)
+    )
+
+
+@distill_app.command("infer")
+def distill_infer(
+    dataset: DatasetOption,
+    model: ModelOption,
+    out: OutOption,
+    adapter: Annotated[Path | None, typer.Option(help="Adapter folder; none: the base model as it is.")] = None,
+    data: DataOption = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Let the student answer a split; continues where it stopped."""
+    import distill.infer
+
+    cfg = _settings(config, overrides)
+    typer.echo(
+        distill.infer.run(cfg.distill.infer, dataset, _data(data), model, out, adapter=adapter, resume=resume.value)
+    )
+
+
+@distill_app.command("evaluate")
+def distill_evaluate(
+    dataset: DatasetOption,
+    predictions: Annotated[Path, typer.Option(help="Predictions, the output of `distill infer`.")],
+    out: OutOption,
+    bertscore_model: Annotated[
+        Path | None, typer.Option(help="Local model folder for BERTScore; none: not computed.")
+    ] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """JSON parse rate, decision accuracy beside the majority floor, BERTScore beside a shuffled floor."""
+    import distill.evaluate
+
+    cfg = _settings(config, overrides, seed)
+    given: Any = {"bertscore_model": bertscore_model, "seed": cfg.seed, "resume": resume.value}
+    typer.echo(distill.evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))
 
 
 # --- this installation ------------------------------------------------------------------------------------------------

@@ -10,11 +10,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from pydantic import Field
 
-import caption.regenerate
+import caption.stage
 import cosfly
 import cosfly.maps
 import cosfly.pedestrians
@@ -25,6 +26,7 @@ import cosfly.simplify
 import release.package
 from caption.schema import CaptionConfig
 from cosfly.config import Config
+from cosfly.errors import NoPathError
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.maps import MapsConfig
 from cosfly.pedestrians import PedestriansConfig
@@ -33,9 +35,22 @@ from cosfly.qc import InspectConfig
 from cosfly.render import RenderConfig
 from cosfly.simplify import SimplifyConfig
 from cosfly.store import Resume, StageFolder, read_json, write_bytes, write_json
+from distill.dataset import PrepareConfig
+from distill.evaluate import EvaluateConfig
+from distill.infer import InferConfig
+from distill.train import TrainConfig
 from release.package import ReleaseConfig
 
 log = logging.getLogger(__name__)
+
+
+class DistillConfig(Config):
+    """Settings of the student's four steps."""
+
+    prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
+    train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
+    infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
+    evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
 
 
 class RunConfig(Config):
@@ -55,6 +70,7 @@ class RunConfig(Config):
     inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
     caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
     release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
+    distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 
 
 @dataclass(frozen=True)
@@ -71,45 +87,73 @@ def num_workers(setting: int) -> int:
     return setting or len(os.sched_getaffinity(0))
 
 
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a run: `work` fills `folder` and is safe to call again."""
+
+    name: str
+    folder: Path
+    product: Path
+    work: Callable[[], Path]
+
+
+def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
+    """Give the stages of a run in order, with all their paths."""
+    seed, workers = cfg.seed, num_workers(cfg.workers)
+    spread: dict[str, Any] = {"workers": workers, "resume": resume}
+    names = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
+    to = {name: out / name for name in names}
+    boxes, simplified = to["maps"] / "boxes_3d.json", to["simplify"] / "step2_simplified.json"
+    paths, traces = to["pedestrians"] / "path.json", to["plan"] / "drone_trace.json"
+    tree, inspected = to["render"], to["inspect"] / "inspect.json"
+    captions, published = to["caption"] / "captions.jsonl", to["release"] / "dataset"
+    works: dict[str, tuple[Path, Callable[[], Path]]] = {
+        "maps": (boxes, lambda: cosfly.maps.run(cfg.maps, to["maps"], seed=seed, resume=resume)),
+        "simplify": (simplified, lambda: cosfly.simplify.run(cfg.simplify, boxes, to["simplify"], resume=resume)),
+        "pedestrians": (
+            paths,
+            lambda: cosfly.pedestrians.run(
+                cfg.pedestrians, simplified, to["pedestrians"], seed=seed, roi=cfg.roi, **spread
+            ),
+        ),
+        "plan": (traces, lambda: cosfly.planners.run(cfg.plan, simplified, paths, to["plan"], seed=seed, **spread)),
+        "render": (tree, lambda: cosfly.render.run(cfg.render, boxes, simplified, traces, tree, seed=seed, **spread)),
+        "inspect": (inspected, lambda: cosfly.qc.run(cfg.inspect, traces, tree, to["inspect"], **spread)),
+        "caption": (captions, lambda: caption.stage.run(cfg.caption, tree, to["caption"], seed=seed, **spread)),
+        "release": (
+            published,
+            lambda: release.package.run(cfg.release, tree, captions, inspected, to["release"], **spread),
+        ),
+    }
+    return [Stage(name, to[name], *works[name]) for name in names]
+
+
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
     """Make a data set: reads what the configuration names, writes one folder per stage below `out`.
 
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
     and `summary.json` in the run folder.
     """
-    seed, workers = cfg.seed, num_workers(cfg.workers)
+    todo = stages(cfg, out, resume=resume)
     _save_run(cfg, out)
-    spread = {"workers": workers, "resume": resume}
-    boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
-    paths, traces = out / "pedestrians/path.json", out / "plan/drone_trace.json"
-    tree, inspected, captions = out / "render", out / "inspect/inspect.json", out / "caption/captions.jsonl"
-
-    stages: list[tuple[str, Path, Callable[[Path], Path]]] = [
-        ("maps", boxes, lambda to: cosfly.maps.run(cfg.maps, to, seed=seed, resume=resume)),
-        ("simplify", simplified, lambda to: cosfly.simplify.run(cfg.simplify, boxes, to, resume=resume)),
-        (
-            "pedestrians",
-            paths,
-            lambda to: cosfly.pedestrians.run(cfg.pedestrians, simplified, to, seed=seed, roi=cfg.roi, **spread),
-        ),
-        ("plan", traces, lambda to: cosfly.planners.run(cfg.plan, simplified, paths, to, seed=seed, **spread)),
-        ("render", tree, lambda to: cosfly.render.run(cfg.render, boxes, simplified, traces, to, seed=seed, **spread)),
-        ("inspect", inspected, lambda to: cosfly.qc.run(cfg.inspect, traces, tree, to, **spread)),
-        ("caption", captions, lambda to: caption.regenerate.run(cfg.caption, tree, to, seed=seed, **spread)),
-        (
-            "release",
-            out / "release",
-            lambda to: release.package.run(cfg.release, tree, captions, inspected, to, **spread),
-        ),
-    ]
     results = []
-    for number, (stage, product, work) in enumerate(stages, 1):
-        was_complete = (out / stage / "manifest.json").exists()
-        log.info("[%d/%d] %s%s", number, len(stages), stage, ": already complete" if was_complete else "")
-        work(out / stage)
-        results.append(StageResult(stage, product, StageFolder(out / stage, stage, True).manifest(), was_complete))
-    contact_sheet(tree, out / "contact_sheet.png")
-    preview_gif(tree, out / "preview.gif")
+    for number, stage in enumerate(todo, 1):
+        was_complete = (stage.folder / "manifest.json").exists()
+        log.info("[%d/%d] %s%s", number, len(todo), stage.name, ": already complete" if was_complete else "")
+        stage.work()
+        manifest = StageFolder(stage.folder, stage.name, is_complete=True).manifest()
+        if manifest["counts"]["kept"] == 0:
+            raise NoPathError(
+                "the stage kept nothing, so there is nothing for the next one",
+                where=stage.folder,
+                got=str({word: manifest["counts"][word] for word in ("dropped", "failed")}),
+                fix=f"see {stage.folder / 'failures.jsonl'}, change the settings and choose another --out",
+            )
+        results.append(StageResult(stage.name, stage.product, manifest, was_complete))
+    tree = out / "render"
+    if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
+        contact_sheet(tree, out / "contact_sheet.png")
+        preview_gif(tree, out / "preview.gif")
     _save_summary(results, out)
     return results
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.console import progress_bar
-from cosfly.errors import CosflyError
+from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.store import StageFolder, Tally, dump_json, write_bytes
 
 log = logging.getLogger(__name__)
@@ -79,7 +79,8 @@ def run_items(
     """Do all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage, and
-    what was finished stays. A worker that dies (out of memory, kill) costs only its item, after one more try of its own.
+    what was finished stays. A worker that dies (out of memory, kill) costs only its items, which get one more try each, alone; if one
+    dies again, the other items are finished first and the stage then stops, unfinished.
     On a later run kept and dropped items are taken from the journal and failed ones are tried again.
 
     Args:
@@ -104,7 +105,16 @@ def run_items(
                     log.error("%s: %s: %s", stage.stage, record["id"], record["message"])
                 advance(1)
     ordered = [records[item_id] for item_id in ids]
-    return Finished(ordered, _tally(stage, ordered))
+    tally = _tally(stage, ordered)
+    if "worker_died" in tally.failed:
+        # That is the machine's doing, not the item's: it must not become a result. The stage stays open.
+        raise EnvironmentMissing(
+            "worker processes were killed, twice for the same item",
+            where=stage.path,
+            got=f"{tally.failed['worker_died']} of {len(ordered)} items without an outcome",
+            fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
+        )
+    return Finished(ordered, tally)
 
 
 def _tally(stage: StageFolder, records: list[dict]) -> Tally:

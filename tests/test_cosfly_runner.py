@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cosfly.errors import InputError, StorageError
+from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runner import Item, Outcome, rng_for, run_items
 from cosfly.store import Journal, StageFolder, dump_json
 
@@ -80,11 +80,14 @@ def test_finished_items_are_not_done_again_and_failed_ones_are(tmp_path):
     assert second.tally == first.tally
 
 
-def test_a_dying_worker_costs_only_its_item(tmp_path):
+def test_a_dying_worker_loses_no_other_item_and_leaves_the_stage_open(tmp_path):
     payloads = [("keep", k) for k in range(5)]
     payloads[2] = ("die", 0)
-    finished = run_items(_stage(tmp_path / "s"), _items(*payloads), make_worker, (tmp_path / "log",), workers=2)
-    assert finished.tally.as_dict() == {"input": 5, "kept": 4, "dropped": {}, "failed": {"worker_died": 1}}
+    stage = _stage(tmp_path / "s")
+    with pytest.raises(EnvironmentMissing, match=r"1 of 5 items without an outcome.*fewer --workers"):
+        run_items(stage, _items(*payloads), make_worker, (tmp_path / "log",), workers=2)
+    assert sorted(r["id"] for r in stage.journal.read() if r["status"] == "kept") == ["i0", "i1", "i3", "i4"]
+    assert not _stage(tmp_path / "s").is_complete
 
 
 @pytest.mark.parametrize("workers", [1, 2])

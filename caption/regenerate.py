@@ -1,0 +1,193 @@
+"""The bounded ask-verify loop of one window, and the stage: reads a playback tree, writes `captions.jsonl`.
+
+Every window ends in one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A decision that
+the flight contradicts is asked for again, by default anchored to the true one; the record says so for ever.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from caption.actions import Motion, label_of, measure, verdict_of
+from caption.facts import measure_facts
+from caption.prompts import Question, make_question, prompt_hash
+from caption.schema import CaptionConfig, Reply, Sample, Strategy
+from caption.teacher import NoAnswer, Teacher
+from caption.verify import check_evidence, check_mirror, flight_numbers
+from cosfly.coc import Caption, Coc, Language, Parsed, Verdict, parse_answer
+from cosfly.errors import InputError, RenderError
+
+
+async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig) -> Caption:
+    """Caption one window.
+
+    Raises:
+        NoAnswer: the teacher gave none, and asking again later may help.
+        TeacherError: no window will get one.
+    """
+    window = sample.observed
+    motion = measure(sample.future)
+    facts = measure_facts(window)
+    question = make_question(window, facts, cfg.image)
+    loop = _Loop(teacher, cfg, motion, label_of(motion, cfg.label))
+    reason = sample.problem
+    if reason is None:
+        try:
+            reason = await loop.run(question)
+        except NoAnswer as error:
+            if not error.is_final:
+                raise
+            reason = error.cause
+        except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
+            reason = "unreadable_frame"
+            loop.checks["frame"] = error.what
+    return Caption(
+        sample_id=window.sample_id,
+        town=window.town,
+        trajectory=window.trajectory,
+        variant=window.variant,
+        frame_index=window.indices[-1],
+        window=list(window.indices),
+        future=list(sample.future.indices),
+        prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
+        prompt_hash=prompt_hash(question.prompts),
+        teacher=teacher.record | {"structured": loop.structured} if loop.structured else dict(teacher.record),
+        usage=loop.usage,
+        attempts=loop.asks,
+        en=loop.english,
+        zh=loop.chinese,
+        label=loop.label,
+        verdict=loop.verdict,
+        repair=loop.repair,
+        checks=loop.checks,
+        status="accepted" if reason is None else "dropped",
+        drop_reason=reason,
+    )
+
+
+def _rungs(strategy: Strategy, max_asks: int) -> list[str]:
+    """Give the kind of each ask: a cascade climbs from the freest to the surest."""
+    if strategy == "cascade":
+        return ["hint", "multi_sample", *["anchored"] * max(0, max_asks - 2)][:max_asks]
+    return [strategy] * max_asks
+
+
+class _Loop:
+    """The asks of one window and what came of them."""
+
+    def __init__(self, teacher: Teacher, cfg: CaptionConfig, motion: Motion, label: str | None) -> None:
+        self.teacher, self.cfg, self.motion, self.label = teacher, cfg, motion, label
+        self.english: Coc | None = None
+        self.chinese: Coc | None = None
+        self.answered: Question | None = None  # the one that `english` answers
+        self.verdict: Verdict | None = None
+        self.repair: dict[str, Any] | None = None
+        self.checks: dict[str, Any] = {}
+        self.usage = {"prompt_tokens": 0, "completion_tokens": 0}
+        self.asks = 0
+        self.structured = ""
+        self._recovered: set[str] = set()
+
+    async def run(self, question: Question) -> str | None:
+        """Ask, verify, repair, mirror; gives the reason to drop the window, None to accept it."""
+        reason = await self._ask_freely(question)
+        if reason is None and self.verdict in self.cfg.repair.verdicts:
+            reason = await self._regenerate(question)
+        if reason is None:
+            reason = await self._mirror()
+        if reason is None:
+            reason = self._check_evidence(question)
+        if self._recovered:
+            self.checks["recovered"] = sorted(self._recovered)
+        return reason
+
+    async def _ask_freely(self, question: Question) -> str | None:
+        parsed = Parsed(None)
+        for ask in range(self.cfg.structure_asks):
+            asked = replace(question, ask=ask)
+            parsed = self._read(await self.teacher.ask(asked), "en")
+            if parsed.coc is not None:
+                self._accept(parsed.coc, asked)
+                self.checks["structure"] = "ok"
+                return None
+        self.checks["structure"] = parsed.reason
+        return f"structure_{parsed.reason}"
+
+    async def _regenerate(self, question: Question) -> str | None:
+        """Ask again by the chosen strategy until an answer is no longer rejected (sec:appendix_e, four strategies)."""
+        assert self.english is not None
+        rejected = self.english.flight_decision
+        self.repair = {
+            "strategy": self.cfg.repair.strategy,
+            "rung": None,
+            "outcome": "no_label",
+            "asks": 0,
+            "first_decision": rejected,
+            "first_verdict": self.verdict,
+        }
+        rungs = _rungs(self.cfg.repair.strategy, self.cfg.repair.max_asks)
+        if self.label is None and "anchored" in rungs:
+            return "conflict_without_label"
+        for ask, rung in enumerate(rungs):
+            self.repair["asks"] = ask + 1
+            asked = self._reworked(question, rung, rejected, ask)
+            parsed = self._read(await self.teacher.ask(asked), "en")
+            if parsed.coc is None or (asked.decision and parsed.coc.flight_decision != asked.decision):
+                continue
+            verdict = verdict_of(parsed.coc.flight_decision, self.motion, self.cfg.label, self.label)
+            if verdict not in self.cfg.repair.verdicts:
+                self._accept(parsed.coc, asked)
+                self.repair |= {"outcome": "repaired", "rung": rung}
+                return None
+        self.repair["outcome"] = "failed"
+        return "regeneration_failed"
+
+    def _reworked(self, question: Question, rung: str, rejected: str, ask: int) -> Question:
+        if rung == "anchored":
+            return replace(question, decision=self.label, ask=ask)
+        if rung == "hint":
+            return replace(question, rejected=rejected, ask=ask)
+        return replace(question, ask=self.cfg.structure_asks + ask)  # the same question under another sampling seed
+
+    async def _mirror(self) -> str | None:
+        assert self.english is not None
+        assert self.answered is not None
+        flight = flight_numbers(self.answered.facts)
+        problem: str | None = None
+        for ask in range(self.cfg.mirror_asks):
+            reply = await self.teacher.mirror(self.answered, self.english, ask)
+            parsed = self._read(reply, "zh")
+            if parsed.coc is None:
+                problem = f"structure_{parsed.reason}"
+                continue
+            self.chinese = parsed.coc
+            problem = check_mirror(self.english, parsed.coc, flight)
+            if problem is None:
+                break
+        self.checks["bilingual"] = problem or "ok"
+        return None if problem is None else f"bilingual_{problem}"
+
+    def _check_evidence(self, question: Question) -> str | None:
+        assert self.english is not None
+        assert self.chinese is not None
+        cfg = self.cfg.evidence
+        found = [f"en {problem}" for problem in check_evidence(self.english, question.facts, cfg, "en")]
+        found += [f"zh {problem}" for problem in check_evidence(self.chinese, question.facts, cfg, "zh")]
+        self.checks["evidence"] = found or "ok"
+        return "evidence" if found and cfg.drop else None
+
+    def _read(self, reply: Reply, language: Language) -> Parsed:
+        self.asks += 1
+        for name, count in reply.usage.items():
+            self.usage[name] = self.usage.get(name, 0) + count
+        self.structured = reply.structured
+        parsed = parse_answer(reply.text, language)
+        if parsed.coc is None and reply.finish_reason == "length":
+            parsed = replace(parsed, reason="cut_short")
+        self._recovered.update(parsed.recovered)
+        return parsed
+
+    def _accept(self, coc: Coc, question: Question) -> None:
+        self.english, self.answered = coc, question
+        self.verdict = verdict_of(coc.flight_decision, self.motion, self.cfg.label, self.label)

@@ -1,0 +1,203 @@
+"""Types and settings of the caption stage.
+
+`ObservedWindow` is all that a teacher may know: it has no future. `FutureMotion` is what the label and the verdict come from.
+Only `windows.py` makes them, and nothing that builds a prompt takes a `FutureMotion`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from cosfly.coc import Verdict
+from cosfly.config import Config
+
+Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
+Modality = Literal["rgb", "depth", "segmentation"]
+
+
+# --- windows ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ObservedWindow:
+    """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
+
+    indices: frame indices (n,). time_s (n,); positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll;
+    targets_m (n, 3) NaN where unknown; target_uv (n, 2) and target_bbox (n, 4) px, NaN where unknown; target_depth_m (n,);
+    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; frame_folders: n folders.
+    """
+
+    sample_id: str
+    town: str
+    trajectory: str
+    variant: str
+    indices: tuple[int, ...]
+    width_px: int
+    height_px: int
+    time_s: np.ndarray
+    positions_m: np.ndarray
+    rotations_deg: np.ndarray
+    targets_m: np.ndarray
+    target_uv: np.ndarray
+    target_bbox: np.ndarray
+    target_depth_m: np.ndarray
+    in_view: np.ndarray
+    visible: np.ndarray
+    visibility: np.ndarray
+    frame_folders: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class FutureMotion:
+    """What the drone did next: row 0 is the current frame, the others follow. Never shown to a teacher.
+
+    indices: the future frames' indices (m,). time_s, yaw_deg, visible (m + 1,); positions_m, targets_m (m + 1, 3).
+    speed_before_mps: over the last observed step, the reference of a speed change.
+    """
+
+    indices: tuple[int, ...]
+    time_s: np.ndarray
+    positions_m: np.ndarray
+    yaw_deg: np.ndarray
+    targets_m: np.ndarray
+    visible: np.ndarray
+    speed_before_mps: float
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One window and its future. Whoever asks a teacher passes on `observed` only."""
+
+    observed: ObservedWindow
+    future: FutureMotion
+    problem: str | None = None  # why no teacher may be asked, for instance a missing image
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One answer of a teacher. `structured` says how its shape was enforced: json_schema, plain, or native (rules)."""
+
+    text: str
+    usage: dict[str, int]
+    structured: str
+    finish_reason: str | None = None
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+class WindowConfig(Config):
+    num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, 0.5 s apart")
+    future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
+    stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
+    require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
+    label_without_perturbation: bool = Field(
+        True, description="take the recorded perturbation off the future poses, so that noise gives no label"
+    )
+
+
+class ImageConfig(Config):
+    modalities: tuple[Modality, ...] = Field(
+        ("rgb", "depth", "segmentation"), min_length=1, description="pictures of each observed frame"
+    )
+    layout: Literal["separate", "tiled"] = Field(
+        "separate", description="separate: one image per modality; tiled: one image per frame, side by side"
+    )
+    max_side_px: int = Field(640, ge=28, description="longest side of one modality's picture")
+    depth_range_m: float = Field(100.0, gt=0, description="depth at the dark end of the pseudo-colour")
+    encoding: Literal["jpeg", "png"] = Field("jpeg", description="encoding of the pictures in a request")
+    jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality")
+    cache_frames: int = Field(256, ge=8, description="encoded frames kept in memory for the windows that share them")
+
+
+class LabelConfig(Config):
+    """Thresholds of the table in actions.py, over the whole future (2.5 s by default)."""
+
+    yaw_deg: float = Field(3.0, gt=0, description="yaw change that makes a turn")
+    hard_turn_deg: float = Field(10.0, gt=0, description="yaw change that contradicts track_straight")
+    altitude_m: float = Field(1.0, gt=0, description="altitude change that makes a climb or descent")
+    speed_change_mps: float = Field(0.8, gt=0, description="mean future speed less current speed that counts")
+    hover_mps: float = Field(0.3, gt=0, description="mean speed below which the drone hovers")
+    moving_mps: float = Field(1.0, gt=0, description="mean speed that contradicts hover")
+    forward_m: float = Field(0.5, gt=0, description="body-frame forward or backward displacement that counts")
+    lateral_m: float = Field(1.0, gt=0, description="body-frame lateral displacement that counts")
+    approach_m: float = Field(1.0, gt=0, description="change of the horizontal distance to the target that counts")
+    circle_deg: float = Field(15.0, gt=0, description="angle swept round the target that makes a circle")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.moving_mps <= self.hover_mps:
+            raise ValueError("moving_mps must be larger than hover_mps, else hover would contradict itself")
+        if self.hard_turn_deg <= self.yaw_deg:
+            raise ValueError("hard_turn_deg must be larger than yaw_deg, else track_straight would contradict itself")
+        return self
+
+
+class EvidenceConfig(Config):
+    """How far a number in a caption may lie from the measured one before it counts as a contradiction."""
+
+    tolerance_m: float = Field(0.3, ge=0, description="metres")
+    tolerance_mps: float = Field(0.15, ge=0, description="metres per second")
+    tolerance_deg: float = Field(1.0, ge=0, description="degrees")
+    tolerance_px: float = Field(3.0, ge=0, description="pixels")
+    relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
+    drop: bool = Field(False, description="drop a sample whose text contradicts a measured value")
+
+
+class EndpointConfig(Config):
+    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
+    top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
+    max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
+    concurrency: int = Field(
+        16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
+    )
+    timeout_s: float = Field(120.0, gt=0, description="limit of one request")
+    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    backoff_s: float = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
+    max_backoff_s: float = Field(60.0, gt=0, description="longest wait between two tries")
+    stop_after_failures: int = Field(20, ge=1, description="windows in a row without an answer that end the run")
+    json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
+    extra_body: dict[str, Any] = Field(
+        default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"
+    )
+
+
+class RepairConfig(Config):
+    verdicts: tuple[Verdict, ...] = Field(("HARD_CONFLICT",), description="verdicts that are re-generated")
+    strategy: Strategy = Field(
+        "anchored",
+        description="anchored: the true decision is given; hint: the rejected one is named; multi_sample: asked anew; "
+        "cascade: hint, then multi_sample, then anchored",
+    )
+    max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
+
+
+class CaptionConfig(Config):
+    """Settings of stage `caption`."""
+
+    teacher: str = Field(
+        "rules", description="`rules` (embedded, no model) or the URL of an OpenAI-compatible endpoint"
+    )
+    window: WindowConfig = Field(WindowConfig(), description="windows")
+    image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
+    label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
+    evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
+    endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
+    repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
+    structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
+    mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
+    limit: int | None = Field(None, ge=1, description="caption at most this many windows; empty takes all")
+
+    @model_validator(mode="after")
+    def _known_teacher(self) -> Self:
+        if self.teacher != "rules" and not self.teacher.startswith(("http://", "https://")):
+            raise ValueError(
+                f"teacher must be `rules` or a URL that begins with http:// or https://, got {self.teacher!r}"
+            )
+        return self

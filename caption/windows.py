@@ -1,0 +1,78 @@
+"""Phase 1: cut flights into windows (causal locality, sec:appendix_e).
+
+The observed frames and the future leave this module as two types, so that a prompt cannot hold the future by accident.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from caption.schema import FutureMotion, ObservedWindow, Sample, WindowConfig
+from cosfly.playback import Flight, sample_id
+
+
+def current_frames(num_points: int, cfg: WindowConfig) -> range:
+    """Give the indices that have a whole past and a whole future."""
+    return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
+
+
+def iterate_samples(flight: Flight, cfg: WindowConfig) -> Iterator[Sample]:
+    """Yield a flight's samples in order of time. A flight shorter than a window gives none."""
+    missing = set(flight.missing_frames(("rgb.png",))) if cfg.require_images else set()
+    clean_positions, clean_yaw_deg = flight.positions_m, flight.rotations_deg[:, 1]
+    if cfg.label_without_perturbation:
+        clean_positions = clean_positions - flight.drone_offsets_m
+        clean_yaw_deg = clean_yaw_deg - flight.rotation_offsets_deg[:, 1]
+    folders = [flight.frame_folder(i) for i in range(len(flight))]
+    for current in current_frames(len(flight), cfg):
+        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders)
+        problem = "missing_frame" if missing.intersection(observed.indices) else None
+        future = cut_future(flight, clean_positions, clean_yaw_deg, current, cfg.future_frames)
+        yield Sample(observed, future, problem)
+
+
+def _observe(flight: Flight, span: slice, folders: list) -> ObservedWindow:
+    """Copy the observed frames out of a flight: nothing of what follows stays reachable."""
+    return ObservedWindow(
+        sample_id=sample_id(flight.flight_id, span.stop - 1),
+        town=flight.town,
+        trajectory=flight.trajectory,
+        variant=flight.variant,
+        indices=tuple(range(span.start, span.stop)),
+        width_px=flight.camera.width_px,
+        height_px=flight.camera.height_px,
+        time_s=flight.time_s[span].copy(),
+        positions_m=flight.positions_m[span].copy(),
+        rotations_deg=flight.rotations_deg[span].copy(),
+        targets_m=flight.targets_m[span].copy(),
+        target_uv=flight.target_uv[span].copy(),
+        target_bbox=flight.target_bbox[span].copy(),
+        target_depth_m=flight.target_depth_m[span].copy(),
+        in_view=flight.target_in_view[span].copy(),
+        visible=flight.target_visible[span].copy(),
+        visibility=flight.visibility[span].copy(),
+        frame_folders=tuple(folders[span]),
+    )
+
+
+def cut_future(
+    flight: Flight, positions_m: np.ndarray, yaw_deg: np.ndarray, current: int, future_frames: int
+) -> FutureMotion:
+    """Give the motion after frame `current`.
+
+    Args:
+        positions_m (n, 3), yaw_deg (n,): of the whole flight, with or without its perturbation.
+    """
+    span = slice(current, current + future_frames + 1)
+    step_s = flight.time_s[current] - flight.time_s[current - 1]
+    return FutureMotion(
+        indices=tuple(range(current + 1, current + future_frames + 1)),
+        time_s=flight.time_s[span],
+        positions_m=positions_m[span],
+        yaw_deg=yaw_deg[span],
+        targets_m=flight.targets_m[span],
+        visible=flight.target_visible[span],
+        speed_before_mps=float(np.linalg.norm(positions_m[current] - positions_m[current - 1]) / step_s),
+    )

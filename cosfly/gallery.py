@@ -1,0 +1,172 @@
+"""Pictures of a playback tree for people: a contact sheet, and a short animation of one flight."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from cosfly.errors import InputError
+from cosfly.playback import SKY_DEPTH_M, Flight, find_flights, read_depth, read_flight, read_instance, read_rgb
+from cosfly.schema import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.store import write_bytes
+
+TILE_PX = (320, 180)
+NUM_RGB_TILES = 4
+MOST_ROWS = 12  # flights on one sheet
+SHEET_BYTES, GIF_BYTES = 2_000_000, 4_000_000
+GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # twice as fast as life: frames are 0.5 s apart
+BOX_COLOR = (255, 214, 10)
+
+
+def contact_sheet(tree: Path, out_png: Path) -> None:
+    """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask.
+
+    Raises:
+        InputError: no tree, or a frame that cannot be read.
+    """
+    folders = find_flights(tree)
+    rows = [_row(read_flight(folder, strict=False)) for folder in folders[:MOST_ROWS]]
+    sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
+    write_bytes(out_png, _png_below(sheet, SHEET_BYTES))
+
+
+def preview_gif(tree: Path, out_gif: Path) -> None:
+    """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in.
+
+    Raises:
+        InputError: no tree, or the flight has no RGB frame.
+    """
+    folders = find_flights(tree)
+    flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    frames = _frames_with(flight, "rgb.png")
+    width, num = GIF_WIDTH_PX, 60
+    while True:
+        chosen = [frames[i] for i in _spread(len(frames), num)]
+        data = _gif([_preview(flight, i, width) for i in chosen])
+        if len(data) < GIF_BYTES or num <= 4:
+            break
+        num = max(4, int(num * 0.9 * GIF_BYTES / len(data)))
+    write_bytes(out_gif, data)
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------------
+
+
+def depth_colors(depth: np.ndarray) -> np.ndarray:
+    """Depth, (h, w) m, as a picture, (h, w, 3) RGB: near is bright, far is dark on a logarithmic scale, sky black."""
+    share = np.log(np.clip(depth, 2.0, 200.0) / 2.0) / np.log(100.0)
+    colors = cv2.cvtColor(
+        cv2.applyColorMap(((1.0 - share) * 255.0).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
+    )
+    colors[(depth >= SKY_DEPTH_M) | (depth <= 0.0)] = 0
+    return colors
+
+
+def mask_colors(kinds: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """Kinds and instance ids, (h, w), as a picture: CARLA's colours, a little lighter or darker by instance."""
+    palette = np.zeros((256, 3))
+    for kind, name in KIND_NAMES.items():
+        palette[kind] = [int(KIND_COLORS[name][i : i + 2], 16) for i in (1, 3, 5)]
+    shade = 0.8 + 0.4 * ((ids.astype(np.uint32) * 40503 % 1024) / 1023.0)
+    shade[kinds == KINDS["Pedestrians"]] = 1.0
+    return np.clip(palette[kinds] * shade[..., None], 0, 255).astype(np.uint8)
+
+
+def _spread(n: int, num: int) -> list[int]:
+    return sorted({int(i) for i in np.linspace(0, n - 1, min(n, num)).round()})
+
+
+def _frames_with(flight: Flight, *names: str) -> list[int]:
+    missing = set(flight.missing_frames(names))
+    frames = [i for i in range(len(flight)) if i not in missing]
+    if not frames:
+        raise InputError("the flight has no frames to show", where=flight.folder, expected=", ".join(names))
+    return frames
+
+
+def _row(flight: Flight) -> np.ndarray:
+    frames = _frames_with(flight, "rgb.png")
+    tiles = []
+    for i in (frames[k] for k in _spread(len(frames), NUM_RGB_TILES)):
+        picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
+        tiles.append(_labelled(_tile(picture), f"t = {flight.time_s[i]:.1f} s"))
+    tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
+    middle = flight.frame_folder(frames[len(frames) // 2])
+    for name in ("depth.npy", "instance.png"):
+        if not (middle / name).is_file():
+            tiles.append(_labelled(np.zeros_like(tiles[0]), f"no {name}"))
+        elif name == "depth.npy":
+            tiles.append(_labelled(_tile(depth_colors(read_depth(middle))), "depth"))
+        else:
+            kinds, ids = read_instance(middle)
+            picture = cv2.resize(mask_colors(kinds, ids), TILE_PX, interpolation=cv2.INTER_NEAREST)
+            tiles.append(_labelled(picture, "instances"))
+    strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
+    visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
+    text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {flight.camera.fov_deg:.0f} deg   {visible}"
+    cv2.putText(strip, text, (8, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (235, 235, 235), 1, cv2.LINE_AA)
+    return np.vstack([strip, np.hstack(tiles)])
+
+
+def _heading(num_flights: int, width_px: int) -> np.ndarray:
+    strip = np.full((26, width_px, 3), 60, np.uint8)
+    shown = "" if num_flights <= MOST_ROWS else f", the first {MOST_ROWS} shown"
+    text = f"{num_flights} flights{shown}"
+    cv2.putText(strip, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return strip
+
+
+def _tile(picture: np.ndarray) -> np.ndarray:
+    return cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
+
+
+def _labelled(tile: np.ndarray, text: str) -> np.ndarray:
+    tile = tile.copy()
+    for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(tile, text, (6, TILE_PX[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
+    return tile
+
+
+def _boxed(picture: np.ndarray, flight: Flight, i: int) -> np.ndarray:
+    """Draw the target's box if the frame has one."""
+    picture = np.ascontiguousarray(picture)
+    if not np.isnan(flight.target_bbox[i]).any():
+        x0, y0, x1, y1 = (round(float(v)) for v in flight.target_bbox[i])
+        cv2.rectangle(picture, (x0, y0), (x1, y1), BOX_COLOR, max(1, picture.shape[1] // 400))
+    return picture
+
+
+def _preview(flight: Flight, i: int, width_px: int) -> Image.Image:
+    picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
+    height_px = round(width_px * picture.shape[0] / picture.shape[1])
+    return Image.fromarray(cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA))
+
+
+def _gif(frames: list[Image.Image]) -> bytes:
+    # One palette for all frames: colours do not flicker, and undithered areas compress better.
+    columns = [frames[i] for i in _spread(len(frames), 6)]
+    sample = Image.fromarray(np.vstack([np.asarray(f) for f in columns]))
+    palette = sample.quantize(128)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=GIF_FRAME_MS, loop=0, optimize=False
+    )
+    return buffer.getvalue()
+
+
+def _png_below(rgb: np.ndarray, most_bytes: int) -> bytes:
+    """Encode a picture, smaller if it would be too large, and with a palette, which costs little in a sheet of thumbnails."""
+    scale = 1.0
+    while True:
+        size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
+        picture = Image.fromarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else rgb)
+        buffer = io.BytesIO()
+        picture.quantize(256, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
+        if buffer.tell() < most_bytes or size[0] < 64:
+            return buffer.getvalue()
+        scale *= 0.85

@@ -1,0 +1,116 @@
+"""The target in the picture: projection of its box, depth, and how much of it the depth image shows (sec:step6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosfly.geometry import box_corners, project
+from cosfly.playback import Camera
+from cosfly.render.frame import NEAR_M, Frame
+from cosfly.render.scene import PERSON_ID
+from cosfly.schema import PERSON_HALF_EXTENTS_M
+
+DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
+MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
+
+# Pairs of corners (order of geometry.box_corners) that an edge of the box joins.
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """Where the target is in one frame.
+
+    uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin, xmax, ymax of
+    the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same clipped to the image, NaN
+    where none of it is inside. in_view: some of the box is inside the image.
+    """
+
+    uv: np.ndarray
+    depth_m: float
+    box_px: np.ndarray
+    bbox_px: np.ndarray
+    in_view: bool
+
+
+def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -> TargetView:
+    """Project the target's 3D box, which stands round its hip point, (3,) world."""
+    uv, z = project(np.asarray(target_m)[None], camera_pose, camera.intrinsic)
+    corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
+    in_camera = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
+    seen = _in_front(in_camera)
+    nothing = np.full(4, np.nan)
+    if len(seen) == 0:
+        return TargetView(uv[0], float(z[0]), nothing, nothing, False)
+    points = seen @ camera.intrinsic.T
+    points = points[:, :2] / points[:, 2:]
+    box = np.array([*points.min(axis=0), *points.max(axis=0)])
+    size = np.array([camera.width_px, camera.height_px] * 2, dtype=np.float64)
+    clipped = np.clip(box, 0.0, size)
+    if clipped[2] <= clipped[0] or clipped[3] <= clipped[1]:
+        return TargetView(uv[0], float(z[0]), box, nothing, False)
+    return TargetView(uv[0], float(z[0]), box, clipped, True)
+
+
+def _in_front(corners: np.ndarray) -> np.ndarray:
+    """Corners of the part of a box that is beyond the near plane; corners (8, 3) in camera axes."""
+    points = [corner for corner in corners if corner[2] >= NEAR_M]
+    for a, b in _EDGES:
+        za, zb = corners[a, 2], corners[b, 2]
+        if (za < NEAR_M) != (zb < NEAR_M):
+            points.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))
+    return np.array(points).reshape(-1, 3)
+
+
+def box_depths(
+    pixels: np.ndarray, center_m: np.ndarray, half_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
+) -> np.ndarray:
+    """Depth at which rays enter an axis-aligned box.
+
+    Args:
+        pixels: (n, 2) px; center_m, half_m: (3,) world; camera_pose: (4, 4) world_from_camera; intrinsic: (3, 3).
+    Returns:
+        (n,) z-depth in m, at least NEAR_M; infinity where the ray misses the box.
+    Source: slab method, Kay and Kajiya 1986; rays have camera z = 1, so that their parameter is z-depth.
+    """
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(intrinsic).T @ camera_pose[:3, :3].T
+    rays[np.abs(rays) < 1e-12] = 1e-12
+    eye = camera_pose[:3, 3]
+    low, high = (center_m - half_m - eye) / rays, (center_m + half_m - eye) / rays
+    enter = np.maximum(np.minimum(low, high).max(axis=1), NEAR_M)
+    leave = np.maximum(low, high).min(axis=1)
+    return np.where(leave > enter, enter, np.inf)
+
+
+def rendered_visibility(
+    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera
+) -> tuple[float, int]:
+    """How much of the target a frame shows.
+
+    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the box's near side, computed,
+    is compared with the depth image; where the person itself was drawn the box is visible. What lies outside the image counts
+    as hidden.
+
+    Returns:
+        Score in [0, 1], and the number of pixels of the person in the whole mask.
+    """
+    num_person_px = int(np.count_nonzero(frame.ids == PERSON_ID))
+    if not view.in_view:
+        return 0.0, num_person_px
+    x0, y0, x1, y1 = view.box_px
+    # A box that reaches far out of the image needs no ray for every pixel out there.
+    stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
+    columns, rows = np.arange(np.floor(x0), np.ceil(x1), stride), np.arange(np.floor(y0), np.ceil(y1), stride)
+    pixels = np.stack(np.meshgrid(np.floor(columns), np.floor(rows)), axis=-1).reshape(-1, 2)
+    near = box_depths(
+        pixels + 0.5, np.asarray(target_m), np.array(PERSON_HALF_EXTENTS_M), camera_pose, camera.intrinsic
+    )
+    pixels, near = pixels[np.isfinite(near)].astype(np.int64), near[np.isfinite(near)]
+    if len(pixels) == 0:
+        return 0.0, num_person_px
+    inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
+    at = pixels[inside, 1], pixels[inside, 0]
+    free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
+    return float(np.count_nonzero(free)) / len(pixels), num_person_px

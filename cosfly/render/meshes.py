@@ -1,0 +1,136 @@
+"""Unit meshes that the built-in renderer instances: each fits into the cube [-1, 1]^3, so a part fits into its half sizes.
+
+Vertices are (n, 6) float32: position and unit normal. Triangles are (k, 3) int32, counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+# Mesh numbers, the order of `all_meshes`.
+BOX, BLOB_FINE, BLOB, BLOB_COARSE, CYLINDER, CONE, CABIN, ROUNDED, SPHERE, LIMB = range(10)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+
+def all_meshes() -> list[Mesh]:
+    """Give every mesh, in the order of the numbers above."""
+    return [
+        prism(1.0, 1.0),
+        blob(2),
+        blob(1),
+        blob(0),
+        revolved([(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)], 10),
+        revolved([(0.0, -1.0), (1.0, -1.0), (0.42, 0.0), (0.0, 1.0)], 9),
+        prism(0.66, 0.84),
+        superquadric(0.45, 12, 7),
+        superquadric(1.0, 14, 9),
+        revolved([(0.0, -1.0), (0.55, -0.96), (0.74, -0.85), (0.92, 0.3), (0.95, 0.85), (0.6, 0.97), (0.0, 1.0)], 10),
+    ]
+
+
+def prism(top_x: float, top_y: float) -> Mesh:
+    """A box whose top face is scaled by top_x and top_y; flat normals, 24 vertices."""
+    corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=np.float64)
+    corners[4:, 0] *= top_x
+    corners[4:, 1] *= top_y
+    vertices: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    for face in faces:
+        quad = corners[list(face)]
+        normal = np.cross(quad[1] - quad[0], quad[2] - quad[0])
+        first = len(vertices)
+        vertices += [[*point, *(normal / np.linalg.norm(normal))] for point in quad]
+        triangles += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
+    return Mesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
+
+
+def revolved(profile: list[tuple[float, float]], num_sides: int) -> Mesh:
+    """A profile of (radius, z), from the bottom up, turned about z; smooth round, sharp between the profile's segments."""
+    angles = np.arange(num_sides + 1) * 2.0 * np.pi / num_sides
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    vertices: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for (r0, z0), (r1, z1) in pairwise(profile):
+        slope = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r1 - r0)  # outward (radial, z)
+        first = len(vertices)
+        for direction in around:
+            normal = [*(direction * slope[0]), slope[1]]
+            vertices += [[*(direction * r0), z0, *normal], [*(direction * r1), z1, *normal]]
+        for side in range(num_sides):
+            a = first + 2 * side
+            triangles += [(a, a + 2, a + 3)] if r0 > 0 else []
+            triangles += [(a, a + 3, a + 1)] if r1 > 0 else []
+    return Mesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
+
+
+def superquadric(exponent: float, num_sides: int, num_rings: int) -> Mesh:
+    """A rounded solid: exponent 1 is the sphere, towards 0 the cube."""
+
+    def power(values: np.ndarray, e: float) -> np.ndarray:
+        return np.sign(values) * np.abs(values) ** e
+
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, num_rings + 1)[:, None]
+    longitude = (np.arange(num_sides + 1) * 2.0 * np.pi / num_sides)[None, :]
+
+    def surface(e: float) -> np.ndarray:
+        ring = power(np.cos(latitude), e)
+        return np.stack(
+            [
+                ring * power(np.cos(longitude), e),
+                ring * power(np.sin(longitude), e),
+                np.broadcast_to(power(np.sin(latitude), e), (num_rings + 1, num_sides + 1)),
+            ],
+            axis=-1,
+        ).reshape(-1, 3)
+
+    normals = surface(2.0 - exponent)  # the superquadric's normal has the complementary exponent
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    ring, side = np.meshgrid(np.arange(num_rings), np.arange(num_sides), indexing="ij")
+    a = (ring * (num_sides + 1) + side).ravel()
+    b = a + num_sides + 1
+    triangles = np.concatenate([np.stack([a, a + 1, b + 1], 1), np.stack([a, b + 1, b], 1)])
+    return Mesh(np.hstack([surface(exponent), normals]).astype(np.float32), triangles.astype(np.int32))
+
+
+def blob(num_subdivisions: int) -> Mesh:
+    """An icosphere, dented inwards by a fixed smooth pattern: the outline of foliage. Radius at most 1."""
+    golden = (1.0 + 5.0**0.5) / 2.0
+    points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
+    points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]
+    vertices = [np.array(p) / np.linalg.norm(p) for p in points]
+    triangles = [
+        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
+        (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
+    ]  # fmt: skip
+    for _ in range(num_subdivisions):
+        middles: dict[tuple[int, int], int] = {}
+        finer = []
+        for a, b, c in triangles:
+            ab, bc, ca = (_middle(vertices, middles, i, j) for i, j in ((a, b), (b, c), (c, a)))
+            finer += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+        triangles = finer
+    unit = np.array(vertices)
+    dents = np.abs(
+        np.sin(unit @ [4.1, 2.3, 1.7]) * np.sin(unit @ [-1.9, 4.7, 2.9]) + 0.6 * np.sin(unit @ [7.3, -6.1, 8.2])
+    )
+    radius = 1.0 - 0.24 * dents / dents.max()
+    return Mesh(np.hstack([unit * radius[:, None], unit]).astype(np.float32), np.array(triangles, np.int32))
+
+
+def _middle(vertices: list[np.ndarray], middles: dict[tuple[int, int], int], a: int, b: int) -> int:
+    """Index of the vertex between two vertices of the unit sphere, made once."""
+    key = (min(a, b), max(a, b))
+    if key not in middles:
+        between = vertices[a] + vertices[b]
+        vertices.append(between / np.linalg.norm(between))
+        middles[key] = len(vertices) - 1
+    return middles[key]

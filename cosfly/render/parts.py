@@ -1,0 +1,130 @@
+"""Drawable parts and how they are collected: one part is one unit mesh (meshes.py) with half sizes, a rotation, a colour and a
+material number that the shader knows. Knows nothing of OpenGL, nor of what things look like (shapes.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# Materials, the same numbers as in scene.frag.glsl.
+(
+    PLAIN, FACADE, ROAD, SIDEWALK, GRASS, LEAVES, BARK, CAR_PAINT, CABIN, RUBBER, METAL, BRICK, WATER, FENCE, ROAD_LINE,
+    LAMP, GRAVEL, SIGNAL, BUS, CLOTH, CONCRETE,
+) = range(21)  # fmt: skip
+NUM_MATERIALS = 21
+GROUND_MATERIALS = (SIDEWALK, ROAD_LINE, ROAD, GRAVEL, WATER, GRASS)
+DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *GROUND_MATERIALS)
+
+PART = np.dtype(
+    [("center", "3f4"), ("half", "3f4"), ("quaternion", "4f4"), ("color", "4f4"), ("tag", "u4"), ("bias", "f4")]
+)
+
+FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is drawn in its simple form
+
+# Coplanar surfaces: the higher layer wins. A layer moves the depth *test* by 1e-4 of the distance, never the depth written.
+LAYER_STEP = 1e-4
+LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
+STANDING_LAYER = 7
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Drawable parts, k of them. Positions are relative to the scene's origin.
+
+    records: (k,) PART; mesh: (k,) mesh numbers; object_centers (k, 3), object_radii (k,): the whole object a part belongs to;
+    a part is drawn while the object's radius on the image lies in [min_px, max_px).
+    """
+
+    records: np.ndarray
+    mesh: np.ndarray
+    object_centers: np.ndarray
+    object_radii: np.ndarray
+    min_px: np.ndarray
+    max_px: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The boxes of one kind: centers, half (n, 3); turns (n, 3, 3) world_from_box; ids (n,); seeds (n,) in [0, 1)."""
+
+    centers: np.ndarray
+    half: np.ndarray
+    turns: np.ndarray
+    ids: np.ndarray
+    seeds: np.ndarray
+    kind: int
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    def select(self, keep: np.ndarray) -> Boxes:
+        return Boxes(
+            self.centers[keep], self.half[keep], self.turns[keep], self.ids[keep], self.seeds[keep], self.kind
+        )  # fmt: skip
+
+    def lengthwise(self) -> Boxes:
+        """The same boxes with x as their longer horizontal axis: turned by 90 degrees where it is not."""
+        across = self.half[:, 1] > self.half[:, 0]
+        half, turns = self.half.copy(), self.turns.copy()
+        half[across] = half[across][:, [1, 0, 2]]
+        turns[across] = turns[across] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return Boxes(self.centers, half, turns, self.ids, self.seeds, self.kind)
+
+    def chance(self, number: int) -> np.ndarray:
+        """A further fixed number in [0, 1) per box."""
+        return np.mod(self.seeds * 9973.0 + number * 0.61803399, 1.0)
+
+    def pick(self, palette: np.ndarray, number: int = 0) -> np.ndarray:
+        return palette[(self.chance(number) * len(palette)).astype(int)]
+
+
+@dataclass
+class PartBuilder:
+    _parts: list[Parts] = field(default_factory=list)
+
+    def add(
+        self, boxes: Boxes, mesh: int, half: np.ndarray, material: int, color: np.ndarray, *,
+        offset: np.ndarray | None = None, turn: np.ndarray | None = None, min_px: float = 0.0, max_px: float = NEVER_PX,
+        layer: int | None = None,
+    ) -> None:  # fmt: skip
+        """Add one part to each box.
+
+        Args:
+            half: (n, 3) or (3,) half sizes of the part, in its own axes; offset: (n, 3) from the box's centre, in box axes.
+            turn: (3, 3) or (n, 3, 3) box_from_part; color: (n, 3) or (3,) linear RGB.
+        """
+        n = len(boxes)
+        if n == 0:
+            return
+        records = np.zeros(n, PART)
+        records["center"] = boxes.centers
+        if offset is not None:
+            records["center"] += np.einsum("nij,nj->ni", boxes.turns, np.broadcast_to(offset, (n, 3)))
+        records["half"] = np.maximum(half, 1e-3)
+        turns = boxes.turns if turn is None else boxes.turns @ turn
+        records["quaternion"] = Rotation.from_matrix(turns).as_quat()
+        records["color"][:, :3] = color
+        records["color"][:, 3] = boxes.seeds
+        records["tag"] = tags(boxes.kind, material, boxes.ids)
+        records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer)
+        self._parts.append(
+            Parts(
+                records, np.full(n, mesh, np.uint8), boxes.centers.astype(np.float32),
+                np.linalg.norm(boxes.half, axis=1).astype(np.float32), np.full(n, min_px, np.float32), np.full(n, max_px, np.float32),
+            )
+        )  # fmt: skip
+
+    def finish(self) -> Parts:
+        names = ("records", "mesh", "object_centers", "object_radii", "min_px", "max_px")
+        return Parts(*(np.concatenate([getattr(p, name) for p in self._parts]) for name in names))
+
+
+def tags(kind: int, material: int, ids: np.ndarray) -> np.ndarray:
+    """Pack kind (bits 0-7), material (8-15) and instance id (16-31) as the shader unpacks them."""
+    return np.uint32(kind) | np.uint32(material << 8) | (np.asarray(ids).astype(np.uint32) << np.uint32(16))

@@ -1,0 +1,188 @@
+"""The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with a way back.
+
+Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space. *Rotation*: the
+camera looks at a point beside the person, at most theta_max off per axis. A shift that puts person or drone too near an obstacle,
+or the person out of the picture, is not made, and the frame says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.config import Config
+from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
+from cosfly.kernels import BoxIndex, signed_distances
+from cosfly.playback import Camera
+from cosfly.schema import GROUND_KINDS, PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M, BoxMap
+
+HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
+STEP_UP_M = 0.5  # a shifted person may stand this much higher or lower than before, not on a roof
+
+
+class PerturbationConfig(Config):
+    """Settings of the perturbed track; defaults from tab:augmentation_params."""
+
+    position_probability: float = Field(
+        0.6, ge=0, le=1, description="chance that a frame's positions are shifted; 0 for never"
+    )
+    rotation_probability: float = Field(
+        0.6, ge=0, le=1, description="chance that a frame's view is turned; 0 for never"
+    )
+    pedestrian_radius_m: float = Field(2.0, ge=0, description="largest shift of the person on the ground (R_h), m")
+    drone_radius_m: float = Field(3.0, ge=0, description="largest shift of the drone (R_d), m")
+    view_radius_m: float = Field(2.0, ge=0, description="how far beside the person the camera may look, m")
+    max_view_deg: float = Field(
+        5.0, ge=0, le=45, description="largest turn of the view, for yaw and for pitch (theta_max), degrees"
+    )
+    sampling: Literal["cubic", "spherical"] = Field(
+        "spherical", description="offsets evenly in a cube or in a ball of the radius"
+    )
+    min_clearance_m: float = Field(0.6, ge=0, description="distance that a shifted drone keeps from obstacles, m")
+    frame_margin: float = Field(
+        0.02, ge=0, lt=0.5, description="share of the image at each border where the person may not be"
+    )
+
+
+@dataclass(frozen=True)
+class Poses:
+    """What is drawn, n frames. positions_m, rotations_deg (pitch, yaw, roll), targets_m: (n, 3), the person's hip point."""
+
+    positions_m: np.ndarray
+    rotations_deg: np.ndarray
+    targets_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class Perturbed:
+    """The perturbed poses, and for each frame what happened.
+
+    drone_offsets_m, target_offsets_m, rotation_offsets_deg: (n, 3), zero where nothing was applied; the rotation offset is the
+    turn away from the person, after the camera was aimed at it anew. states: (n,) {"position", "rotation"}, each none | applied |
+    or the reason for falling back.
+    """
+
+    poses: Poses
+    drone_offsets_m: np.ndarray
+    target_offsets_m: np.ndarray
+    rotation_offsets_deg: np.ndarray
+    states: list[dict[str, str]]
+
+    @property
+    def is_perturbed(self) -> np.ndarray:
+        return np.array(["applied" in state.values() for state in self.states])
+
+
+class Ground:
+    """Height of the ground at a place, from the map's surfaces."""
+
+    def __init__(self, box_map: BoxMap) -> None:
+        slabs = box_map.select(np.isin(box_map.kinds, sorted(GROUND_KINDS)))
+        self._centers, self._half = slabs.centers, slabs.half_extents
+        self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
+        self._tops = slabs.maxs[:, 2]
+
+    def height_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
+        """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none."""
+        offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
+        local = np.einsum("nji,nj->ni", self._turns, offset)
+        over = (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
+        return float(self._tops[over].max()) if over.any() else near_z_m
+
+
+def perturb(
+    planned: Poses,
+    camera: Camera,
+    obstacles: BoxIndex,
+    ground: Ground,
+    cfg: PerturbationConfig,
+    rng: np.random.Generator,
+) -> Perturbed:
+    """Perturb every frame of a flight. The same number of random draws is used for every frame, whatever happens in it."""
+    n = len(planned.positions_m)
+    result = Perturbed(
+        Poses(planned.positions_m.copy(), planned.rotations_deg.copy(), planned.targets_m.copy()),
+        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), [{"position": "none", "rotation": "none"} for _ in range(n)],
+    )  # fmt: skip
+    for i in range(n):
+        events = rng.random(2)
+        person_offset = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
+        drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)
+        view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
+        if events[0] < cfg.position_probability:
+            _shift(result, planned, i, person_offset, drone_offset, camera, obstacles, ground, cfg)
+        if events[1] < cfg.rotation_probability:
+            _turn(result, i, view_offset, camera, cfg)
+    return result
+
+
+def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
+    """An offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
+    offset = np.zeros(3)
+    cube = rng.uniform(-1.0, 1.0, num_axes)
+    direction, share = rng.normal(size=num_axes), rng.random()
+    if cfg.sampling == "cubic":
+        offset[:num_axes] = radius_m * cube
+    else:
+        offset[:num_axes] = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
+    return offset
+
+
+def _shift(
+    result: Perturbed, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
+    obstacles: BoxIndex, ground: Ground, cfg: PerturbationConfig,
+) -> None:  # fmt: skip
+    """Apply one frame's position event, or note why not."""
+    target = planned.targets_m[i] + person_offset
+    feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
+    target[2] = ground.height_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
+    drone = planned.positions_m[i] + drone_offset
+    # The camera is aimed at the shifted person as it was aimed at the unshifted one.
+    aimed = planned.rotations_deg[i].copy()
+    aimed[:2] += _aim_deg(drone, target) - _aim_deg(planned.positions_m[i], planned.targets_m[i])
+    aimed[1] = wrap_deg(aimed[1])
+    ground_z = ground.height_m(drone[0], drone[1], feet_z)
+    distances, _ = signed_distances(obstacles, np.stack([drone, target, target + HEAD_OFFSET_M]))
+    if distances[0] < cfg.min_clearance_m or drone[2] < ground_z + cfg.min_clearance_m:
+        result.states[i]["position"] = "fallback: drone clearance"
+    elif distances[1:].min() < PERSON_HALF_EXTENTS_M[0]:
+        result.states[i]["position"] = "fallback: person in an obstacle"
+    elif not in_frame(target, drone, aimed, camera, cfg.frame_margin):
+        result.states[i]["position"] = "fallback: target out of view"
+    else:
+        result.states[i]["position"] = "applied"
+        result.poses.positions_m[i], result.poses.targets_m[i], result.poses.rotations_deg[i] = drone, target, aimed
+        result.drone_offsets_m[i] = drone_offset
+        result.target_offsets_m[i] = target - planned.targets_m[i]
+
+
+def _turn(result: Perturbed, i: int, view_offset: np.ndarray, camera: Camera, cfg: PerturbationConfig) -> None:
+    """Apply one frame's rotation event to whatever pose the frame has, or note why not."""
+    drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
+    turn = wrap_deg(_aim_deg(drone, target + view_offset) - _aim_deg(drone, target))
+    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), 0.0])
+    rotation = result.poses.rotations_deg[i] + turn
+    rotation[1] = wrap_deg(rotation[1])
+    if abs(rotation[0]) >= 90.0 or not in_frame(target, drone, rotation, camera, cfg.frame_margin):
+        result.states[i]["rotation"] = "fallback: target out of view"
+        return
+    result.states[i]["rotation"] = "applied"
+    result.poses.rotations_deg[i] = rotation
+    result.rotation_offsets_deg[i] = turn
+
+
+def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Pitch and yaw from eye to target, (2,) degrees."""
+    return np.degrees(np.array(look_at(eye, target)))
+
+
+def in_frame(
+    target_m: np.ndarray, drone_m: np.ndarray, rotation_deg: np.ndarray, camera: Camera, margin: float
+) -> bool:
+    """Tell whether the target's hip point is inside the image by a margin (a share of width and height)."""
+    uv, z = project(np.asarray(target_m)[None], world_from_camera(drone_m, rotation_deg), camera.intrinsic)
+    size = np.array([camera.width_px, camera.height_px])
+    return bool(z[0] > 0.3 and (uv[0] >= margin * size).all() and (uv[0] <= (1.0 - margin) * size).all())

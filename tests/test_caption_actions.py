@@ -1,0 +1,203 @@
+"""The action table against hand-made futures, and its invariances."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from caption.actions import BY_TOKEN, MIRRORED, TABLE, label_of, measure, verdict_of
+from caption.schema import FutureMotion, LabelConfig
+from cosfly.coc import ACTION_GROUPS, ACTIONS
+
+CFG = LabelConfig()
+
+
+def future(
+    forward=0.0, left=0.0, up=0.0, turn_deg=0.0, before_mps=None, target=(20.0, 0.0), target_step=(0.0, 0.0), visible=1
+) -> FutureMotion:
+    """A straight future along +x: total displacement and turn over five steps; target at `target`, moving by steps."""
+    k = np.arange(6)[:, None] / 5.0
+    positions = k * np.array([forward, left, up]) + np.array([0.0, 0.0, 15.0])
+    speed = float(np.linalg.norm([forward, left, up]) / 2.5)
+    steps = np.arange(6)[:, None] * np.array([*target_step, 0.0])
+    return FutureMotion(
+        indices=(5, 6, 7, 8, 9),
+        time_s=np.arange(6) * 0.5,
+        positions_m=positions,
+        yaw_deg=k[:, 0] * turn_deg,
+        targets_m=np.array([*target, 0.9]) + steps,
+        visible=np.full(6, bool(visible)),
+        speed_before_mps=speed if before_mps is None else before_mps,
+    )
+
+
+LABELS = [
+    ({"forward": 3.0, "target_step": (0.6, 0.0)}, "track_straight"),
+    ({"forward": 3.0, "turn_deg": 3.01, "target_step": (0.6, 0)}, "yaw_left_to_follow"),
+    ({"forward": 3.0, "turn_deg": 2.9, "target_step": (0.6, 0)}, "track_straight"),
+    ({"forward": 3.0, "turn_deg": -8.0}, "yaw_right_to_follow"),
+    ({"forward": 3.0, "up": 1.2, "turn_deg": 8.0}, "yaw_left_to_follow"),  # a turn goes before a climb
+    ({"forward": 3.0, "up": 1.2, "target_step": (0.6, 0)}, "ascend"),
+    ({"up": -1.5}, "descend"),
+    ({"forward": 4.0, "before_mps": 0.5, "target_step": (0.8, 0)}, "speed_up"),
+    ({"forward": 2.0, "before_mps": 2.0, "target_step": (0.4, 0)}, "slow_down"),
+    ({"left": 2.0}, "strafe_left"),
+    ({"left": -2.0}, "strafe_right"),
+    ({"forward": -2.0}, "move_backward"),
+    ({"forward": 2.0}, "move_forward"),  # closes in on a standing target
+    ({}, "hover"),
+    ({"forward": 3.0, "visible": 0}, "search_to_reacquire_target"),
+    ({"left": 5.0, "turn_deg": -15.0, "target": (12.0, 2.5)}, "circle_left"),
+    ({"left": -5.0, "turn_deg": 15.0, "target": (12.0, -2.5)}, "circle_right"),
+    ({"left": 0.9}, None),  # it moves, but no manoeuvre stands out
+]
+
+
+@pytest.mark.parametrize(("motion", "label"), LABELS)
+def test_label_of_a_known_future(motion, label):
+    assert label_of(measure(future(**motion)), CFG) == label
+
+
+def test_every_action_that_geometry_can_imply_has_an_example():
+    assert {label for _, label in LABELS} - {None} == {action.token for action in TABLE if action.implied is not None}
+    assert set(ACTIONS) - {label for _, label in LABELS} == {"break_off", "return_to_home"}
+
+
+HARD = [
+    ("yaw_left_to_follow", {"forward": 3.0, "turn_deg": -4.0}),
+    ("yaw_right_to_follow", {"forward": 3.0, "turn_deg": 4.0}),
+    ("track_straight", {"forward": 3.0, "turn_deg": 12.0}),
+    ("ascend", {"forward": 3.0, "up": -0.6}),
+    ("descend", {"forward": 3.0, "up": 0.6}),
+    ("speed_up", {"forward": 2.0, "before_mps": 2.0}),
+    ("slow_down", {"forward": 4.0, "before_mps": 0.5}),
+    ("strafe_left", {"left": -0.8}),
+    ("strafe_right", {"left": 0.8}),
+    ("move_forward", {"forward": -1.0}),
+    ("move_backward", {"forward": 1.0}),
+    ("circle_left", {"left": -1.5}),
+    ("circle_right", {"left": 1.5}),
+    ("hover", {"forward": 3.0}),
+    ("search_to_reacquire_target", {"forward": 3.0}),
+    ("break_off", {"forward": 3.0, "target_step": (0.6, 0.0)}),
+    ("return_to_home", {"forward": 3.0, "target_step": (0.6, 0.0)}),
+]
+
+
+@pytest.mark.parametrize(("decision", "motion"), HARD)
+def test_contradiction_of_each_action(decision, motion):
+    measured = measure(future(**motion))
+    assert verdict_of(decision, measured, CFG, label_of(measured, CFG)) == "HARD_CONFLICT"
+
+
+def test_all_actions_are_in_the_contradiction_table():
+    assert {decision for decision, _ in HARD} == set(ACTIONS)
+
+
+def test_soft_and_abstain_and_consistent():
+    straight = measure(future(forward=3.0, target_step=(0.6, 0.0)))
+    assert verdict_of("track_straight", straight, CFG, "track_straight") == "CONSISTENT"
+    assert verdict_of("yaw_left_to_follow", straight, CFG, "track_straight") == "SOFT_CONFLICT"
+    vague = measure(future(left=0.4, forward=0.3, up=0.6))
+    assert label_of(vague, CFG) is None
+    assert verdict_of("yaw_left_to_follow", vague, CFG, None) == "ABSTAIN"
+    assert verdict_of("descend", vague, CFG, None) == "HARD_CONFLICT"  # a contradiction needs no label
+
+
+def test_unknown_target_leaves_the_other_labels_alone():
+    base = future(forward=3.0, turn_deg=5.0)
+    blind = dataclasses.replace(base, targets_m=np.full((6, 3), np.nan))
+    assert label_of(measure(blind), CFG) == "yaw_left_to_follow"
+    assert label_of(measure(dataclasses.replace(blind, yaw_deg=np.zeros(6))), CFG) == "track_straight"
+
+
+def test_groups_follow_the_paper():
+    assert {action.token: action.group for action in TABLE} == {
+        token: group for group, tokens in ACTION_GROUPS.items() for token in tokens
+    }
+
+
+# --- properties -------------------------------------------------------------------------------------------------------
+
+coordinate = st.floats(-6.0, 6.0, allow_nan=False, width=32)
+rows = st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=6, max_size=6)
+angles = st.lists(st.floats(-20.0, 20.0, allow_nan=False, width=32), min_size=6, max_size=6)
+
+
+@st.composite
+def futures(draw) -> FutureMotion:
+    targets = np.array(draw(rows)) + np.array([15.0, 0.0, 0.0])
+    return FutureMotion(
+        indices=(5, 6, 7, 8, 9),
+        time_s=np.arange(6) * 0.5,
+        positions_m=np.array(draw(rows)),
+        yaw_deg=np.array(draw(angles)),
+        targets_m=targets,
+        visible=np.array(draw(st.lists(st.booleans(), min_size=6, max_size=6))),
+        speed_before_mps=draw(st.floats(0.0, 5.0)),
+    )
+
+
+def judged(motion) -> tuple[str | None, dict[str, str]]:
+    label = label_of(motion, CFG)
+    return label, {token: verdict_of(token, motion, CFG, label) for token in ACTIONS}
+
+
+def is_near_a_threshold(motion) -> bool:
+    """Rounding may move a value that sits on a threshold; such draws say nothing about invariance."""
+    values = dataclasses.asdict(motion)
+    limits = [*list(CFG.model_dump().values()), 0.0]
+    limits += [0.5 * CFG.altitude_m, 0.5 * CFG.lateral_m]
+    numbers = [v for v in values.values() if isinstance(v, float)] + [0.5 * abs(motion.left_m) - motion.target_path_m]
+    numbers += [abs(motion.left_m) - abs(motion.forward_m)]
+    return any(abs(abs(number) - limit) < 1e-6 for number in numbers for limit in limits if limit or number)
+
+
+@given(futures())
+def test_mirroring_swaps_sides_and_keeps_verdicts(drawn):
+    flip = np.array([1.0, -1.0, 1.0])
+    mirrored = dataclasses.replace(
+        drawn, positions_m=drawn.positions_m * flip, targets_m=drawn.targets_m * flip, yaw_deg=-drawn.yaw_deg
+    )
+    (label, verdicts), (other, others) = judged(measure(drawn)), judged(measure(mirrored))
+    if is_near_a_threshold(measure(drawn)):
+        return
+    assert other == (None if label is None else MIRRORED[label])
+    assert {MIRRORED[token]: verdict for token, verdict in verdicts.items()} == others
+
+
+@given(futures(), st.floats(-180, 180), st.tuples(coordinate, coordinate, coordinate), st.floats(0, 1e4))
+def test_moving_the_world_and_the_clock_changes_nothing(drawn, turn_deg, shift, later_s):
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    moved = dataclasses.replace(
+        drawn,
+        positions_m=drawn.positions_m @ turn.T + shift,
+        targets_m=drawn.targets_m @ turn.T + shift,
+        yaw_deg=(drawn.yaw_deg + turn_deg + 180.0) % 360.0 - 180.0,
+        time_s=drawn.time_s + later_s,
+    )
+    if not is_near_a_threshold(measure(drawn)):
+        assert judged(measure(drawn)) == judged(measure(moved))
+
+
+@given(futures())
+def test_what_is_implied_is_never_contradicted(drawn):
+    motion = measure(drawn)
+    label = label_of(motion, CFG)
+    if label is not None:
+        assert not BY_TOKEN[label].contradicted(motion, CFG)
+
+
+@given(futures())
+def test_geometry_never_orders_a_mission(drawn):
+    assert label_of(measure(drawn), CFG) not in ("break_off", "return_to_home")
+
+
+def test_thresholds_that_contradict_each_other_are_refused():
+    with pytest.raises(ValueError, match="hover would contradict itself"):
+        LabelConfig(hover_mps=2.0)

@@ -1,0 +1,187 @@
+"""Stage `caption` with the rule teacher: products, tally, workers, kill and resume, bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import pytest
+
+from caption.actions import label_of, measure
+from caption.glossary import load_glossary
+from caption.schema import CaptionConfig
+from caption.stage import run
+from caption.windows import iterate_samples
+from cosfly.coc import read_captions
+from cosfly.errors import ConfigError, InputError
+from cosfly.playback import find_flights, read_flight
+from specimens import make_playback_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 3, 18)
+
+
+@pytest.fixture(scope="module")
+def done(tree, tmp_path_factory):
+    return run(CaptionConfig(), tree, tmp_path_factory.mktemp("done") / "caption").parent
+
+
+def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
+    captions = list(read_captions(done / "captions.jsonl"))
+    expected = {}
+    for folder in find_flights(tree):
+        for sample in iterate_samples(read_flight(folder), CaptionConfig().window):
+            expected[sample.observed.sample_id] = label_of(measure(sample.future), CaptionConfig().label)
+    assert [caption.sample_id for caption in captions] == sorted(expected)
+    assert {caption.sample_id: caption.label for caption in captions} == expected
+    assert len(captions) == 6 * 9
+    for caption in captions:
+        assert caption.teacher["kind"] == "rules"
+        assert caption.window[-1] == caption.frame_index
+        assert caption.future[0] == caption.frame_index + 1
+        assert caption.status == "accepted"
+        assert caption.verdict != "HARD_CONFLICT"
+        assert caption.en.flight_decision == caption.zh.flight_decision
+
+
+def test_the_report_adds_up_and_repairs_stay_on_record(done):
+    captions = list(read_captions(done / "captions.jsonl"))
+    report = json.loads((done / "caption_report.json").read_text())
+    manifest = json.loads((done / "manifest.json").read_text())
+    assert report["windows"] == manifest["counts"] == {"input": 54, "kept": 54, "dropped": {}, "failed": {}}
+    assert report["labels"] == dict(Counter(caption.label or "none" for caption in captions).most_common())
+    repaired = [caption for caption in captions if caption.repair]
+    assert repaired, "the specimens must hold a conflict for this test to mean anything"
+    assert report["repair"]["rejected"] == report["verdicts_of_first_answers"]["HARD_CONFLICT"] == len(repaired)
+    assert all(c.repair["strategy"] == "anchored" and c.en.flight_decision == c.label for c in repaired)
+    first = sum(count for row in report["confusion_label_to_first_decision"].values() for count in row.values())
+    assert first == sum(report["verdicts_of_first_answers"].values()) == 54
+    assert not (done / "parts").exists()
+
+
+def test_one_and_two_workers_give_the_same_bytes(tree, done, tmp_path):
+    two = run(CaptionConfig(), tree, tmp_path / "two", workers=2)
+    assert two.read_bytes() == (done / "captions.jsonl").read_bytes()
+    assert (two.parent / "caption_report.json").read_bytes() == (done / "caption_report.json").read_bytes()
+
+
+def test_another_seed_changes_the_wording_only(tree, done, tmp_path):
+    other = list(read_captions(run(CaptionConfig(), tree, tmp_path / "other", seed=1)))
+    base = list(read_captions(done / "captions.jsonl"))
+    assert [c.label for c in other] == [c.label for c in base]
+    assert [c.en.flight_decision for c in other] == [c.en.flight_decision for c in base]
+    assert [c.en.critical_components for c in other] != [c.en.critical_components for c in base]
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import caption.stage as stage
+from caption.schema import CaptionConfig
+plain = stage.write_captions
+def slow(path, captions):
+    import time
+    time.sleep(0.3)
+    return plain(path, captions)
+stage.write_captions = slow
+stage.run(CaptionConfig(), Path(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+def test_kill_9_and_resume_give_the_same_bytes(tree, done, tmp_path):
+    out = tmp_path / "out"
+    child = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tree), str(out)])
+    deadline_s = time.monotonic() + 60
+    while len(list(out.glob("parts/*.jsonl"))) < 2 and child.poll() is None and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert not (out / "manifest.json").exists()
+    assert 2 <= len(list(out.glob("parts/*.jsonl"))) < 6
+    assert run(CaptionConfig(), tree, out).read_bytes() == (done / "captions.jsonl").read_bytes()
+
+
+def test_a_complete_folder_is_not_touched_again(tree, done):
+    before = (done / "captions.jsonl").stat().st_mtime_ns
+    assert run(CaptionConfig(), tree, done) == done / "captions.jsonl"
+    assert (done / "captions.jsonl").stat().st_mtime_ns == before
+
+
+def test_limit_does_not_depend_on_workers(tree, tmp_path):
+    cfg = CaptionConfig(limit=13)
+    one = run(cfg, tree, tmp_path / "one")
+    two = run(cfg, tree, tmp_path / "two", workers=2)
+    assert len(one.read_text().splitlines()) == 13
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
+    root = tmp_path / "tree"
+    shutil.copytree(tree, root)
+    folders = find_flights(root)
+    raw = json.loads((folders[0] / "trajectory.json").read_text())
+    raw["points"] = raw["points"][:9]  # one short of a window and its future
+    (folders[0] / "trajectory.json").write_text(json.dumps(raw))
+    (folders[1] / "trajectory.json").write_text('{"schema":')
+    text = (folders[2] / "trajectory.json").read_text()
+    raw = json.loads(text)
+    raw["points"][3]["drone_pose"]["x"] = None
+    (folders[2] / "trajectory.json").write_text(json.dumps(raw))
+    (folders[3] / "frames_playback" / "frame_00006" / "rgb.png").unlink()
+    out = run(CaptionConfig(), root, tmp_path / "out").parent
+    report = json.loads((out / "caption_report.json").read_text())
+    assert report["flights"] == {"input": 6, "kept": 3, "dropped": {"too_short": 1}, "failed": {"input": 2}}
+    # Frame 6 is observed by the windows at 6..10, of those at 4..12.
+    assert report["windows"] == {"input": 27, "kept": 22, "dropped": {"missing_frame": 5}, "failed": {}}
+    failures = (out / "failures.jsonl").read_text()
+    assert "points[3].drone_pose.x: not a number" in failures
+    assert "not valid JSON" in failures
+
+
+@pytest.mark.parametrize("num_points", [4, 9])
+def test_no_window_at_all_is_one_clear_error(tmp_path, num_points):
+    root = make_playback_tree(tmp_path / "tree", 1, num_points, with_images=False)
+    with pytest.raises(InputError, match=r"no window to caption.*too_short 2.*at least 10 frames"):
+        run(CaptionConfig(), root, tmp_path / "out")
+
+
+def test_a_folder_that_is_no_playback_tree(tmp_path):
+    (tmp_path / "data").mkdir()
+    with pytest.raises(InputError, match="not a playback tree"):
+        run(CaptionConfig(), tmp_path / "data", tmp_path / "out")
+
+
+def test_two_flights_of_one_name_are_refused(tmp_path):
+    root = make_playback_tree(tmp_path / "tree", 1, 12, with_images=False)
+    shutil.copytree(root / "Town01", root / "Town02")
+    with pytest.raises(InputError, match="two flights of one name"):
+        run(CaptionConfig(), root, tmp_path / "out")
+
+
+def test_a_teacher_must_be_rules_or_a_url():
+    with pytest.raises(ValueError, match="`rules` or a URL"):
+        CaptionConfig(teacher="gpt")
+
+
+def test_evidence_can_be_made_a_reason_to_drop(tree, tmp_path):
+    strict = {"drop": True, "tolerance_m": 0, "tolerance_mps": 0, "tolerance_px": 0, "tolerance_deg": 0, "relative": 0}
+    cfg = CaptionConfig.model_validate({"evidence": strict})
+    report = json.loads((run(cfg, tree, tmp_path / "out").parent / "caption_report.json").read_text())
+    assert report["windows"]["kept"] == 54  # the rule teacher's numbers are the measured ones
+
+
+def test_a_glossary_without_an_action_is_refused(tmp_path):
+    from cosfly.config import shipped
+
+    text = shipped("glossary.yaml").read_text(encoding="utf-8").replace("  hover: {en: hover, zh: 悬停}\n", "")
+    (tmp_path / "glossary.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match="not the closed set; got hover"):
+        load_glossary(tmp_path / "glossary.yaml")

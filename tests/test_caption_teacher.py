@@ -1,0 +1,391 @@
+"""The endpoint teacher against a real server that misbehaves: fault -> what the run must do."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from teacher_server import MODEL, TeacherServer, is_mirror
+
+from caption.schema import CaptionConfig
+from caption.stage import run
+from caption.teacher import KEY_VARIABLE, base_url, shown_url
+from caption.throttle import Throttle
+from cosfly.coc import read_captions
+from cosfly.errors import ResumeError, TeacherError
+from cosfly.store import Journal
+from specimens import make_playback_tree
+
+ENDPOINT = {"max_tries": 4, "backoff_s": 0.02, "max_backoff_s": 0.05, "timeout_s": 0.5, "concurrency": 4}
+
+
+def settings(url: str, **changes) -> CaptionConfig:
+    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
+    return CaptionConfig.model_validate({"teacher": url, "endpoint": endpoint, "image": {"max_side_px": 32}, **changes})
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 14, with_augmented=False)
+
+
+def report_of(out: Path) -> dict:
+    return json.loads((out / "caption_report.json").read_text())
+
+
+def first(fault: str, count: int = 1):
+    """The fault for the first requests only."""
+    return lambda number, body: fault if number < count else None
+
+
+# What the run must do with one faulty answer among good ones: number of requests beyond an undisturbed run's, and the word
+# under which the mended wrapper is counted.
+PASSING_FAULTS = [
+    ("429", 1, None), ("500", 1, None), ("503", 1, None), ("reset", 1, None), ("truncated_body", 1, None),
+    ("not_json", 1, None), ("empty_choices", 1, None), ("null_content", 1, None), ("slow", 1, None),
+    ("wrong_shape", 1, None), ("wrong_decision", 1, None), ("short", 1, None), ("cut", 1, None), ("empty_text", 1, None),
+    ("prose", 0, "prose_around"), ("fence", 0, "code_fence"), ("thinking", 0, "thinking_tags"),
+    ("control", 0, "control_characters"), ("comma", 0, "trailing_comma"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "more_requests", "recovered"), PASSING_FAULTS)
+def test_one_fault_is_survived(tree, tmp_path, fault, more_requests, recovered):
+    cfg = {"limit": 2, "repair": {"verdicts": ()}}
+    with TeacherServer(first(fault), decision=lambda body: "hover") as server:
+        path = run(settings(server.url, **cfg), tree, tmp_path / "out")
+    captions = list(read_captions(path))
+    assert [caption.status for caption in captions] == ["accepted", "accepted"]
+    assert len(server.bodies) == 4 + more_requests  # English and Chinese of two windows
+    assert report_of(tmp_path / "out")["recovered"] == ({recovered: 1} if recovered else {})
+    assert all("\x0f" not in caption.en.critical_components for caption in captions)
+
+
+# What the run must do when every answer has the fault: the reason under which all windows are dropped.
+DROPPING_FAULTS = [
+    ("wrong_shape", "structure_missing_field"), ("wrong_decision", "structure_decision_not_in_closed_set"),
+    ("short", "structure_reasoning_trace_too_short"), ("cut", "structure_cut_short"), ("empty_text", "structure_empty"),
+    ("413", "refused_413"), ("wrong_mirror_decision", "bilingual_decision"), ("wrong_mirror_number", "bilingual_number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "reason"), DROPPING_FAULTS)
+def test_a_lasting_fault_drops_windows_with_its_reason(tree, tmp_path, fault, reason):
+    cfg = {"limit": 2, "repair": {"verdicts": ()}}
+    with TeacherServer(lambda number, body: fault, decision=lambda body: "ascend") as server:
+        run(settings(server.url, **cfg), tree, tmp_path / "out")
+    windows = report_of(tmp_path / "out")["windows"]
+    assert windows == {"input": 2, "kept": 0, "dropped": {reason: 2}, "failed": {}}
+
+
+# Faults that end the run with one line, before or during it.
+ENDING_FAULTS = [("401", "refuses the key"), ("404", "no such model"), ("500", "500"), ("reset", "connection")]
+
+
+@pytest.mark.parametrize(("fault", "words"), ENDING_FAULTS)
+def test_a_lasting_server_fault_ends_the_run(tree, tmp_path, fault, words):
+    cfg = settings("http://user:hunter2@127.0.0.1:1", endpoint={"stop_after_failures": 3})
+    with TeacherServer(lambda number, body: fault) as server:
+        cfg = cfg.model_copy(update={"teacher": server.url.replace("http://", "http://user:hunter2@")})
+        with pytest.raises(TeacherError, match=words) as caught:
+            run(cfg, tree, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert "hunter2" not in str(caught.value)
+    assert "127.0.0.1" in str(caught.value)
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_windows_without_an_answer_are_listed_and_asked_again(tree, tmp_path):
+    out = tmp_path / "out"
+    bad = {}
+
+    def fault(number, body):  # one window's first question never gets through
+        if not is_mirror(body) and not bad:
+            bad["seed"] = body["seed"]
+        return "500" if bad.get("seed") == body["seed"] and bad.get("on", True) else None
+
+    with TeacherServer(fault, decision=lambda body: "hover") as server:
+        cfg = settings(server.url, repair={"verdicts": ()})
+        with pytest.raises(TeacherError, match=r"1 of 5 windows got no answer.*http_500 1"):
+            run(cfg, tree, out)
+        assert report_of(out)["windows"]["failed"] == {"no_answer": 1}
+        assert len(list(read_captions(out / "captions.jsonl"))) == 4
+        assert json.loads((out / "failures.jsonl").read_text())["code"] == "http_500"
+        bad["on"] = False
+        asked = len(server.bodies)
+        path = run(cfg, tree, out)
+    assert len(server.bodies) - asked == 2  # the missing window in two languages, nothing else
+    assert len(list(read_captions(path))) == 5
+
+
+def test_an_unreadable_picture_drops_its_windows_and_asks_nothing(tree, tmp_path):
+    root = tmp_path / "tree"
+    shutil.copytree(tree, root)
+    broken = next(root.rglob("frame_00002/rgb.png"))
+    broken.write_bytes(broken.read_bytes()[:20])
+    with TeacherServer(decision=lambda body: "hover") as server:
+        run(settings(server.url, repair={"verdicts": ()}), root, tmp_path / "out")
+    # Frame 2 is observed by the windows at 4, 5 and 6 of 4..8.
+    windows = report_of(tmp_path / "out")["windows"]
+    assert windows == {"input": 5, "kept": 2, "dropped": {"unreadable_frame": 3}, "failed": {}}
+    assert len(server.bodies) == 4
+
+
+def test_schema_refused_falls_back_to_plain_asking_and_says_so(tree, tmp_path):
+    with TeacherServer(lambda number, body: "schema_refused") as server:
+        run(settings(server.url, limit=2, endpoint={"concurrency": 1}), tree, tmp_path / "out")
+    with_schema = [b"response_format" in body for body in server.bodies]
+    assert with_schema[0]
+    assert not any(with_schema[1:])  # refused once, never sent again
+    assert report_of(tmp_path / "out")["structured"] == {"plain": 2}
+
+
+def test_anchored_repair_enforces_the_label(tree, tmp_path):
+    with TeacherServer() as server:
+        path = run(settings(server.url), tree, tmp_path / "out")
+    repaired = [caption for caption in read_captions(path) if caption.repair]
+    assert repaired, "the seeded decisions must hit a hard conflict for this test to mean anything"
+    for caption in repaired:
+        assert caption.repair["first_verdict"] == "HARD_CONFLICT"
+        assert caption.repair["strategy"] == "anchored"
+        assert caption.repair["first_decision"] != caption.label
+        assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
+        assert caption.verdict == "CONSISTENT"
+    anchored = [json.loads(body) for body in server.bodies if b"Hard constraint" in body]
+    assert len(anchored) == len(repaired)
+    enums = [b["response_format"]["json_schema"]["schema"]["properties"]["flight_decision"]["enum"] for b in anchored]
+    assert all(len(enum) == 1 for enum in enums)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "rungs"),
+    [
+        ("anchored", ["anchored"] * 3),
+        ("hint", ["hint"] * 3),
+        ("multi_sample", ["multi_sample"] * 3),
+        ("cascade", ["hint", "multi_sample", "anchored"]),
+    ],
+)
+def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
+    """A teacher that insists on hovering: only an enforced decision can mend it."""
+    with TeacherServer(decision=lambda body: "hover") as server:
+        path = run(settings(server.url, repair={"strategy": strategy}), tree, tmp_path / "out")
+    repaired = [caption for caption in read_captions(path) if caption.repair]
+    assert repaired
+    for caption in repaired:
+        assert caption.repair["strategy"] == strategy
+        assert caption.repair["first_decision"] == "hover"
+        if "anchored" in rungs:
+            assert caption.repair["rung"] == "anchored"
+            assert caption.repair["asks"] == rungs.index("anchored") + 1
+            assert caption.en.flight_decision == caption.label
+        else:
+            assert (caption.repair["rung"], caption.repair["asks"]) == (None, 3)
+            assert caption.drop_reason == "regeneration_failed"
+    hints = sum(b"Hint: an earlier answer" in body for body in server.bodies)
+    assert hints == len(repaired) * rungs[: repaired[0].repair["asks"]].count("hint")
+    repair = report_of(tmp_path / "out")["repair"]
+    assert repair["rejected"] == sum(repair["rungs"].values()) == len(repaired)
+
+
+def test_a_hint_can_mend_a_conflict(tree, tmp_path):
+    """A teacher that thinks again when told so: the rung says hint, and the text was not anchored."""
+
+    def decide(body):
+        return "yaw_right_to_follow" if "Hint:" in body["messages"][0]["content"] else "hover"
+
+    with TeacherServer(decision=decide) as server:
+        cfg = settings(server.url, repair={"strategy": "cascade"})
+        path = run(cfg, tree, tmp_path / "out")
+    rungs = {caption.repair["rung"] for caption in read_captions(path) if caption.repair}
+    assert "hint" in rungs
+
+
+def test_a_server_that_ignores_the_schema_exhausts_the_asks(tree, tmp_path):
+    with TeacherServer(lambda number, body: "schema_ignored", decision=lambda body: "hover") as server:
+        path = run(settings(server.url), tree, tmp_path / "out")
+    captions = list(read_captions(path))
+    failed = [caption for caption in captions if caption.drop_reason == "regeneration_failed"]
+    assert failed
+    assert all(caption.repair["asks"] == 3 and caption.repair["outcome"] == "failed" for caption in failed)
+    repair = report_of(tmp_path / "out")["repair"]
+    assert repair["rejected"] == sum(repair["rungs"].values()) == sum(repair["asks"].values())
+
+
+def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret-123")
+    caplog.set_level(logging.DEBUG)
+    with TeacherServer() as server:
+        run(settings(server.url, limit=2), tree, tmp_path / "good")
+    assert {headers["authorization"] for headers in server.headers} == {"Bearer sk-very-secret-123"}
+    with TeacherServer(lambda number, body: "echo_key") as server, pytest.raises(TeacherError) as caught:
+        run(settings(server.url, limit=2), tree, tmp_path / "bad")
+    assert "sk-very-secret" not in str(caught.value)
+    assert "***" in str(caught.value)
+    assert "sk-very-secret" not in caplog.text
+    for file in tmp_path.rglob("*"):
+        assert not file.is_file() or b"sk-very-secret" not in file.read_bytes(), file
+
+
+def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(TeacherError, match=f"127.0.0.1:{port}/v1: cannot reach the teacher"):
+        run(settings(f"http://127.0.0.1:{port}"), tree, tmp_path / "a")
+    with TeacherServer(models=("one", "two")) as server:
+        with pytest.raises(TeacherError, match="does not have this model; got three; expected one of one, two"):
+            run(settings(server.url, endpoint={"model": "three"}), tree, tmp_path / "b")
+        with pytest.raises(TeacherError, match="has several models"):
+            run(settings(server.url), tree, tmp_path / "c")
+        with pytest.raises(TeacherError, match="may not be an OpenAI-compatible endpoint"):
+            run(settings(server.url.removesuffix("/v1") + "/elsewhere"), tree, tmp_path / "d")
+        assert not server.bodies
+
+
+def test_at_most_the_set_number_is_in_flight(tree, tmp_path):
+    with TeacherServer(delay_s=0.03) as server:
+        run(settings(server.url, endpoint={"concurrency": 3}), tree, tmp_path / "out")
+    assert 2 <= server.most_at_once <= 3
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("http://h:8000", "http://h:8000/v1"),
+        ("http://h:8000/", "http://h:8000/v1"),
+        ("https://h/api/v3/", "https://h/api/v3"),
+        ("http://h/v1/chat/completions", "http://h/v1"),
+    ],
+)
+def test_base_url(url, expected):
+    assert base_url(url) == expected
+
+
+def test_shown_url_has_no_secrets():
+    assert shown_url("https://me:pw@h:1/v1?key=abc") == "https://h:1/v1"
+
+
+# --- the throttle ---
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_the_throttle_ramps_halves_and_recovers():
+    clock = Clock()
+    throttle = Throttle(64, clock)
+    assert throttle.limit == 8
+    for _ in range(8):
+        throttle.succeeded()
+    assert throttle.limit == 16  # doubled by one round of answers
+    clock.now_s = 1.0
+    throttle.was_busy(given_s=0.5, retry_after_s=None)
+    throttle.was_busy(given_s=0.5, retry_after_s=None)  # sent before the decrease: says nothing new
+    assert throttle.limit == 8
+    for _ in range(8):
+        throttle.succeeded()
+    assert 8.9 < throttle.limit <= 9.0  # one more per round from now on
+    for _ in range(20):
+        clock.now_s += 1.0
+        throttle.was_busy(given_s=clock.now_s, retry_after_s=None)
+    assert throttle.limit == 1.0
+    for _ in range(10_000):
+        throttle.succeeded()
+    assert throttle.limit == 64
+
+
+def test_a_server_with_room_for_three_is_not_flooded(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 2, 20, with_augmented=False)
+    with TeacherServer(lambda number, body: "429" if server.active > 3 else None, delay_s=0.05) as server:
+        endpoint = {"concurrency": 16, "max_tries": 20}
+        run(settings(server.url, endpoint=endpoint), tree, tmp_path / "out")
+        asked = len(server.bodies)
+        answered = len(list(Journal(tmp_path / "out" / "answers.jsonl").read()))
+    assert report_of(tmp_path / "out")["windows"]["failed"] == {}
+    assert asked - answered < 0.6 * answered  # most requests are answered at once
+    assert asked > answered  # the limit was met
+
+
+# --- the journal ------------------------------------------------------------------------------------------------------
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from caption.schema import CaptionConfig
+from caption.stage import run
+run(CaptionConfig.model_validate(json.loads(sys.argv[3])), Path(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+def test_nothing_answered_is_asked_twice_after_kill_9(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 2, 20, with_augmented=False)
+    with TeacherServer() as undisturbed:
+        expected = run(settings(undisturbed.url), tree, tmp_path / "whole").read_bytes()
+    out, kills = tmp_path / "out", 2
+    with TeacherServer(delay_s=0.02) as server:
+        config = settings(server.url).model_dump_json()
+        for stop_at in (15, 35):
+            child = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tree), str(out), config])
+            deadline_s = time.monotonic() + 60
+            while len(server.bodies) < stop_at and child.poll() is None and time.monotonic() < deadline_s:
+                time.sleep(0.005)
+            os.kill(child.pid, signal.SIGKILL)
+            child.wait()
+        answered = {record["key"] for record in Journal(out / "answers.jsonl").read()}
+        assert answered, "the kills must fall in the middle"
+        assert not (out / "manifest.json").exists()
+        found = run(settings(server.url), tree, out).read_bytes()
+    assert found == expected
+    in_flight = kills * ENDPOINT["concurrency"]
+    assert len(undisturbed.bodies) <= len(server.bodies) <= len(undisturbed.bodies) + in_flight
+    assert set(server.digests()) == set(undisturbed.digests())
+    keys = [record["key"] for record in Journal(out / "answers.jsonl").read()]
+    assert len(keys) == len(set(keys))
+
+
+def test_a_damaged_journal_line_costs_one_request(tree, tmp_path):
+    out = tmp_path / "out"
+    with TeacherServer() as server:
+        cfg = settings(server.url)
+        expected = run(cfg, tree, out).read_bytes()
+        asked = len(server.bodies)
+        (out / "manifest.json").unlink()
+        lines = (out / "answers.jsonl").read_bytes().splitlines(keepends=True)
+        lines[3] = lines[3].replace(b"pedestrian", b"pedestrain").replace("行人".encode(), "路人".encode())
+        (out / "answers.jsonl").write_bytes(b"".join(lines))
+        assert run(cfg, tree, out).read_bytes() == expected
+    assert len(server.bodies) == asked + 1
+
+
+def test_another_prompt_setting_stops_the_resume(tree, tmp_path):
+    with TeacherServer() as server:
+        run(settings(server.url, limit=1), tree, tmp_path / "out")
+        run(
+            settings(server.url, limit=1, endpoint={"concurrency": 9}), tree, tmp_path / "out"
+        )  # a manner, not a prompt
+        with pytest.raises(ResumeError, match=r"endpoint\.temperature was 0\.6, is 0\.1"):
+            run(settings(server.url, limit=1, endpoint={"temperature": 0.1}), tree, tmp_path / "out")
+
+
+def test_records_name_the_teacher(tree, tmp_path):
+    with TeacherServer() as server:
+        path = run(settings(server.url, limit=1), tree, tmp_path / "out")
+    caption = next(read_captions(path))
+    assert caption.teacher["kind"] == "endpoint"
+    assert caption.teacher["model"] == MODEL
+    assert caption.teacher["structured"] == "json_schema"
+    assert caption.usage["prompt_tokens"] == 1000 * caption.attempts

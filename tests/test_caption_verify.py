@@ -1,0 +1,263 @@
+"""Evidence and mirror checks: the paper's own sample passes, planted contradictions fail, clean captions raise no alarm."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caption.facts import Facts, measure_facts
+from caption.glossary import load_glossary
+from caption.rules import write_answers
+from caption.schema import EvidenceConfig, WindowConfig
+from caption.verify import check_evidence, check_mirror, flight_numbers
+from caption.windows import iterate_samples
+from cosfly.coc import ACTIONS, Coc
+from specimens import make_flight
+
+CFG = EvidenceConfig()
+
+# tab:coc_sample_en and tab:coc_sample_zh, trajectory_1776047127_ORI_frame_00004.
+PAPER_EN = Coc(
+    critical_components=(
+        "Target pedestrian walking straight in the center lane. Bounding-box size remains stable (about 34 × 59 px), "
+        "image position is centered, horizontal distance increases slightly from 20.0 m to 21.4 m, drone speed matches "
+        "target speed, altitude is stable at 20.6 m, and the road ahead is clear."
+    ),
+    reasoning_trace=(
+        "The target motion is visually stable and straight. The earlier increase in distance indicates the drone was "
+        "briefly slower than the pedestrian, but the current speed of 1.02 m/s now matches the target's 1.00 m/s, "
+        "stabilizing the gap. Since yaw is aligned and the path is obstacle-free, the correct action is to maintain the "
+        "current trajectory."
+    ),
+    flight_decision="track_straight",
+)
+PAPER_ZH = Coc(
+    critical_components=(
+        "目标为在中央车道直行的行人。边界框尺寸稳定（约 34 × 59 像素），位置居中，水平距离从 20.0 米略微增加至 21.4 米。"
+        "无人机速度（1.02 米/秒）与目标速度（1.00 米/秒）匹配，高度稳定在 20.6 米，前方道路无遮挡。"
+    ),
+    reasoning_trace=(
+        "目标直线移动且视觉特征稳定。序列中距离增加 1.4 米，说明无人机先前略慢于目标，但当前速度已经与目标同步，"
+        "因此间距趋于稳定。偏航方向已与目标路径对齐，且环境无即时障碍物，所以无人机应保持当前轨迹继续跟踪。"
+    ),
+    flight_decision="track_straight",
+)
+# The sample's flight data; distances and box from its text.
+PAPER_FACTS = Facts(
+    speed_mps=(None, 2.92, 1.46, 0.87, 1.02),
+    altitude_m=(22.0, 21.2, 20.7, 20.6, 20.6),
+    yaw_deg=(0.0, 3.2, 4.4, 4.8, 4.8),
+    pitch_deg=(-45.0,) * 5,
+    distance_m=(20.0, 20.4, 20.9, 21.2, 21.4),
+    slant_m=(29.0, 29.0, 29.0, 29.0, 29.1),
+    target_speed_mps=1.0,
+    target_turn_deg=0.0,
+    box_width_px=(34,) * 5,
+    box_height_px=(59,) * 5,
+    offset_x_px=(0,) * 5,
+    offset_y_px=(0,) * 5,
+    visibility=("visible",) * 5,
+    width_px=1280,
+    height_px=720,
+)
+FLIGHT = flight_numbers(PAPER_FACTS)
+
+
+def test_the_papers_own_sample_passes_both_checks():
+    assert check_mirror(PAPER_EN, PAPER_ZH, FLIGHT) is None
+    assert check_evidence(PAPER_EN, PAPER_FACTS, CFG, "en") == []
+    assert check_evidence(PAPER_ZH, PAPER_FACTS, CFG, "zh") == []
+
+
+def altered(coc: Coc, old: str, new: str) -> Coc:
+    changed = {name: text.replace(old, new) for name, text in coc.model_dump().items() if name != "flight_decision"}
+    assert changed != {name: getattr(coc, name) for name in changed}, old
+    return Coc(**changed, flight_decision=coc.flight_decision)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("20.6", "26.0", "number"),
+        ("34 × 59", "34 × 95", "number"),
+        ("1.4 米", "1.5 米", "number"),
+        ("21.4 米", "24.1 米", "number"),
+        ("1.00 米/秒", "1.20 米/秒", "number"),
+        ("增加", "减少", "polarity_trend"),
+        ("慢于", "快于", "polarity_pace"),
+    ],
+)
+def test_a_planted_contradiction_in_the_papers_chinese_fails(old, new, reason):
+    assert check_mirror(PAPER_EN, altered(PAPER_ZH, old, new), FLIGHT) == reason
+
+
+def pair(en: str, zh: str) -> tuple[Coc, Coc]:
+    filler_en, filler_zh = "The pedestrian is on the road here.", "行人此刻在道路上行走着。"
+    return (
+        Coc(critical_components=filler_en, reasoning_trace=en, flight_decision="hover"),
+        Coc(critical_components=filler_zh, reasoning_trace=zh, flight_decision="hover"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("en", "zh", "reason"),
+    [
+        ("the target is on the left", "目标在左侧", None),
+        ("the target is on the left", "目标在右侧", "polarity_side"),
+        ("the target is right now on the left", "目标此刻在左侧", None),
+        ("about 3 m to the left", "左侧 3 米左右", None),
+        ("the drone climbs", "无人机下降", "polarity_vertical"),
+        ("the drone ascends", "无人机上升", None),
+        ("the gap decreases", "间距增大", "polarity_trend"),
+        ("the target is visible", "目标被遮挡", "polarity_visibility"),
+        ("the target is visible", "目标不可见", "polarity_visibility"),
+        ("the target is not visible", "目标不可见", None),
+        ("the target is not occluded", "目标无遮挡", None),
+        ("the target is occluded", "目标未被遮挡", "polarity_visibility"),
+        ("it turns left, then right, then left", "先向左，再向右，再向右", "polarity_side"),
+        ("the target is 12.5 m away", "目标在 12.5 米处", None),
+        ("the target is 12.5 m away", "目标在 15.2 米处", "number"),
+        ("the target is 12.5 m away", "目标速度 12.5 米/秒", "number"),  # same digits, another unit
+        ("over 5 frames", "在五帧中", None),
+    ],
+)
+def test_mirror_check(en, zh, reason):
+    assert check_mirror(*pair(en, zh), {}) == reason
+
+
+def test_another_decision_fails():
+    other = PAPER_ZH.model_copy(update={"flight_decision": "hover"})
+    assert check_mirror(PAPER_EN, other, FLIGHT) == "decision"
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("The horizontal distance increases from 20.0 m to 21.4 m", None),
+        ("The horizontal distance decreases from 20.0 m to 21.4 m", "trend"),
+        ("The horizontal distance is 30.0 m", "number"),
+        ("The altitude is 20.6 m", None),
+        ("The altitude is 29.0 m", "number"),  # a slant range, not an altitude
+        ("The drone climbs steadily", "trend"),
+        ("The drone descends in altitude", None),
+        ("The drone flies at 1.02 m/s", None),
+        ("The drone flies at 5 m/s", "number"),
+        ("The bounding box is 59 x 34 px", "box"),
+        ("The yaw has turned to the right", "side"),
+        ("The yaw has turned 4.8 deg to the left", None),
+        ("The target is occluded", "visibility"),
+        ("The target is visible", None),
+        ("The drone should descend", "decision"),
+        ("The distance has grown by 1.4 m", None),
+        ("The wall is 55 years old", None),  # nothing measured
+    ],
+)
+def test_evidence_check(text, kind):
+    coc = Coc(critical_components=text + ".", reasoning_trace="Nothing more is said here.", flight_decision="ascend")
+    found = check_evidence(coc, PAPER_FACTS, CFG, "en")
+    assert [problem.partition(":")[0] for problem in found] == ([kind] if kind else [])
+
+
+# --- seeded corruption of rule-teacher captions ------------------------------------------------------------------------
+
+
+def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
+    captions = []
+    for seed in range(num_flights):
+        for variant in ("ORI", "aug_001"):
+            flight, _ = make_flight(30, seed=seed, variant=variant, width_px=640, height_px=360)
+            flight = dataclasses.replace(flight, folder=Path("nowhere"))
+            for sample in iterate_samples(flight, WindowConfig(require_images=False, stride=2)):
+                facts = measure_facts(sample.observed)
+                captions.append((facts, *write_answers(facts, np.random.default_rng([seed, len(captions)]))))
+    return captions
+
+
+SIDES = (("left", "right"), ("increases", "decreases"), ("climbs", "descends"), ("grows", "shrinks"))
+
+
+def corruptions(coc: Coc, rng: np.random.Generator) -> list[Coc]:
+    """Give the text with one side swapped and with one number changed (by a third, or its sign of change swapped)."""
+    text = coc.critical_components
+    made = []
+    for one, two in SIDES:
+        for old, new in ((one, two), (two, one)):
+            spots = [m.start() for m in re.finditer(rf"\b{old}\b", text)]
+            if spots:
+                at = int(rng.choice(spots))
+                made.append(text[:at] + new + text[at + len(old) :])
+    numbers = list(re.finditer(r"\d+(?:\.\d+)?", text))
+    number = numbers[int(rng.integers(len(numbers)))]
+    digits = len(number.group().partition(".")[2])
+    value = float(number.group())
+    made.append(f"{text[: number.start()]}{value * 1.5 + 7:.{digits}f}{text[number.end() :]}")
+    return [coc.model_copy(update={"critical_components": changed}) for changed in made]
+
+
+def test_corruptions_are_caught_and_clean_captions_raise_no_alarm():
+    captions = clean_captions(20)
+    rng = np.random.default_rng(5)
+    alarms = sum(bool(check_evidence(en, f, CFG, "en") or check_evidence(zh, f, CFG, "zh")) for f, en, zh in captions)
+    planted = [(facts, bad) for facts, en, _ in captions for bad in corruptions(en, rng)]
+    caught = sum(bool(check_evidence(bad, facts, CFG, "en")) for facts, bad in planted)
+    assert len(captions) >= 400
+    assert len(planted) >= 1000
+    assert alarms <= 0.01 * len(captions)
+    assert caught >= 0.98 * len(planted), f"{caught} of {len(planted)}"
+
+
+def test_rule_captions_are_one_record_in_two_languages():
+    captions = clean_captions(6)
+    for facts, en, zh in captions:
+        assert check_mirror(en, zh, flight_numbers(facts)) is None
+    # A digit of the Chinese text altered to a value that nothing measured is caught.
+    for facts, en, zh in captions[:40]:
+        number = re.search(r"\d+\.\d+", zh.critical_components)
+        assert number is not None
+        changed = f"{float(number.group()) + 137.77:.2f}"
+        bad = zh.model_copy(update={"critical_components": zh.critical_components.replace(number.group(), changed)})
+        assert check_mirror(en, bad, flight_numbers(facts)) == "number"
+
+
+# --- the rule teacher ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("decision", ACTIONS)
+def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
+    for facts, _, _ in clean_captions(2)[::7]:
+        english, chinese = write_answers(facts, np.random.default_rng(3), decision)
+        assert english.flight_decision == chinese.flight_decision == decision
+        assert check_evidence(english, facts, CFG, "en") == []
+        assert check_evidence(chinese, facts, CFG, "zh") == []
+        assert check_mirror(english, chinese, flight_numbers(facts)) is None
+        assert load_glossary().actions[decision]["zh"] in chinese.reasoning_trace
+
+
+def test_the_rule_teacher_decides_from_what_it_sees():
+    from caption.rules import decide
+
+    base = dataclasses.replace(PAPER_FACTS, altitude_m=(20.6,) * 5, yaw_deg=(0.0,) * 5, distance_m=(20.0,) * 5)
+    cases = {
+        "track_straight": {},
+        "search_to_reacquire_target": {"visibility": ("visible",) * 4 + ("occluded",)},
+        "yaw_left_to_follow": {"offset_x_px": (0, -40, -80, -120, -160)},
+        "yaw_right_to_follow": {"yaw_deg": (0.0, -1.0, -2.0, -3.0, -4.0)},
+        "ascend": {"altitude_m": (20.0, 20.4, 20.8, 21.2, 21.6)},
+        "descend": {"altitude_m": (20.0, 19.6, 19.2, 18.8, 18.4)},
+        "speed_up": {"distance_m": (20.0, 20.5, 21.0, 21.5, 22.0), "target_speed_mps": 2.0},
+        "slow_down": {"distance_m": (22.0, 21.5, 21.0, 20.5, 20.0), "target_speed_mps": 0.5},
+        "hover": {"speed_mps": (None, 0.1, 0.1, 0.1, 0.1), "target_speed_mps": 0.0},
+    }
+    for expected, change in cases.items():
+        assert decide(dataclasses.replace(base, **change)) == expected
+
+
+def test_wording_varies_with_the_sample_and_not_with_the_run():
+    facts = clean_captions(1)[0][0]
+    texts = {write_answers(facts, np.random.default_rng(seed))[0].critical_components for seed in range(30)}
+    assert len(texts) >= 10
+    assert write_answers(facts, np.random.default_rng(1)) == write_answers(facts, np.random.default_rng(1))

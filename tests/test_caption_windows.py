@@ -1,0 +1,248 @@
+"""Windows, facts, prompts and pictures; above all: nothing of the future reaches a request."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from teacher_server import TeacherServer
+
+from caption.facts import measure_facts
+from caption.images import FrameEncoder, depth_colors, segmentation_colors
+from caption.prompts import answer_schema, make_question, mirror_schema, question_messages, system_prompt
+from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig
+from caption.stage import run
+from caption.windows import current_frames, iterate_samples
+from cosfly.coc import ACTIONS
+from cosfly.playback import find_flights, read_flight, write_flight
+from cosfly.schema import KINDS
+from specimens import PERSON_ID, make_flight, make_playback_tree
+
+NO_IMAGES = WindowConfig(require_images=False)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 16, seed=4, with_augmented=False)
+
+
+def flight_in(root):
+    return read_flight(find_flights(root)[0], strict=False)
+
+
+@pytest.mark.parametrize(
+    ("num_points", "stride", "expected"),
+    [(9, 1, []), (10, 1, [4]), (12, 1, [4, 5, 6]), (20, 5, [4, 9, 14]), (0, 1, [])],
+)
+def test_current_frames_have_a_whole_past_and_future(num_points, stride, expected):
+    assert list(current_frames(num_points, WindowConfig(stride=stride))) == expected
+
+
+def test_samples_carry_their_frames_and_ids(tree):
+    samples = list(iterate_samples(flight_in(tree), WindowConfig(stride=2)))
+    assert [sample.observed.indices[-1] for sample in samples] == [4, 6, 8, 10]
+    assert samples[0].observed.sample_id == "trajectory_1776047127_ORI_frame_00004"
+    assert samples[1].observed.indices == (2, 3, 4, 5, 6)
+    assert samples[1].future.indices == (7, 8, 9, 10, 11)
+    assert next(folder.name for folder in samples[1].observed.frame_folders) == "frame_00002"
+
+
+def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
+    flight = flight_in(tree)
+    sample = next(iterate_samples(flight, WindowConfig()))
+    assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
+    for field in dataclasses.fields(ObservedWindow):
+        value = getattr(sample.observed, field.name)
+        if isinstance(value, np.ndarray):
+            assert len(value) == 5
+            assert value.base is None or len(value.base) == 5, f"{field.name} is a view into the flight"
+
+
+def spoil_future(root, current: int) -> None:
+    """Change every pose, target, flag and picture after a frame."""
+    folder = find_flights(root)[0]
+    flight = read_flight(folder, strict=False)
+    rng = np.random.default_rng(1)
+    later = np.arange(len(flight)) > current
+    columns = {}
+    for name in (
+        "positions_m",
+        "rotations_deg",
+        "targets_m",
+        "target_uv",
+        "target_bbox",
+        "target_depth_m",
+        "visibility",
+    ):
+        values = getattr(flight, name).copy()
+        values[later] = rng.uniform(5.0, 30.0, values[later].shape)
+        columns[name] = values
+    for name in ("target_in_view", "target_visible"):
+        values = getattr(flight, name).copy()
+        values[later] = ~values[later]
+        columns[name] = values
+    write_flight(folder, dataclasses.replace(flight, **columns))
+    for i in np.flatnonzero(later):
+        frame = flight.frame_folder(int(i))
+        h, w = flight.camera.height_px, flight.camera.width_px
+        cv2.imwrite(str(frame / "rgb.png"), rng.integers(0, 256, (h, w, 3), dtype=np.uint8))
+        cv2.imwrite(str(frame / "instance.png"), rng.integers(0, 256, (h, w, 3), dtype=np.uint8))
+        np.save(frame / "depth.npy", rng.uniform(1, 50, (h, w)).astype(np.float32))
+
+
+def free_requests(root, out, seed=0) -> list[bytes]:
+    cfg = {"limit": 1, "repair": {"verdicts": []}}
+    with TeacherServer(decision=lambda body: "hover") as server:
+        run(CaptionConfig.model_validate({"teacher": server.url, **cfg}), root, out, seed=seed)
+    return sorted(server.bodies)
+
+
+def test_changing_all_future_frames_leaves_requests_byte_identical(tree, tmp_path):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(tree, spoiled)
+    spoil_future(spoiled, current=4)
+    before, after = free_requests(tree, tmp_path / "a"), free_requests(spoiled, tmp_path / "b")
+    assert len(before) == 2  # English and Chinese
+    assert before == after
+
+
+@pytest.mark.parametrize("current", [4, 7, 9])
+@pytest.mark.parametrize("layout", ["separate", "tiled"])
+def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, tmp_path, current, layout):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(tree, spoiled)
+    spoil_future(spoiled, current)
+    cfg = ImageConfig(layout=layout)
+    found = []
+    for root in (tree, spoiled):
+        sample = next(s for s in iterate_samples(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
+        question = make_question(sample.observed, measure_facts(sample.observed), cfg)
+        messages, digests = question_messages(question, FrameEncoder(cfg))
+        found.append((question.prompts, json.dumps(messages), digests))
+    assert found[0] == found[1]
+    # The comparison can fail: a frame that is observed does reach the request.
+    changed = [
+        make_question(s.observed, measure_facts(s.observed), cfg).prompts
+        for root in (tree, spoiled)
+        for s in iterate_samples(flight_in(root), NO_IMAGES)
+        if s.observed.indices[-1] == current + 1
+    ]
+    assert changed[0] != changed[1]
+
+
+def test_facts_of_a_hand_made_window(tree):
+    window = next(iterate_samples(flight_in(tree), WindowConfig())).observed
+    x = np.arange(5.0)
+    window = dataclasses.replace(
+        window,
+        width_px=640,
+        height_px=360,
+        time_s=100.0 + 0.5 * x,
+        positions_m=np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
+        rotations_deg=np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
+        targets_m=np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
+        target_bbox=np.tile([340.0, 160.0, 360.0, 220.0], (5, 1)),
+        in_view=np.array([True, True, True, True, False]),
+        visible=np.array([True, True, True, False, False]),
+        visibility=np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
+    )
+    facts = measure_facts(window)
+    assert facts.speed_mps == (None, 2.24, 2.24, 2.24, 2.24)  # sqrt(1 + 0.25) / 0.5
+    assert facts.altitude_m == (20.0, 19.5, 19.0, 18.5, 18.0)
+    assert facts.yaw_deg == (0.0, 1.0, 2.0, 3.0, 4.0)  # across the seam at 180
+    assert facts.distance_m == (15.0,) * 5
+    assert facts.target_speed_mps == 2.0
+    assert facts.target_turn_deg == 0.0
+    assert (facts.box_width_px[-1], facts.box_height_px[-1]) == (20, 60)
+    assert (facts.offset_x_px[-1], facts.offset_y_px[-1]) == (30, 10)
+    assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
+    prompt = make_question(window, facts, ImageConfig()).prompts["en"].user
+    assert "Velocity: [0.0, 2.24, 2.24, 2.24, 2.24] m/s" in prompt
+    assert "Yaw against the first frame: [0.0, 1.0, 2.0, 3.0, 4.0] deg" in prompt
+    assert "[visible, visible, partly occluded, occluded, out of view]" in prompt
+    chinese = make_question(window, facts, ImageConfig()).prompts["zh"].user
+    assert "[可见, 可见, 部分遮挡, 被遮挡, 在视野外]" in chinese
+
+
+def test_prompts_name_the_closed_set_and_the_shape():
+    for language in ("en", "zh"):
+        text = system_prompt(language)
+        assert all(token in text for token in ACTIONS)
+        assert all(name in text for name in ("critical_components", "reasoning_trace", "flight_decision"))
+    assert answer_schema()["properties"]["flight_decision"]["enum"] == list(ACTIONS)
+    assert mirror_schema("hover")["properties"]["flight_decision"]["enum"] == ["hover"]
+
+
+def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
+    """Older public trees: bbox null, no visibility, no meta.json, RGBA pictures, no depth."""
+    root = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
+    folder = find_flights(root)[0]
+    raw = json.loads((folder / "trajectory.json").read_text())
+    del raw["augmentation"], raw["coordinates"]
+    for point in raw["points"]:
+        point["target"]["bbox_2d"] = None
+        del point["target"]["visibility"], point["perturbation"]
+    (folder / "trajectory.json").write_text(json.dumps(raw))
+    for frame in (folder / "frames_playback").iterdir():
+        (frame / "meta.json").unlink()
+        (frame / "depth.npy").unlink()
+        rgb = cv2.imread(str(frame / "rgb.png"))
+        cv2.imwrite(str(frame / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_BGR2BGRA))
+    sample = next(iterate_samples(flight_in(root), WindowConfig()))
+    facts = measure_facts(sample.observed)
+    assert facts.box_width_px == (None,) * 5
+    assert facts.offset_x_px[-1] is not None  # from image_uv
+    question = make_question(sample.observed, facts, ImageConfig())
+    assert question.modalities == ("rgb", "segmentation")
+    _, digests = question_messages(question, FrameEncoder(ImageConfig()))
+    assert len(digests) == 10
+    path = run(CaptionConfig(), root, tmp_path / "out")
+    assert len(path.read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(("layout", "num_images", "width_px"), [("separate", 15, 32), ("tiled", 5, 96)])
+def test_pictures_are_bounded_and_encoded_once_per_frame(tree, layout, num_images, width_px):
+    cfg = ImageConfig(layout=layout, max_side_px=32, encoding="png")
+    encoder = FrameEncoder(cfg)
+    for sample in list(iterate_samples(flight_in(tree), WindowConfig()))[:4]:
+        question = make_question(sample.observed, measure_facts(sample.observed), cfg)
+        messages, digests = question_messages(question, encoder)
+        assert len(digests) == num_images
+    assert encoder.num_encoded == 8  # four windows over frames 0..7
+    url = messages[1]["content"][1]["image_url"]["url"]
+    assert url.startswith("data:image/png;base64,")
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (18, width_px, 3)
+
+
+def test_depth_colors_near_is_bright_and_sky_is_dark():
+    depth = np.array([[0.5, 50.0, 99.9, 1000.0, 0.0]], dtype=np.float32)
+    brightness = depth_colors(depth, 100.0).sum(axis=2)[0]
+    assert brightness[0] > brightness[1] > brightness[2]
+    assert brightness[3] == brightness[4] <= brightness[2]
+
+
+def test_only_the_pedestrian_is_vivid():
+    kinds = np.array([[KINDS["Buildings"], KINDS["Pedestrians"], KINDS["Sky"]]], dtype=np.uint8)
+    ids = np.array([[3, PERSON_ID, 0]], dtype=np.uint16)
+    colors = segmentation_colors(kinds, ids)[0].astype(int)
+    spread = colors.max(axis=1) - colors.min(axis=1)
+    assert spread[1] > 200
+    assert max(spread[0], spread[2]) < 80
+
+
+def test_perturbation_is_taken_off_the_future_only():
+    clean, _ = make_flight(12, seed=2)
+    noisy, _ = make_flight(12, seed=2, variant="aug_001")
+    noisy = dataclasses.replace(noisy, folder=clean.folder)
+    frames = {}
+    for name, flight in (("clean", clean), ("noisy", noisy)):
+        frames[name] = next(iterate_samples(dataclasses.replace(flight, folder=Path("x")), NO_IMAGES))
+    np.testing.assert_allclose(frames["clean"].future.positions_m, frames["noisy"].future.positions_m, atol=1e-9)
+    assert not np.allclose(frames["clean"].observed.positions_m, frames["noisy"].observed.positions_m)

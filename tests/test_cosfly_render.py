@@ -1,0 +1,567 @@
+"""Stage 5 around the renderer: scene parts, ids, the person, projection, perturbation, the stage and its files, the gallery."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from test_renderers_contract import pose_towards, street
+
+from cosfly import gallery, playback
+from cosfly.config import build
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError
+from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matrices, world_from_camera
+from cosfly.kernels import obstacle_index, signed_distances
+from cosfly.playback import Camera, read_depth, read_flight, read_instance, read_meta, read_rgb
+from cosfly.render import Frame, RenderConfig, gl_backend, open_renderer, plan_flight, run
+from cosfly.render import meshes as unit_meshes
+from cosfly.render.camera import box_depths, rendered_visibility, view_target
+from cosfly.render.person import choose_clothes, pose_person, walk_of
+from cosfly.render.perturbation import Ground, PerturbationConfig, Poses, in_frame, perturb
+from cosfly.render.scene import (
+    GROUND_PLANE_HALF_M,
+    MAX_BOX_ID,
+    PERSON_ID,
+    SHARED_ID,
+    build_scene,
+    instance_ids,
+)
+from cosfly.schema import KINDS, PERSON_HALF_EXTENTS_M, DroneTrace, make_box_map, write_boxes, write_traces
+from cosfly.store import read_checksums, sha256_file
+
+CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
+ALL_MESHES = unit_meshes.all_meshes()
+SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street"}
+needs_gl = pytest.mark.skipif(gl_backend.is_missing() is not None, reason=str(gl_backend.is_missing()))
+
+
+def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
+    """A person walks along the pavement, the drone circles."""
+    t = np.arange(n) * 0.5
+    targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
+    angle = 0.15 * t - 1.0
+    drones = targets + np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), np.full(n, 6.0)], axis=1)
+    pitch, yaw = look_at(drones, targets)
+    rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
+    return DroneTrace(path_id, "hand", t, drones, rotations, targets, np.ones(n), np.ones(n), drop_reason=drop_reason)
+
+
+# --- scene ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_meshes_fit_into_the_unit_cube_and_face_outwards(number):
+    mesh = ALL_MESHES[number]
+    assert np.abs(mesh.vertices[:, :3]).max() <= 1.0 + 1e-6
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[:, 3:], axis=1), 1.0, atol=1e-4)
+    corners = mesh.vertices[mesh.triangles]
+    turn = np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]).astype(float)
+    area = np.linalg.norm(turn, axis=1)
+    outwards = (turn * corners[:, :, 3:].sum(axis=1)).sum(axis=1)
+    assert (outwards[area > 1e-4] > 0).all()
+    volume = np.einsum("ij,ij->i", corners[:, 0, :3].astype(float), turn).sum() / 6.0
+    assert volume > 0.2
+
+
+def crowded(seed: int = 0, n: int = 400):
+    rng = np.random.default_rng(seed)
+    names = [name for name in KINDS if name not in ("NONE", "Sky")]
+    kinds = [KINDS[names[i % len(names)]] for i in range(n)]
+    return make_box_map(
+        rng.uniform(-100, 100, (n, 3)), rng.uniform(0.02, 6.0, (n, 3)), np.stack([0 * rng.random(n), rng.uniform(-180, 180, n), 0 * rng.random(n)], 1), kinds
+    )  # fmt: skip
+
+
+def test_every_part_stays_inside_its_box():
+    """What the planners know of collision and visibility must stay true of the pictures."""
+    box_map = crowded()
+    scene = build_scene(box_map)
+    parts = scene.parts
+    row_of = {int(i): row for row, i in enumerate(box_map.ids)}
+    turns = rotation_matrices(np.radians(box_map.rotations_deg))
+    q = parts.records["quaternion"].astype(float)
+    checked = set()
+    for k in range(len(parts)):
+        box_id = int(parts.records["tag"][k] >> 16)
+        if box_id == 0:
+            continue  # the ground plane
+        row = row_of[box_id]
+        local = ALL_MESHES[parts.mesh[k]].vertices[:, :3] * parts.records["half"][k]
+        xyz, w = q[k, :3], q[k, 3]
+        turned = local + 2.0 * np.cross(xyz, np.cross(xyz, local) + w * local)
+        world = turned + parts.records["center"][k] + scene.origin_m
+        in_box = (world - box_map.centers[row]) @ turns[row]
+        assert (np.abs(in_box) <= box_map.half_extents[row] + 2e-3).all(), (int(box_map.kinds[row]), parts.mesh[k])
+        checked.add(row)
+    assert checked == set(range(len(box_map))), "a box is not drawn at all"
+
+
+def test_parts_carry_kind_and_id_of_their_box():
+    box_map = crowded(1, 60)
+    scene = build_scene(box_map)
+    tag = scene.parts.records["tag"]
+    kind_of = dict(zip(box_map.ids.astype(int).tolist(), box_map.kinds.tolist(), strict=True))
+    for kind, box_id in zip((tag & 0xFF).tolist(), (tag >> 16).tolist(), strict=True):
+        assert kind == kind_of.get(box_id, KINDS["Terrain"])
+
+
+def test_instance_ids_are_the_boxes_own_where_they_fit():
+    found = instance_ids(
+        make_box_map(np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3)), [3, 9, 1], [5, MAX_BOX_ID, 1])
+    )
+    assert (found.ids.tolist(), found.num_shared, found.are_box_ids) == ([5, MAX_BOX_ID, 1], 0, True)
+
+
+def test_instance_ids_never_wrap():
+    n = 66_000
+    kinds = np.full(n, KINDS["Vegetation"])
+    kinds[-3:] = KINDS["Buildings"]  # last in the file, first to get an id
+    found = instance_ids(
+        make_box_map(np.zeros((n, 3)), np.ones((n, 3)), np.zeros((n, 3)), kinds, np.arange(n) + 10**12)
+    )
+    assert found.ids[-3:].tolist() == [1, 2, 3]
+    assert not found.are_box_ids
+    assert found.num_shared == n - MAX_BOX_ID == int((found.ids == SHARED_ID).sum())
+    own = found.ids[found.ids != SHARED_ID]
+    assert len(np.unique(own)) == len(own)
+    assert PERSON_ID not in found.ids
+    assert 0 not in found.ids
+
+
+def test_an_id_of_zero_is_replaced():
+    found = instance_ids(make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 3], [0, 1]))
+    assert found.ids.tolist() == [1, 2]
+
+
+def test_ground_plane_is_below_every_slab():
+    scene = build_scene(street())
+    top = scene.parts.records["center"][-1, 2] + scene.parts.records["half"][-1, 2] + scene.origin_m[2]
+    assert scene.parts.records["half"][-1, 0] == GROUND_PLANE_HALF_M
+    assert top < -0.1
+
+
+# --- the person -------------------------------------------------------------------------------------------------------
+
+
+@given(
+    heading=st.floats(-7, 7), phase=st.floats(0, 500), swing=st.floats(0, 1), x=st.floats(-500, 500), z=st.floats(-20, 60)
+)  # fmt: skip
+@settings(max_examples=25, deadline=None)
+def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, swing, x, z):
+    hip = np.array([x, 3.0, z + 0.9])
+    body = pose_person(hip, heading, phase, swing, choose_clothes(np.random.default_rng(0)))
+    points = []
+    for k in range(len(body.mesh)):
+        local = ALL_MESHES[body.mesh[k]].vertices[:, :3] * body.records["half"][k]
+        q = body.records["quaternion"][k].astype(float)
+        points.append(local + 2.0 * np.cross(q[:3], np.cross(q[:3], local) + q[3] * local) + body.centers_m[k])
+    offset = np.vstack(points) - hip
+    assert np.abs(np.hypot(offset[:, 0], offset[:, 1])).max() < np.hypot(*PERSON_HALF_EXTENTS_M[:2])
+    assert -0.96 < offset[:, 2].min() < -0.86, "a foot stands on the ground"
+    assert 0.80 < offset[:, 2].max() < 0.93, "the head ends at 1.8 m"
+    assert ((body.records["tag"] >> 16) == PERSON_ID).all()
+    assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
+
+
+def test_walk_follows_motion_and_keeps_the_heading_when_standing():
+    targets = np.array([[0, 0, 0.9], [0, 1, 0.9], [0, 2, 0.9], [0, 2, 0.9], [0, 2, 0.9]], dtype=float)
+    walk = walk_of(targets, np.arange(5) * 0.5)
+    np.testing.assert_allclose(walk.headings_rad, np.pi / 2)
+    assert walk.swings[-1] == 0.0
+    assert (np.diff(walk.phases_rad)[:2] > 0).all()
+    assert np.diff(walk.phases_rad)[-1] == 0.0
+
+
+# --- the target in the picture ----------------------------------------------------------------------------------------
+
+
+def test_focal_length_is_the_papers_formula():
+    assert focal_px(1280, 90.0) == pytest.approx(640.0)
+    assert focal_px(1280, 110.0) == pytest.approx(448.13, abs=0.01)
+
+
+def test_target_in_the_middle_of_the_picture():
+    hip = np.array([0.0, 10.0, 0.9])
+    view = view_target(hip, pose_towards((0, 0, 0.9), hip), CAMERA)
+    np.testing.assert_allclose(view.uv, [160, 90], atol=1e-9)
+    assert view.depth_m == pytest.approx(10.0)
+    f = focal_px(320, 90.0)
+    near = 10.0 - 0.3
+    np.testing.assert_allclose(
+        view.bbox_px, [160 - f * 0.3 / near, 90 - f * 0.9 / near, 160 + f * 0.3 / near, 90 + f * 0.9 / near]
+    )
+    assert view.in_view
+
+
+def test_target_behind_and_beside_the_camera_is_not_in_view():
+    pose = pose_towards((0, 0, 2), (0, 10, 2))
+    behind = view_target(np.array([0.0, -5.0, 0.9]), pose, CAMERA)
+    assert not behind.in_view
+    assert np.isnan(behind.uv).all()
+    assert np.isnan(behind.bbox_px).all()
+    beside = view_target(np.array([30.0, 5.0, 0.9]), pose, CAMERA)
+    assert not beside.in_view
+    assert np.isnan(beside.bbox_px).all()
+
+
+def test_target_across_the_near_plane_still_has_a_finite_box():
+    view = view_target(np.array([0.2, 0.35, 2.0]), pose_towards((0, 0, 2), (0, 10, 2)), CAMERA)
+    assert view.in_view
+    assert np.isfinite(view.bbox_px).all()
+
+
+def blank_frame(depth: np.ndarray) -> Frame:
+    return Frame(
+        np.zeros((*depth.shape, 3), np.uint8),
+        depth.astype(np.float32),
+        np.zeros(depth.shape, np.uint8),
+        np.zeros(depth.shape, np.uint16),
+    )
+
+
+def test_rendered_visibility_by_hand():
+    hip = np.array([0.0, 10.0, 0.9])
+    pose = pose_towards((0, 0, 0.9), hip)
+    view = view_target(hip, pose, CAMERA)
+    free = np.full((180, 320), 500.0)
+    assert rendered_visibility(blank_frame(free), hip, view, pose, CAMERA)[0] == 1.0
+    assert rendered_visibility(blank_frame(np.full((180, 320), 5.0)), hip, view, pose, CAMERA)[0] == 0.0
+    half = free.copy()
+    half[:, :160] = 5.0
+    assert rendered_visibility(blank_frame(half), hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
+    drawn = blank_frame(half)
+    drawn.ids[90, 161:164] = PERSON_ID
+    assert rendered_visibility(drawn, hip, view, pose, CAMERA)[1] == 3
+
+
+def test_what_is_outside_the_image_counts_as_hidden():
+    hip = np.array([0.0, 10.0, 0.9])
+    aside = world_from_camera(
+        np.array([0.0, 0.0, 0.9]), np.array([0.0, 45.0, 0.0])
+    )  # the box straddles the right border
+    view = view_target(hip, aside, CAMERA)
+    score, _ = rendered_visibility(blank_frame(np.full((180, 320), 500.0)), hip, view, aside, CAMERA)
+    assert score == pytest.approx(0.5, abs=0.1)
+
+
+def test_box_depths_of_a_box_ahead():
+    pose = pose_towards((0, 0, 1), (0, 10, 1))
+    pixels = np.array([[160.0, 90.0], [5.0, 90.0]])
+    found = box_depths(pixels, np.array([0.0, 10.0, 1.0]), np.array([1.0, 2.0, 1.0]), pose, CAMERA.intrinsic)
+    assert found[0] == pytest.approx(8.0)
+    assert np.isinf(found[1])
+
+
+# --- perturbation -----------------------------------------------------------------------------------------------------
+
+
+def planned(n: int = 200) -> Poses:
+    trace = circling(n)
+    return Poses(trace.positions_m, trace.rotations_deg, trace.targets_m)
+
+
+def perturbed(cfg: PerturbationConfig, n: int = 200, box_map=None, seed: int = 0):
+    box_map = box_map or street()
+    return perturb(planned(n), CAMERA, obstacle_index(box_map), Ground(box_map), cfg, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
+def test_perturbed_frames_keep_their_promises(sampling):
+    cfg = PerturbationConfig(sampling=sampling)
+    before, after = planned(), perturbed(cfg)
+    index = obstacle_index(street())
+    moved = np.array([s["position"] == "applied" for s in after.states])
+    turned = np.array([s["rotation"] == "applied" for s in after.states])
+    assert 0.3 < moved.mean() <= 0.7
+    assert 0.5 < turned.mean() < 0.7
+    np.testing.assert_array_equal(after.is_perturbed, moved | turned)
+    distances, _ = signed_distances(index, after.poses.positions_m[moved])
+    assert distances.min() >= cfg.min_clearance_m
+    people, _ = signed_distances(index, after.poses.targets_m[moved])
+    assert people.min() >= 0.3
+    assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg + 1e-9
+    reach = (
+        np.linalg.norm(after.drone_offsets_m, axis=1)
+        if sampling == "spherical"
+        else np.abs(after.drone_offsets_m).max(axis=1)
+    )
+    assert reach.max() <= cfg.drone_radius_m + 1e-9
+    walked = np.linalg.norm(after.target_offsets_m[:, :2], axis=1)
+    assert walked.max() <= cfg.pedestrian_radius_m * (1.0 if sampling == "spherical" else 2.0**0.5) + 1e-9
+    np.testing.assert_allclose(after.poses.positions_m - before.positions_m, after.drone_offsets_m)
+    np.testing.assert_allclose(after.poses.targets_m - before.targets_m, after.target_offsets_m)
+    for i in np.flatnonzero(after.is_perturbed):
+        assert in_frame(after.poses.targets_m[i], after.poses.positions_m[i], after.poses.rotations_deg[i], CAMERA, 0.0)
+    still = ~after.is_perturbed
+    np.testing.assert_array_equal(after.poses.positions_m[still], before.positions_m[still])
+    np.testing.assert_array_equal(after.poses.rotations_deg[still], before.rotations_deg[still])
+
+
+def test_the_four_states_come_in_the_papers_shares():
+    """tab:augmentation_states: 16, 24, 24 and 36 %, before fallbacks."""
+    states = perturbed(PerturbationConfig(), 3000).states
+    drawn = np.array([[s["position"] != "none", s["rotation"] != "none"] for s in states])
+    shares = [np.mean((drawn == pattern).all(axis=1)) for pattern in ([0, 0], [1, 0], [0, 1], [1, 1])]
+    np.testing.assert_allclose(shares, [0.16, 0.24, 0.24, 0.36], atol=0.03)
+
+
+def test_probability_zero_changes_nothing():
+    after = perturbed(PerturbationConfig(position_probability=0.0, rotation_probability=0.0))
+    assert not after.is_perturbed.any()
+    np.testing.assert_array_equal(after.poses.positions_m, planned().positions_m)
+
+
+def test_a_frame_does_not_depend_on_what_happened_before():
+    """Fallbacks must not shift the random numbers of later frames."""
+    free = perturbed(PerturbationConfig(), 40)
+    strict = perturbed(PerturbationConfig(min_clearance_m=500.0), 40)
+    assert not any(s["position"] == "applied" for s in strict.states)
+    assert [s["position"] != "none" for s in free.states] == [s["position"] != "none" for s in strict.states]
+
+
+def test_a_walled_in_person_is_not_moved():
+    start = planned(1).targets_m[0]
+    cage = make_box_map(
+        start + 0.75 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]),
+        [[0.4, 4, 2], [0.4, 4, 2], [4, 0.4, 2], [4, 0.4, 2]], np.zeros((4, 3)), [KINDS["Walls"]] * 4,
+    )  # fmt: skip
+    found = [
+        perturbed(PerturbationConfig(position_probability=1.0, pedestrian_radius_m=1.0), 1, cage, seed)
+        for seed in range(30)
+    ]
+    outcomes = {f.states[0]["position"] for f in found}
+    assert "fallback: person in an obstacle" in outcomes
+    for f in found:
+        assert (
+            signed_distances(obstacle_index(cage), f.poses.targets_m)[0].min() >= 0.3
+            or f.states[0]["position"] != "applied"
+        )
+
+
+def test_ground_height_finds_the_pavement():
+    ground = Ground(street())
+    assert ground.height_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
+    assert ground.height_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
+    assert ground.height_m(500.0, 500.0, 0.4) == 0.4
+    assert ground.height_m(0.0, -9.0, 20.0) == 20.0
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        ({"fovs_deg": [0]}, "field of view"),
+        ({"fovs_deg": []}, "fovs_deg"),
+        ({"tracks": ["clean", "clean"]}, "twice"),
+        ({"town": "../x"}, "letters"),
+        ({"widht_px": 3}, "width_px"),
+        ({"perturbation": {"sampling": "square"}}, "sampling"),
+    ],
+)
+def test_bad_settings_are_named(data, word):
+    with pytest.raises(ConfigError, match=word):
+        build(RenderConfig, data, "test")
+
+
+def test_unknown_renderer():
+    with pytest.raises(ConfigError, match="unknown renderer"):
+        open_renderer("crayon", build_scene(street()), 32, 18)
+
+
+def test_missing_gl_names_the_packages(monkeypatch):
+    import moderngl
+
+    def fail(**_):
+        raise Exception("libEGL.so not loaded")
+
+    monkeypatch.setattr(moderngl, "create_context", fail)
+    with pytest.raises(EnvironmentMissing, match="libegl1 libgl1 libgl1-mesa-dri") as caught:
+        gl_backend.gl_report()
+    assert caught.value.fatal
+    assert "libEGL" in str(caught.value)
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def write_inputs(folder: Path, traces: list[DroneTrace]) -> list[Path]:
+    folder.mkdir(exist_ok=True)
+    write_boxes(folder / "boxes_3d.json", street())
+    write_boxes(folder / "step2_simplified.json", street())
+    write_traces(folder / "drone_trace.json", traces, {})
+    return [folder / name for name in ("boxes_3d.json", "step2_simplified.json", "drone_trace.json")]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("render")
+    traces = [circling(5), circling(5, "path_001", "not_visible"), circling(4, "path_002")]
+    inputs = write_inputs(folder / "in", traces)
+    return run(build(RenderConfig, SMALL, "test"), *inputs, folder / "out", seed=5), inputs
+
+
+def files_of(tree: Path) -> dict[str, str]:
+    return {str(p.relative_to(tree)): sha256_file(p) for p in sorted((tree / "Street").rglob("*")) if p.is_file()}
+
+
+@needs_gl
+def test_the_tree_is_complete_and_readable(finished):
+    tree, _ = finished
+    folders = playback.find_flights(tree)
+    names = [str(f.relative_to(tree)) for f in folders]
+    assert names == [f"Street/trajectory_{1776000000 + k}/{v}" for k in (0, 2) for v in ("ORI", "aug_001")]
+    for folder in folders:
+        flight = read_flight(folder)  # strict
+        assert not flight.missing_frames()
+        assert flight.is_original == (folder.name == "ORI")
+        checksums = read_checksums(folder)
+        on_disk = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()} - {"checksums.sha256"}
+        assert set(checksums) == on_disk
+        assert all(sha256_file(folder / name) == digest for name, digest in checksums.items())
+    manifest = json.loads((tree / "manifest.json").read_text())
+    assert manifest["counts"] == {"input": 4, "kept": 4, "dropped": {}, "failed": {}}
+    assert (manifest["num_traces"], manifest["num_traces_not_rendered"], manifest["num_frames"]) == (3, 1, 18)
+
+
+@needs_gl
+def test_frames_hold_what_their_annotation_says(finished):
+    tree, _ = finished
+    for folder in playback.find_flights(tree):
+        flight = read_flight(folder)
+        for i in range(len(flight)):
+            frame = flight.frame_folder(i)
+            kinds, ids = read_instance(frame)
+            depth, meta = read_depth(frame), read_meta(frame)
+            assert read_rgb(frame).shape == (90, 160, 3)
+            assert depth.shape == kinds.shape == (90, 160)
+            assert (meta["index"], meta["variant"]) == (i, folder.name)
+            assert meta["target"]["num_pixels"] == int((ids == PERSON_ID).sum()) > 0
+            assert meta["target"]["visible"] == bool(flight.target_visible[i])
+            assert meta["target"]["visibility"] == pytest.approx(flight.visibility[i], abs=1e-6)
+            assert meta["drone_pose"]["y"] == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
+            assert meta["camera"]["intrinsic"] == flight.camera.intrinsic.tolist()
+            u, v = flight.target_uv[i]
+            x0, y0, x1, y1 = flight.target_bbox[i]
+            assert x0 <= u <= x1
+            assert y0 <= v <= y1
+            columns = np.nonzero(ids == PERSON_ID)[1]
+            assert columns.min() >= x0 - 2
+            assert columns.max() <= x1 + 2
+            assert np.abs(np.median(depth[ids == PERSON_ID]) - flight.target_depth_m[i]) < 0.5
+
+
+@needs_gl
+def test_both_tracks_share_camera_and_clothes_and_the_report_adds_up(finished):
+    tree, _ = finished
+    for trajectory in sorted((tree / "Street").glob("trajectory_*")):
+        clean, shaken = read_flight(trajectory / "ORI"), read_flight(trajectory / "aug_001")
+        assert clean.camera.fov_deg == pytest.approx(shaken.camera.fov_deg)
+        np.testing.assert_array_equal(clean.time_s, shaken.time_s)
+        assert not clean.is_perturbed.any()
+        np.testing.assert_allclose(shaken.positions_m - shaken.drone_offsets_m, clean.positions_m, atol=1e-9)
+        report = json.loads((trajectory / "aug_001/perturbation_report.json").read_text())
+        assert sum(report["position"].values()) == sum(report["rotation"].values()) == len(shaken)
+        assert report["num_perturbed"] == int(shaken.is_perturbed.sum())
+
+
+@needs_gl
+def test_two_workers_give_the_same_files(finished, tmp_path):
+    tree, inputs = finished
+    again = run(build(RenderConfig, SMALL, "test"), *inputs, tmp_path / "out", seed=5, workers=2)
+    assert files_of(again) == files_of(tree)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from cosfly.config import build
+from cosfly.render import RenderConfig, run
+inputs = [Path(p) for p in sys.argv[1:4]]
+if __name__ == "__main__":
+    run(build(RenderConfig, {config!r}, "test"), *inputs, Path(sys.argv[4]), seed=5)
+"""
+
+
+@needs_gl
+def test_kill_and_resume_gives_the_same_files(finished, tmp_path):
+    tree, inputs = finished
+    script = tmp_path / "stage.py"
+    script.write_text(textwrap.dedent(KILLED.format(config=SMALL)))
+    out = tmp_path / "out"
+    process = subprocess.Popen([sys.executable, str(script), *map(str, inputs), str(out)])
+    first, deadline_s = out / "Street/trajectory_1776000000/ORI", time.monotonic() + 60
+    while not first.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert first.exists()
+    assert not (out / "manifest.json").exists(), "the kill came too late to show anything"
+    run(build(RenderConfig, SMALL, "test"), *inputs, out, seed=5)
+    assert files_of(out) == files_of(tree)
+    assert not list(out.rglob(".*.partial"))
+
+
+@needs_gl
+def test_other_settings_do_not_continue_a_finished_tree(finished):
+    tree, inputs = finished
+    with pytest.raises(ResumeError, match="seed was 5"):
+        run(build(RenderConfig, SMALL, "test"), *inputs, tree, seed=6)
+    assert run(build(RenderConfig, SMALL, "test"), *inputs, tree, seed=5) == tree
+
+
+def test_no_flight_to_draw(tmp_path):
+    inputs = write_inputs(tmp_path, [circling(3, drop_reason="not_smooth")])
+    with pytest.raises(InputError, match="no flight to draw"):
+        run(RenderConfig(), *inputs, tmp_path / "out")
+
+
+def test_plans_depend_on_the_seed_only():
+    cfg = RenderConfig(width_px=160, height_px=90)
+    fovs = {plan_flight(circling(3), 0, "clean", "T", street(), cfg, seed).camera.fov_deg for seed in range(30)}
+    assert {round(fov) for fov in fovs} == {110, 90, 60, 30}
+    a, b = (plan_flight(circling(9), 0, "perturbed", "T", street(), cfg, 3) for _ in range(2))
+    np.testing.assert_array_equal(a.poses.positions_m, b.poses.positions_m)
+    fixed = plan_flight(circling(3), 4, "clean", "T", street(), RenderConfig(fovs_deg=(60.0,)), 1)
+    assert fixed.camera.fov_deg == pytest.approx(60.0)
+    assert fixed.trajectory == "trajectory_1776000004"
+
+
+# --- gallery ----------------------------------------------------------------------------------------------------------
+
+
+@needs_gl
+def test_gallery(finished, tmp_path):
+    tree, _ = finished
+    gallery.contact_sheet(tree, tmp_path / "sheet.png")
+    gallery.preview_gif(tree, tmp_path / "preview.gif")
+    assert (tmp_path / "sheet.png").stat().st_size < gallery.SHEET_BYTES
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.width == 6 * 320
+        assert sheet.height > 4 * 180
+    with Image.open(tmp_path / "preview.gif") as animation:
+        assert animation.width == 480
+        assert animation.n_frames == 5
+
+
+def test_gallery_of_nothing(tmp_path):
+    with pytest.raises(InputError, match="not a playback tree"):
+        gallery.contact_sheet(tmp_path, tmp_path / "sheet.png")
+
+
+def test_depth_colors_mark_sky_and_invalid():
+    colors = gallery.depth_colors(np.array([[1000.0, 0.0, 3.0, 150.0]], np.float32))
+    assert (colors[0, :2] == 0).all()
+    assert colors[0, 2].sum() > colors[0, 3].sum() > 0

@@ -1,0 +1,167 @@
+"""The whole way on a tiny town: every stage, one and two workers, kill -9 in the middle of every stage."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from cosfly import pipeline
+from cosfly.coc import read_captions
+from cosfly.config import load
+from cosfly.errors import ResumeError
+from cosfly.pipeline import RunConfig
+from cosfly.playback import find_flights, read_flight
+from cosfly.store import read_json
+
+TINY = [
+    "pedestrians.num_paths=2",
+    "render.width_px=160",
+    "render.height_px=90",
+    "render.fovs_deg=[60]",
+    "caption.window.stride=8",
+    "workers=1",
+]
+STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
+
+
+def tiny(**changes) -> RunConfig:
+    return load(RunConfig, None, [*TINY, *(f"{key}={value}" for key, value in changes.items())])
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """One undisturbed run; tests copy what they need of it."""
+    out = tmp_path_factory.mktemp("base") / "run"
+    pipeline.run(tiny(), out)
+    return out
+
+
+def products(folder: Path) -> dict[str, str]:
+    """Product -> sha256 of a complete stage. Frames stand for themselves by their flight's checksum file."""
+    return {entry["path"]: entry["sha256"] for entry in read_json(folder / "manifest.json")["outputs"]}
+
+
+def begin(base: Path, out: Path, stage: str) -> Path:
+    """Copy the stages before `stage`."""
+    for name in STAGES[: STAGES.index(stage)]:
+        shutil.copytree(base / name, out / name)
+    return out
+
+
+def work(cfg: RunConfig, out: Path, stage: str) -> None:
+    next(s for s in pipeline.stages(cfg, out) if s.name == stage).work()
+
+
+def test_every_stage_is_complete_and_adds_up(base):
+    for stage in STAGES:
+        manifest = read_json(base / stage / "manifest.json")
+        counts = manifest["counts"]
+        assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == counts["input"], (
+            stage
+        )
+        assert products(base / stage), stage
+    assert read_json(base / "summary.json")["peak_memory_mb"] > 10
+    for picture in ("contact_sheet.png", "preview.gif"):
+        assert (base / picture).stat().st_size > 10_000
+
+
+def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):
+    flights = [read_flight(folder) for folder in find_flights(base / "render")]
+    assert sorted(flight.variant for flight in flights) == ["ORI", "ORI", "aug_001", "aug_001"]
+    assert all(flight.missing_frames() == [] for flight in flights)
+    captions = list(read_captions(base / "caption/captions.jsonl"))
+    accepted = [c for c in captions if c.status == "accepted"]
+    assert len(accepted) > 10
+    assert all(c.en and c.zh and c.en.flight_decision == c.zh.flight_decision for c in accepted)
+    assert [c.sample_id for c in captions] == sorted(c.sample_id for c in captions)
+
+
+def test_running_again_changes_nothing(base):
+    before = {
+        p: p.stat().st_mtime_ns for p in base.rglob("*") if p.is_file() and p.name not in ("run.yaml", "summary.json")
+    }
+    results = pipeline.run(tiny(), base)
+    assert all(result.was_complete for result in results)
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+
+
+def test_other_settings_are_refused_by_name(base, tmp_path):
+    out = begin(base, tmp_path / "run", "plan")
+    with pytest.raises(ResumeError, match=r"num_paths was 2, is 5"):
+        pipeline.run(tiny(**{"pedestrians.num_paths": 5}), out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["pedestrians", "plan", "render", "inspect", "caption", "release"])
+def test_two_workers_give_the_same_products(base, tmp_path, stage):
+    out = begin(base, tmp_path / "run", stage)
+    work(tiny(workers=2), out, stage)
+    assert products(out / stage) == products(base / stage)
+
+
+# Kills the process at the n-th time that a file or a line is made safe after the stage was opened.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import test_pipeline_tiny as tiny
+from cosfly.store import StageFolder
+
+left = {countdown}
+def deadly(function):
+    def wrapped(*args, **kwargs):
+        global left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*args, **kwargs)
+    return wrapped
+
+opened = StageFolder.open.__func__
+def open_then_arm(cls, *args, **kwargs):
+    stage = opened(cls, *args, **kwargs)
+    os.replace, os.fsync = deadly(os.replace), deadly(os.fsync)
+    return stage
+StageFolder.open = classmethod(open_then_arm)
+tiny.work(tiny.tiny(), Path({out!r}), {stage!r})
+print("SURVIVED")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("countdown", [1, 4])
+@pytest.mark.parametrize("stage", STAGES)
+def test_kill_in_the_middle_and_resume(base, tmp_path, stage, countdown):
+    """The products of a killed and resumed stage are those of an undisturbed one, byte for byte.
+
+    Frames too: the renderer gives the same bytes in every process of one machine.
+    """
+    out = begin(base, tmp_path / "run", stage)
+    program = KILLED.format(tests=str(Path(__file__).parent), countdown=countdown, out=str(out), stage=stage)
+    killed = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
+    assert not (out / stage / "manifest.json").exists()
+    work(tiny(), out, stage)
+    assert products(out / stage) == products(base / stage)
+    assert not list(out.rglob("*.partial"))
+
+
+@pytest.mark.slow
+def test_a_half_written_tree_is_a_counted_failure(base, tmp_path):
+    """A flight whose frames were damaged is named; the others are inspected."""
+    out = begin(base, tmp_path / "run", "inspect")
+    flight = find_flights(out / "render")[0]
+    (flight / "frames_playback/frame_00003/depth.npy").write_bytes(b"half")
+    work(tiny(), out, "inspect")
+    text = json.dumps(read_json(out / "inspect/inspect.json")) + (out / "inspect/failures.jsonl").read_text()
+    assert "frame_00003" in text
+    counts = read_json(out / "inspect/manifest.json")["counts"]
+    assert counts["input"] == 4
+    assert counts["kept"] == 3
