@@ -36,7 +36,7 @@ $(VENV)/bin/python:
 	missing=""
 	$$python -c 'import ensurepip, venv' 2>/dev/null || missing="python3-venv"
 	libraries=$$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p)
-	dri=$$(ls -d /usr/lib/*/dri /usr/lib/dri /usr/lib64/dri 2>/dev/null | head -n 1)
+	dri=$$(find /usr/lib /usr/lib64 -maxdepth 2 -name dri 2>/dev/null | head -n 1 || true)
 	if ! grep -q 'libEGL\.so\.1' <<<"$$libraries" || ! grep -q 'libGL\.so\.1' <<<"$$libraries" || [ -z "$$dri" ]; then
 	  missing="$$missing $(GL_PACKAGES)"; fi
 	if [ -n "$$missing" ]; then
