@@ -31,6 +31,8 @@ FRAME_FILES = ("rgb.png", "depth.npy", "instance.png", "meta.json")
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
 
+XYZ, ANGLES, BBOX = ("x", "y", "z"), ("pitch", "yaw", "roll"), ("xmin", "ymin", "xmax", "ymax")
+
 COORDINATES = {
     "frame": "carla",
     "handedness": "left",
@@ -172,48 +174,17 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     if not isinstance(raw, dict):
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
     reader = _Reader(path, strict)
-    reader.equal("schema", raw.get("schema"), SCHEMA)
-    reader.equal("schema_version", raw.get("schema_version"), SCHEMA_VERSION)
-    points = raw.get("points", None if strict else raw.get("waypoints"))
-    if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
-        raise InputError("no points", where=f"{path}: points", got=type(points).__name__, expected="a list of objects")
     trajectory, variant = folder.resolve().parent.name, folder.resolve().name
-    if raw.get("trace_dir") not in (trajectory, variant):
-        reader.issue("trace_dir", raw.get("trace_dir"), f"{trajectory!r}, the folder's name")
-    for i, point in enumerate(points):
-        reader.equal(f"points[{i}].index", point.get("index"), i)
-    n = len(points)
-    time_s = np.array([reader.time(i, point) for i, point in enumerate(points)])
-    steps = np.diff(time_s)
-    if (steps <= 0).any():
-        where = f"{path}: points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-        raise InputError(
-            "time does not increase", where=where, got=str(float(steps.min())), expected="strictly increasing times"
-        )
-    if n > 1 and np.abs(steps - DT_S).max() > 1e-3:
-        reader.issue(
-            "points[].timing.trace_timestamp",
-            f"steps of {steps.min():.3f} to {steps.max():.3f} s",
-            f"steps of {DT_S} s",
-        )
-    poses = np.array(
-        [
-            [
-                reader.number(f"points[{i}].drone_pose", p.get("drone_pose"), k)
-                for k in ("x", "y", "z", "pitch", "yaw", "roll")
-            ]
-            for i, p in enumerate(points)
-        ]
-    )
-    positions = mirror_positions(poses[:, :3])
-    reader.waypoints(points, poses[:, :3])
+    reader.header(raw, (trajectory, variant))
+    points = reader.points(raw)
+    time_s, poses = reader.times(points), reader.poses(points)
     targets = [_object(p, "target") for p in points]
     if not all(targets):
         reader.issue("points[].target", "missing", "an object")
     offsets = [_object(p, "perturbation") for p in points]
-    augmentation = raw.get("augmentation") if isinstance(raw.get("augmentation"), dict) else {}
-    is_original = (
-        augmentation.get("is_original", variant == "ORI") if isinstance(augmentation, dict) else variant == "ORI"
+    drone, turn, walker = (
+        np.nan_to_num(_vectors(offsets, name, axes))  # a missing perturbation is none
+        for name, axes in (("drone_position", XYZ), ("drone_rotation", ANGLES), ("target_position", XYZ))
     )
     return Flight(
         town=folder.resolve().parent.parent.name,
@@ -221,23 +192,21 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         variant=variant,
         camera=reader.camera(raw.get("camera")),
         time_s=time_s,
-        positions_m=positions,
+        positions_m=mirror_positions(poses[:, :3]),
         rotations_deg=mirror_rotations(poses[:, 3:]),
-        targets_m=mirror_positions(_vectors(targets, "world_location", ("x", "y", "z"))),
+        targets_m=mirror_positions(_vectors(targets, "world_location", XYZ)),
         target_in_view=_flags(targets, "in_view", default_key="visible"),
         target_visible=_flags(targets, "visible"),
-        target_depth_m=_vectors([{"v": [t.get("depth")]} for t in targets], "v", ("v",))[:, 0],
+        target_depth_m=_numbers(targets, "depth"),
         target_uv=_vectors(targets, "image_uv", ("u", "v")),
-        target_bbox=_vectors(targets, "bbox_2d", ("xmin", "ymin", "xmax", "ymax")),
-        visibility=_vectors([{"v": [t.get("visibility")]} for t in targets], "v", ("v",))[:, 0],
+        target_bbox=_vectors(targets, "bbox_2d", BBOX),
+        visibility=_numbers(targets, "visibility"),
         is_perturbed=np.array([bool(p.get("is_perturbed", False)) for p in points]),
-        drone_offsets_m=mirror_positions(np.nan_to_num(_vectors(offsets, "drone_position", ("x", "y", "z")))),
-        rotation_offsets_deg=mirror_rotations(
-            np.nan_to_num(_vectors(offsets, "drone_rotation", ("pitch", "yaw", "roll")))
-        ),
-        target_offsets_m=mirror_positions(np.nan_to_num(_vectors(offsets, "target_position", ("x", "y", "z")))),
+        drone_offsets_m=mirror_positions(drone),
+        rotation_offsets_deg=mirror_rotations(turn),
+        target_offsets_m=mirror_positions(walker),
         source=_object(raw, "source"),
-        is_original=bool(is_original),
+        is_original=bool(_object(raw, "augmentation").get("is_original", variant == "ORI")),
         folder=folder,
         raw=raw,
         issues=tuple(reader.issues),
@@ -260,6 +229,45 @@ class _Reader:
     def equal(self, where: str, got: object, expected: object) -> None:
         if got != expected:
             self.issue(where, repr(got), repr(expected))
+
+    def header(self, raw: dict, names: tuple[str, str]) -> None:
+        self.equal("schema", raw.get("schema"), SCHEMA)
+        self.equal("schema_version", raw.get("schema_version"), SCHEMA_VERSION)
+        if raw.get("trace_dir") not in names:
+            self.issue("trace_dir", raw.get("trace_dir"), f"{names[0]!r}, the folder's name")
+
+    def points(self, raw: dict) -> list[dict]:
+        points = raw.get("points", None if self.strict else raw.get("waypoints"))
+        if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
+            raise InputError(
+                "no points", where=f"{self.path}: points", got=type(points).__name__, expected="a list of objects"
+            )
+        for i, point in enumerate(points):
+            self.equal(f"points[{i}].index", point.get("index"), i)
+        return points
+
+    def times(self, points: list[dict]) -> np.ndarray:
+        """Times of the points, (n,) s; they must increase."""
+        time_s = np.array([self.time(i, point) for i, point in enumerate(points)])
+        steps = np.diff(time_s)
+        if (steps <= 0).any():
+            where = f"{self.path}: points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
+            raise InputError(
+                "time does not increase", where=where, got=str(float(steps.min())), expected="strictly increasing times"
+            )
+        if len(steps) and np.abs(steps - DT_S).max() > 1e-3:
+            got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
+            self.issue("points[].timing.trace_timestamp", got, f"steps of {DT_S} s")
+        return time_s
+
+    def poses(self, points: list[dict]) -> np.ndarray:
+        """Poses as the file holds them, (n, 6): x, y, z, pitch, yaw, roll in CARLA's axes."""
+        poses = [
+            [self.number(f"points[{i}].drone_pose", point.get("drone_pose"), name) for name in XYZ + ANGLES]
+            for i, point in enumerate(points)
+        ]
+        self.waypoints(points, np.array(poses)[:, :3])
+        return np.array(poses)
 
     def number(self, where: str, group: Any, name: str) -> float:
         value = group.get(name) if isinstance(group, dict) else None
@@ -288,7 +296,7 @@ class _Reader:
                 if found is not None:
                     self.issue(where, repr(found)[:60], "null at the last point")
                 return
-            vector = _vector(found, ("x", "y", "z"))
+            vector = _vector(found, XYZ)
             if np.isnan(vector).any() or np.abs(vector - positions[i + 1]).max() > WAYPOINT_TOLERANCE_M:
                 self.issue(where, repr(found)[:60], f"the next point's position {positions[i + 1].tolist()}")
                 return  # one note is enough
@@ -326,6 +334,11 @@ def _vector(value: Any, names: tuple[str, ...]) -> np.ndarray:
 
 def _vectors(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
     return np.array([_vector(group.get(key), names) for group in groups]).reshape(-1, len(names))
+
+
+def _numbers(groups: list[dict], key: str) -> np.ndarray:
+    """Read one number of each group, (n,); anything else, nulls included, is NaN."""
+    return np.array([_vector([group.get(key)], (key,))[0] for group in groups])
 
 
 def _flags(groups: list[dict], key: str, default_key: str | None = None) -> np.ndarray:
@@ -397,8 +410,8 @@ def write_flight(folder: Path, flight: Flight) -> None:
 
 
 _VECTOR_NAMES = {
-    "world_location": ("x", "y", "z"), "image_uv": None, "bbox_2d": ("xmin", "ymin", "xmax", "ymax"),
-    "drone_position": ("x", "y", "z"), "drone_rotation": ("pitch", "yaw", "roll"), "target_position": ("x", "y", "z"),
+    "world_location": XYZ, "image_uv": None, "bbox_2d": BBOX,
+    "drone_position": XYZ, "drone_rotation": ANGLES, "target_position": XYZ,
 }  # fmt: skip
 
 
