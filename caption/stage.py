@@ -102,7 +102,9 @@ def _named_flights(data: Path) -> list[tuple[str, Path]]:
     for folder in find_flights(data):
         name = f"{folder.resolve().parent.name}_{folder.resolve().name}"
         if name in named:
-            raise InputError("two flights of one name", where=data, got=f"{named[name]} and {folder}")
+            raise InputError(
+                "two flights of one name", where=data, got=f"{named[name]} and {folder}", fix="give the tree of one run"
+            )
         named[name] = folder
     return sorted(named.items(), key=lambda pair: f"{pair[0]}_frame_")  # the order of their sample ids
 

@@ -236,7 +236,7 @@ class EndpointTeacher:
             if wanted:
                 return wanted  # some hosts list no models; the first request will tell
             what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=f"HTTP {response.status_code}", fix="check the URL, or set endpoint.model")
+            raise self._error(what, got=f"HTTP {response.status_code}", fix="check the URL, or give --model")
         if wanted is None and len(names) == 1:
             return names[0]
         if wanted in names:
@@ -246,7 +246,7 @@ class EndpointTeacher:
             "the endpoint does not have this model" if wanted else "the endpoint has several models",
             got=wanted or f"{len(names)} models",
             expected=f"one of {listed}",
-            fix="set endpoint.model (--model)",
+            fix="give --model",
         )
 
     def _stop_if_fatal(self, response: httpx.Response) -> None:

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosfly import __version__
-from cosfly.errors import CosflyError, InputError
+from cosfly.errors import ConfigError, CosflyError, InputError, nearest
 
 if TYPE_CHECKING:
     from cosfly.pipeline import RunConfig, StageResult
+
+INTERRUPTED = 130  # the exit code of Ctrl-C: Typer makes it of a KeyboardInterrupt, without a word
 
 app = typer.Typer(
     help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
@@ -71,8 +73,10 @@ def main() -> None:
         app()
     except CosflyError as error:
         _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted; finished work is kept: run the same command again to continue", 130)
+    except SystemExit as end:
+        if end.code != INTERRUPTED:
+            raise
+        _fail("interrupted; finished work is kept: run the same command again to continue", INTERRUPTED)
 
 
 def _fail(message: str, status: int) -> None:
@@ -100,6 +104,11 @@ def _config_path(config: Path | None) -> Path | None:
         packaged = shipped(f"{config}.yaml")
         if packaged.exists():
             return packaged
+        names = sorted(path.stem for path in packaged.parent.glob("*.yaml") if path.stem != "glossary")
+        raise ConfigError(
+            f"no such configuration{nearest(str(config), names)}", where=config,
+            expected=f"a YAML file, or one that ships: {', '.join(names)}",
+        )  # fmt: skip
     return config
 
 
@@ -107,6 +116,17 @@ def _spread(cfg: RunConfig) -> int:
     from cosfly.pipeline import num_workers
 
     return num_workers(cfg.workers)
+
+
+def _made(product: Path, out: Path) -> None:
+    """Name a stage's product. That nothing was kept is an error: whoever calls the next stage must not go on."""
+    from cosfly.store import read_json
+
+    typer.echo(product)
+    counts = read_json(out / "manifest.json")["counts"]
+    if counts["kept"] == 0:
+        got = {word: counts[word] for word in ("dropped", "failed") if counts[word]}
+        raise InputError("nothing was kept", where=out, got=str(got), fix="see the records in that folder")
 
 
 def _data(data: Path | None) -> Path:
@@ -242,7 +262,7 @@ def plan(
 
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    typer.echo(cosfly.planners.run(cfg.plan, map_, paths, out, seed=cfg.seed, **spread))
+    _made(cosfly.planners.run(cfg.plan, map_, paths, out, seed=cfg.seed, **spread), out)
 
 
 # --- stages 5-7 -------------------------------------------------------------------------------------------------------
@@ -265,7 +285,7 @@ def render(
 
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    typer.echo(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **spread))
+    _made(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **spread), out)
 
 
 @app.command()
@@ -277,7 +297,6 @@ def gallery(
     from cosfly.gallery import contact_sheet, preview_gif
 
     tree = _data(data)
-    out.mkdir(parents=True, exist_ok=True)
     contact_sheet(tree, out / "contact_sheet.png")
     preview_gif(tree, out / "preview.gif")
     typer.echo(out)
@@ -298,7 +317,7 @@ def inspect(
 
     cfg = _settings(config, overrides, None, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    typer.echo(cosfly.qc.run(cfg.inspect, traces, _data(data), out, **spread))
+    _made(cosfly.qc.run(cfg.inspect, traces, _data(data), out, **spread), out)
 
 
 caption_app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
@@ -333,7 +352,7 @@ def caption(
     tree = _data(data)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
     target = out or tree.resolve().parent / "caption"
-    typer.echo(caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, **spread))
+    _made(caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, **spread), target)
 
 
 # --- release ----------------------------------------------------------------------------------------------------------
@@ -506,16 +525,17 @@ def doctor(
     out: Annotated[Path, typer.Option(help="Where runs will be written.")] = Path("runs"),
 ) -> None:
     """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
+    from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from cosfly import doctor as examination
-    from cosfly.console import console
 
     checks = examination.examine(out, teacher)
     table = Table(show_header=False, box=None)
     for check in checks:
         color = {"ok": "green", "missing": "red", "optional": "yellow"}[check.state]
-        table.add_row(check.name, f"[{color}]{check.state}[/]", check.detail)
-    console.print(table)
+        table.add_row(check.name, f"[{color}]{check.state}[/]", escape(check.detail))
+    Console().print(table)
     if any(check.state == "missing" for check in checks):
         raise typer.Exit(1)

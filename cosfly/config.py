@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cosfly.errors import ConfigError, nearest
 
+MOST_LISTED = 15  # names of settings in a message
+
 
 class Config(BaseModel):
     """Base of every stage's settings: frozen, and an unknown key is an error."""
@@ -22,6 +24,17 @@ class Config(BaseModel):
 C = TypeVar("C", bound=BaseModel)
 
 
+class _Loader(yaml.SafeLoader):
+    """The safe loader; a key that is given twice is an error, because only the last would count."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        keys = [key.value for key, _ in node.value]
+        twice = next((key for key, _ in node.value if keys.count(key.value) > 1 and key.value != "<<"), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice.value!r} is given twice", twice.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path) -> dict:
     """Read a YAML mapping with the safe loader.
 
@@ -29,7 +42,7 @@ def read_yaml(path: Path) -> dict:
         ConfigError: it is missing, not YAML, or not a mapping.
     """
     try:
-        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+        value = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ConfigError(
             "cannot read the configuration", where=path, got=error.strerror, fix="check the path"
@@ -50,9 +63,12 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     data = _copy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
-        if not equals or not key:
+        if not equals or not all(key.split(".")):
             raise ConfigError(
-                "not an assignment", where="--set", got=override, expected="key=value, for instance plan.seed=3"
+                "not an assignment",
+                where="--set",
+                got=override,
+                expected="key=value, for instance pedestrians.num_paths=3",
             )
         try:
             value = yaml.safe_load(text)
@@ -89,17 +105,21 @@ def build(model: type[C], data: dict, source: str | Path) -> C:
 
 def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:
     """Defaults, then the file, then the overrides."""
+    overrides = list(overrides)
     data = apply_overrides(read_yaml(path) if path else {}, overrides)
-    return build(model, data, path or "--set")
+    return build(model, data, " with ".join([*([str(path)] if path else []), *(["--set"] if overrides else [])]))
 
 
 def _problem(model: type[BaseModel], detail: Any) -> str:
     field = ".".join(str(part) for part in detail["loc"]) or "settings"
     if detail["type"] == "extra_forbidden":
         *parents, last = detail["loc"]
-        return f"{field}: unknown setting{nearest(str(last), _known(model, parents))}"
+        known = _known(model, parents)
+        hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
+        return f"{field}: unknown setting{hint}"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
-    return f"{field}: {detail['msg']}{got}"
+    what = "not a group of settings" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
+    return f"{field}: {what}{got}"
 
 
 def _known(model: Any, parents: Iterable[Any]) -> list[str]:

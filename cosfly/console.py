@@ -17,10 +17,22 @@ log = logging.getLogger(__name__)
 SECONDS_BETWEEN_LINES = 10.0  # progress as log lines where there is no terminal
 
 
+class _Lines(logging.Handler):
+    """Writes a record as one line, however long; in a pipe there is no width to wrap it to."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        console.print(self.format(record), soft_wrap=True, markup=False, highlight=False)
+
+
 def set_up_logging(verbose: bool) -> None:
-    """Send log lines to the shared console. Called by the command line only."""
-    handler = RichHandler(console=console, show_path=False, show_time=False, markup=False, rich_tracebacks=False)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    """Send log lines to the shared console; in a pipe or a file one record is one line. Called by the command line only."""
+    handler: logging.Handler
+    if console.is_terminal:
+        handler = RichHandler(console=console, show_path=False, show_time=False, markup=False, rich_tracebacks=False)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = _Lines()
+        handler.setFormatter(logging.Formatter("%(levelname)-8s %(message)s"))
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], force=True)
     for noisy in ("httpx", "httpcore", "numba", "PIL", "asyncio", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)

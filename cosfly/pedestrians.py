@@ -250,7 +250,7 @@ def run(
             "not one walk could be made",
             where=out / "failures.jsonl",
             got=f"{finished.tally}; first: {finished.records[0]['message']}",
-            fix="change what the first failure names, and choose another --out",
+            fix="change what the first failure names and run again",
         )
     paths = [PedestrianPath.from_json(result["path"], f"{out}: items.jsonl") for result in results]
     for result in results:

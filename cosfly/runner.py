@@ -7,10 +7,12 @@ item. Load maps and open GL contexts in the factory. The same signature fits an 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import logging.handlers
 import multiprocessing
+import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -102,7 +104,8 @@ def run_items(
                 records[record["id"]] = record
                 journal.append(record)
                 if record["status"] == "failed":
-                    log.error("%s: %s: %s", stage.stage, record["id"], record["message"])
+                    named = "" if record["id"] in record["message"] else f"{record['id']}: "
+                    log.error("%s: %s%s", stage.stage, named, record["message"])
                 advance(1)
     ordered = [records[item_id] for item_id in ids]
     tally = _tally(stage, ordered)
@@ -170,7 +173,8 @@ def _pooled(
             try:
                 while waiting or running:
                     while waiting and len(running) < 2 * workers:  # a short queue keeps every worker fed
-                        running[pool.submit(_attempt_in_worker, waiting[-1])] = waiting[-1]
+                        with _no_interrupt():  # a worker that starts here inherits the mask
+                            running[pool.submit(_attempt_in_worker, waiting[-1])] = waiting[-1]
                         waiting.pop()
                     done, _ = wait(running, return_when=FIRST_COMPLETED)
                     for future in done:
@@ -180,10 +184,24 @@ def _pooled(
             except BrokenProcessPool:
                 suspects.extend(running.values())
                 log.warning("a worker process died; its items get one more try")
+            except KeyboardInterrupt:
+                for process in multiprocessing.active_children():
+                    process.terminate()  # what they had in hand is done again by the next run
+                raise
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
     finally:
         listener.stop()
+
+
+@contextlib.contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Hold back Ctrl-C: it would hit a starting worker in the middle of an import, which prints a traceback."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 _work: Work | None = None  # this worker process's function
@@ -192,6 +210,8 @@ _start_error: CosflyError | None = None
 
 def _start_worker(factory: Callable, factory_args: tuple, logs: Any, level: int) -> None:
     global _work, _start_error
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker at once; only the main process speaks of it
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     root = logging.getLogger()
     root.handlers = [logging.handlers.QueueHandler(logs)]
     root.setLevel(level)

@@ -129,12 +129,12 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     Raises:
         InputError: NaN, a negative extent, an unknown kind or a repeated id; names the box and the field.
     """
-    for name in ("centers", "half_extents", "rotations_deg"):
+    for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
         bad = np.flatnonzero(~np.isfinite(getattr(box_map, name)).all(axis=1))
         if len(bad):
             row = int(bad[0])
             raise InputError(
-                "a box is not finite", where=f"{where}: box {box_map.ids[row]}: {name}",
+                "a box is not finite", where=f"{where}: box {box_map.ids[row]}: {field_name}",
                 got=str(getattr(box_map, name)[row].tolist()), expected="finite numbers",
             )  # fmt: skip
     bad = np.flatnonzero((box_map.half_extents < 0).any(axis=1))
@@ -235,9 +235,9 @@ def read_boxes(path: Path) -> BoxMap:
 def _vectors(records: list[dict], name: str, path: Path) -> np.ndarray:
     """Read one three-vector field of all records, (n, 3)."""
     try:
-        values = np.array([record[name] for record in records], dtype=np.float64)
-        if values.shape == (len(records), 3):
-            return values
+        values = np.array([record[name] for record in records])
+        if values.shape == (len(records), 3) and values.dtype.kind in "fiu":  # not numbers in quotes, not null
+            return values.astype(np.float64)
     except (KeyError, TypeError, ValueError):
         pass
     for i, record in enumerate(records):  # slow, only to name the culprit
@@ -293,9 +293,9 @@ def read_roi(path: Path) -> Roi:
         roi = Roi.model_validate(value)
     except ValidationError as error:
         detail = error.errors()[0]
-        raise InputError(
-            detail["msg"], where=f"{path}: {'.'.join(map(str, detail['loc']))}", got=repr(detail["input"])[:80]
-        ) from None
+        place = ".".join(map(str, detail["loc"])) or "top level"
+        what = "not an object" if detail["type"] == "model_type" else detail["msg"]
+        raise InputError(what, where=f"{path}: {place}", got=repr(detail["input"])[:80]) from None
     if not roi.closed:
         raise InputError(
             "the polygon is not closed",

@@ -125,13 +125,6 @@ def _concatenate(one: BoxMap, other: BoxMap) -> BoxMap:
     return replace(one, **joined)
 
 
-def _boxes_between(mins: np.ndarray, maxs: np.ndarray, kinds: np.ndarray, ids: np.ndarray, header: dict) -> BoxMap:
-    """Unturned boxes from their corners, (n, 3) each."""
-    return BoxMap(
-        (mins + maxs) / 2, (maxs - mins) / 2, np.zeros_like(mins), kinds.astype(np.uint8), ids.astype(np.uint64), header
-    )
-
-
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
     gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.model_dump().items() if gap is not None}
     return {

@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 import logging
+import math
 import os
 import shutil
 import threading
@@ -27,6 +28,10 @@ log = logging.getLogger(__name__)
 
 Resume = Literal["never", "if-same", "force"]
 
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
+NO_SUCH_PLACE = frozenset({errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG})
+
 STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
 
 
@@ -35,26 +40,22 @@ STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn a full or read-only disk into a StorageError that names the file."""
+    """Turn a full, read-only or otherwise unusable disk into a StorageError that names the file."""
     try:
         yield
     except OSError as error:
-        if error.errno in (
-            errno.ENOSPC,
-            errno.EDQUOT,
-            errno.EROFS,
-            errno.EACCES,
-            errno.EPERM,
-            errno.ENOTDIR,
-            errno.EIO,
-        ):
-            raise StorageError(
-                "cannot write",
-                where=path,
-                got=error.strerror,
-                fix="free some space or choose another --out, then run the same command again: finished work is kept",
-            ) from error
-        raise
+        if error.errno in DISK_FULL:
+            fix = "free some space or choose another --out, then run the same command again: finished work is kept"
+        elif error.errno in NOT_WRITABLE or (error.errno in NO_SUCH_PLACE and _concerns(error, path)):
+            fix = "choose another --out, or mend the folder and run the same command again: finished work is kept"
+        else:
+            raise
+        raise StorageError("cannot write", where=path, got=error.strerror, fix=fix) from error
+
+
+def _concerns(error: OSError, path: Path) -> bool:
+    """Tell whether an error is about the file that is being written or a folder above it, not about something read."""
+    return error.filename is not None and path.absolute().is_relative_to(Path(os.fsdecode(error.filename)).absolute())
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -83,8 +84,29 @@ def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
     write_bytes(path, (dump_json(value, indent=indent) + "\n").encode())
 
 
+class _NotFinite(ValueError):
+    """NaN or Infinity stands in JSON text."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__(f"{word} is not a number that a file may hold")
+        self.word = word
+
+
 def _no_constants(text: str) -> float:
-    raise ValueError(f"{text} is not a number that a file may hold")
+    raise _NotFinite(text)
+
+
+def _place_of_constant(value: Any) -> str | None:
+    """Name the first field that holds NaN or infinity, as in `.boxes[3].center[0]`; None where there is none."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else ""
+    if not isinstance(value, dict | list):
+        return None
+    for key, member in value.items() if isinstance(value, dict) else enumerate(value):
+        place = _place_of_constant(member)
+        if place is not None:
+            return (f".{key}" if isinstance(value, dict) else f"[{key}]") + place
+    return None
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -102,6 +124,14 @@ def read_json(path: Path, *, what: str = "file") -> Any:
         return parse_json(path.read_bytes())
     except OSError as error:
         raise InputError(f"cannot read the {what}", where=path, got=error.strerror, fix="check the path") from None
+    except _NotFinite as error:
+        with contextlib.suppress(ValueError):  # broken farther on: then the place stays unknown
+            place = _place_of_constant(json.loads(path.read_bytes()))
+            raise InputError(
+                f"the {what} holds a number that is not finite", where=f"{path}: {(place or '').lstrip('.')}", got=error.word,
+                expected="a finite number",
+            ) from None  # fmt: skip
+        raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
 
@@ -208,8 +238,9 @@ class Journal:
 
     def close(self) -> None:
         if self._file is not None:
-            self._file.close()
-            self._file = None
+            file, self._file = self._file, None
+            with contextlib.suppress(OSError):  # a line that did not fit stays in the buffer; `append` has told of it
+                file.close()
 
     def __enter__(self) -> Journal:
         return self
@@ -316,29 +347,12 @@ class StageFolder:
         stage_file, manifest_file = out / "stage.json", out / "manifest.json"
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
-        if stage_file.exists():
-            found = check_schema(read_json(stage_file), STAGE_SCHEMA, VERSION, stage_file)
-            if resume == "never":
-                raise ResumeError(
-                    "the folder already holds work", where=out, fix="choose another --out, or --resume if-same"
-                )
-            differences = _differences(found, record)
-            if differences and resume == "if-same":
-                raise ResumeError(
-                    "the folder holds work made with other settings or inputs",
-                    where=out,
-                    got="; ".join(differences),
-                    fix="choose another --out, restore the setting, or --resume force to keep the finished items all the same",
-                )
-            if differences:
-                record["resumed_with_other"] = [*found.get("resumed_with_other", []), *differences]
-                manifest_file.unlink(missing_ok=True)
-            elif "resumed_with_other" in found:
-                record["resumed_with_other"] = found["resumed_with_other"]
-            if found.get("code_version") != record["code_version"]:
-                log.warning(
-                    "%s: continued by version %s, begun by %s", out, record["code_version"], found.get("code_version")
-                )
+        if stage_file.exists() and not _holds_work(out):
+            # An attempt that ended before anything was finished binds nobody to its settings.
+            for name in ("stage.json", "items.jsonl", "failures.jsonl"):
+                (out / name).unlink(missing_ok=True)
+        elif stage_file.exists():
+            _continue(out, record, resume)
         elif out.is_dir() and any(out.iterdir()):
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
@@ -385,6 +399,40 @@ class StageFolder:
         return check_schema(
             read_json(self.path / "manifest.json"), MANIFEST_SCHEMA, VERSION, self.path / "manifest.json"
         )
+
+
+def _continue(out: Path, record: dict, resume: Resume) -> None:
+    """See whether the work that stands in a folder may be continued as `record` says, and note in it what differs."""
+    found = check_schema(read_json(out / "stage.json"), STAGE_SCHEMA, VERSION, out / "stage.json")
+    if resume == "never":
+        raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
+    differences = _differences(found, record)
+    if differences and resume == "if-same":
+        raise ResumeError(
+            "the folder holds work made with other settings or inputs",
+            where=out,
+            got="; ".join(differences),
+            fix="choose another --out, restore the setting, or --resume force to keep the finished items all the same",
+        )
+    if differences:
+        record["resumed_with_other"] = [*found.get("resumed_with_other", []), *differences]
+        (out / "manifest.json").unlink(missing_ok=True)
+    elif "resumed_with_other" in found:
+        record["resumed_with_other"] = found["resumed_with_other"]
+    if found.get("code_version") != record["code_version"]:
+        log.warning("%s: continued by version %s, begun by %s", out, record["code_version"], found.get("code_version"))
+
+
+def _holds_work(out: Path) -> bool:
+    """Tell whether a stage folder holds anything that was finished, and not only the records of failures."""
+    if any(record["status"] != "failed" for record in Journal(out / "items.jsonl").read()):
+        return True
+    records = {out / name for name in ("stage.json", "items.jsonl", "failures.jsonl")}
+    return any(
+        path not in records
+        for path in out.rglob("*")
+        if path.is_file() and not any(part.endswith(".partial") for part in path.relative_to(out).parts)
+    )
 
 
 def _differences(found: dict, wanted: dict) -> list[str]:

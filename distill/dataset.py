@@ -123,7 +123,7 @@ def assign_splits(groups: Iterable[str], cfg: PrepareConfig, seed: int) -> dict[
                 f"too few {cfg.split_by} groups with accepted captions to split without a leak",
                 got=str(len(ranked)),
                 expected=f"{len(wanted)} or more, one for each of {', '.join(wanted)}",
-                fix="caption more flights, set a fraction to 0, or set too_few=fill",
+                fix="caption more flights, set a fraction to 0, or --set distill.prepare.too_few=fill",
             )
         return dict(zip(ranked, wanted, strict=False))
     num_test = max(1, round(cfg.test_fraction * len(ranked))) if cfg.test_fraction else 0

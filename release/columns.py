@@ -62,6 +62,7 @@ SCALARS: dict[str, str | tuple[str, ...]] = {
     **dict.fromkeys(CAPTION_FIELDS, "string"),
 }
 WINDOW = "caption_window"
+PNG_END = b"IEND\xaeB`\x82"  # the last chunk and its checksum
 
 CONTRACT: dict[str, Any] = {
     "handedness": "right",
@@ -164,7 +165,7 @@ def row(
     values.update(caption.facts if caption else dict.fromkeys(CAPTION_FACTS))
     for modality in modalities:
         column, name = FILES[modality]
-        data = _read(flight.frame_folder(i) / name)
+        data = _read(flight.frame_folder(i) / name, modality, flight.camera.width_px * flight.camera.height_px)
         values[column] = data if modality == "depth" else {"bytes": data, "path": f"{values['sample_id']}_{name}"}
     return values
 
@@ -182,10 +183,15 @@ def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path, modality: Modality, num_pixels: int) -> bytes:
+    """Read a frame's file and see that its end is there; `release verify` decodes all of it."""
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(
             "cannot read a frame's file", where=path, got=error.strerror, fix="run cosfly inspect again"
         ) from None
+    is_whole = len(data) > 4 * num_pixels if modality == "depth" else PNG_END in data[-256:]
+    if not is_whole:
+        raise InputError("a frame's file is cut short", where=path, got=f"{len(data)} bytes", fix="render it again")
+    return data

@@ -119,10 +119,14 @@ def write_part(path: Path, folder: Path, captions: dict[int, ReleasedCaption], c
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open_writer(partial, schema) as writer:
-            for rows in _batches((columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected), cfg):
-                writer.write_table(pa.Table.from_pylist(rows, schema=schema), row_group_size=len(rows))
-        os.replace(partial, path)
+        try:
+            with open_writer(partial, schema) as writer:
+                for rows in _batches((columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected), cfg):
+                    writer.write_table(pa.Table.from_pylist(rows, schema=schema), row_group_size=len(rows))
+            os.replace(partial, path)
+        except BaseException:
+            partial.unlink(missing_ok=True)  # on a full disk it would hold the space that is needed
+            raise
     num_captions = sum(i in captions for i in selected)
     return {
         "frames": len(selected),

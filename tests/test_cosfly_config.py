@@ -74,3 +74,22 @@ def test_a_missing_file(tmp_path):
 
 def test_shipped_files_are_found():
     assert shipped("__init__.py").exists()
+
+
+def test_a_key_given_twice_is_an_error(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("plan: {altitude_m: 30}\nseed: 3\nplan: {}\n")
+    with pytest.raises(ConfigError, match="'plan' is given twice"):
+        load(Outer, file)
+
+
+def test_a_wrong_override_is_not_laid_at_the_files_door(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("seed: 3\n")
+    with pytest.raises(ConfigError, match=r"c\.yaml with --set: plan: not a group of settings, got 3"):
+        load(Outer, file, ["plan=3"])
+
+
+def test_where_no_name_is_near_the_known_ones_are_listed():
+    with pytest.raises(ConfigError, match=r"plan\.xyz: unknown setting \(there are altitude_m\)"):
+        load(Outer, None, ["plan.xyz=3"])

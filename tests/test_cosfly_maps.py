@@ -117,6 +117,13 @@ def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWor
     return SimWorldConfig(world=folder / "world.json")
 
 
+def test_a_world_without_a_size_table_says_which_setting_names_one(tmp_path: Path):
+    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
+    (tmp_path / "Bbox.json").unlink()
+    with pytest.raises(InputError, match=r"Bbox\.json: there is no asset size table.*maps\.simworld\.sizes"):
+        simworld(cfg)
+
+
 def simworld(cfg: SimWorldConfig) -> BoxMap:
     return load_map(MapsConfig(source="simworld", simworld=cfg))
 

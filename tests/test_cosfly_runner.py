@@ -149,3 +149,52 @@ def test_kill_and_resume(tmp_path):
     finished = run_items(_stage(tmp_path / "s"), items, make_slow_worker)
     assert [r["result"]["value"] for r in finished.records] == list(range(60))
     assert sum(1 for _ in journal.read()) == 60  # nothing was done twice
+
+
+STUCK = """
+import sys, time
+from pathlib import Path
+from cosfly import cli
+from cosfly.runner import Item, run_items
+from cosfly.store import StageFolder
+
+def slow(folder):
+    def work(item):
+        (Path(folder) / item.item_id).touch()
+        time.sleep(60)
+    return work
+
+if __name__ == "__main__":
+    @cli.app.command()
+    def wait(folder: Path) -> None:
+        '''Wait.'''
+        stage = StageFolder.open(folder / "out", "demo", config={}, inputs={}, seed=0)
+        run_items(stage, [Item("a"), Item("b"), Item("c")], slow, (str(folder),), workers=2)
+    sys.argv = ["cosfly", "wait", sys.argv[1]]
+    cli.main()
+"""
+
+
+@pytest.mark.parametrize("started", [False, True], ids=["while workers start", "while they work"])
+def test_ctrl_c_ends_workers_at_once_and_without_tracebacks(tmp_path, started):
+    (tmp_path / "stuck.py").write_text(STUCK)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "stuck.py"), str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    deadline_s = time.monotonic() + 30
+    while not ((tmp_path / "a") if started else (tmp_path / "out/stage.json")).exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
+    text, _ = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert text.splitlines() == ["error: interrupted; finished work is kept: run the same command again to continue"]
+
+
+def test_an_item_is_named_once_in_the_log(tmp_path, caplog):
+    run_items(_stage(tmp_path / "s"), _items(("fail", "x"), ("bug", "y")), make_worker, (tmp_path / "log",))
+    assert "demo: i0: broken" in caplog.text
+    assert "demo: i1: KeyError" in caplog.text

@@ -59,6 +59,8 @@ def test_the_papers_bare_list_loads(tmp_path):
     [
         (lambda v: v["boxes"][1].update(extent=[1, -2, 1]), r"box 2: extent.*-2"),
         (lambda v: v["boxes"][1].update(center=[1, "x", 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].update(center=[1, "2", 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].update(center=[1, None, 1]), r"boxes\[1\].center"),
         (lambda v: v["boxes"][1].pop("rotation"), r"boxes\[1\].rotation"),
         (lambda v: v["boxes"][1].update(type="Building"), r"boxes\[1\].type.*did you mean 'Buildings'"),
         (lambda v: v["boxes"][1].update(id=-1), r"boxes\[1\].id"),
@@ -85,11 +87,11 @@ def test_nan_in_a_map(tmp_path):
     path = tmp_path / "boxes_3d.json"
     write_boxes(path, some_boxes())
     path.write_text(path.read_text().replace('"center":[', '"center":[NaN,', 1))
-    with pytest.raises(InputError, match="NaN"):
+    with pytest.raises(InputError, match=r"boxes_3d\.json: boxes\[0\]\.center\[0\]: .*got NaN"):
         read_boxes(path)
     boxes = some_boxes()
     boxes.centers[2, 1] = np.inf
-    with pytest.raises(InputError, match="box 3: centers"):
+    with pytest.raises(InputError, match="box 3: center:"):
         write_boxes(tmp_path / "x.json", boxes)
 
 
@@ -109,7 +111,7 @@ def test_roi_forms(tmp_path):
         ({"closed": True, "points_world": []}, "no polygon"),
         ({"closed": True, "points_world": [[0, 0], [1, 0]]}, "not a ring"),
         ({"closed": True, "points_world": [[0, 0], [1, 0], ["a", 1]]}, "points_world.2.0"),
-        ([], "roi"),
+        ([], "top level: not an object"),
     ],
 )
 def test_bad_rois(tmp_path, value, words):

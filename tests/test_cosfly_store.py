@@ -2,6 +2,7 @@
 
 import errno
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -112,7 +113,7 @@ def test_stage_life(tmp_path):
     ],
 )
 def test_other_settings_are_named(tmp_path, changes, words):
-    _open(tmp_path / "out")
+    _open(tmp_path / "out").journal.append({"id": "a", "status": "kept"})
     with pytest.raises(ResumeError, match=words):
         _open(tmp_path / "out", **changes)
     forced = _open(tmp_path / "out", **changes, resume="force")
@@ -124,10 +125,45 @@ def test_other_settings_are_named(tmp_path, changes, words):
 def test_a_changed_input_is_named(tmp_path):
     source = tmp_path / "in.json"
     write_json(source, 1)
-    _open(tmp_path / "out", inputs={"map": source})
+    _open(tmp_path / "out", inputs={"map": source}).journal.append({"id": "a", "status": "kept"})
     write_json(source, 2)
     with pytest.raises(ResumeError, match="the input map"):
         _open(tmp_path / "out", inputs={"map": source})
+
+
+def test_an_attempt_without_finished_work_binds_nobody(tmp_path):
+    stage = _open(tmp_path / "out")
+    stage.journal.append({"id": "a", "status": "failed", "code": "input", "message": "x"})
+    (stage.path / "failures.jsonl").write_text("{}")
+    (stage.path / "Town").mkdir()
+    again = _open(tmp_path / "out", config={"a": {"b": 2}})
+    assert "resumed_with_other" not in read_json(again.path / "stage.json")
+    assert list(again.journal.read()) == []
+    (again.path / "product.json").write_text("{}")
+    with pytest.raises(ResumeError, match=r"a\.b was 2, is 3"):
+        _open(tmp_path / "out", config={"a": {"b": 3}})
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_under_a_journal_is_one_error():
+    with pytest.raises(StorageError, match="No space left"), Journal(Path("/dev/full")) as journal:
+        journal.append({"id": "a"})
+
+
+def test_a_missing_input_is_not_taken_for_a_full_disk(tmp_path):
+    with pytest.raises(FileNotFoundError), store.storage_errors(tmp_path / "out"):
+        (tmp_path / "input").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [('{"a": [1, {"b": NaN}]}', "x.json: a[1].b:"), ("[1, -Infinity]", "x.json: [1]:"), ("[NaN, ", "x.json: the")],
+)
+def test_a_number_that_is_not_finite_is_placed(tmp_path, text, place):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_json(tmp_path / "x.json")
+    assert place in str(caught.value)
 
 
 def test_foreign_files_are_not_touched(tmp_path):

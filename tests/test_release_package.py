@@ -314,15 +314,21 @@ def test_kill_and_resume_gives_the_same_bytes(inputs, built, tmp_path):
     assert all_bytes(build(inputs, tmp_path / "killed")) == all_bytes(built)
 
 
-def test_a_flight_that_cannot_be_read_is_counted_and_the_others_go_on(inputs, tmp_path):
+@pytest.mark.parametrize(("name", "left"), [("depth.npy", None), ("depth.npy", 300), ("rgb.png", 500)])
+def test_a_flight_that_cannot_be_read_is_counted_and_the_others_go_on(inputs, tmp_path, name, left):
     copy = shutil.copytree(inputs, tmp_path / "inputs")
     first = find_flights(copy / "tree")[0]
-    (first / "frames_playback" / "frame_00000" / "depth.npy").unlink()
+    damaged = first / "frames_playback" / "frame_00000" / name
+    data = damaged.read_bytes()
+    damaged.unlink()
+    if left is not None:  # cut short
+        assert left < len(data)
+        damaged.write_bytes(data[:left])
     folder = build(copy, tmp_path / "r")
     record = read_json(folder / "release.json")
     assert record["history"]["flights"]["left_out"]["failed: input"] == 1
     assert record["numbers"]["flights"] == 3
-    assert "depth.npy" in (tmp_path / "r" / "failures.jsonl").read_text()
+    assert name in (tmp_path / "r" / "failures.jsonl").read_text()
     assert verify(folder).is_ok
 
 

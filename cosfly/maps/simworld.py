@@ -92,6 +92,12 @@ class SimWorldConfig(Config):
             raise ConfigError(
                 "no file is given", where="maps.simworld.world", expected="a path", fix="--set maps.simworld.world=..."
             )
+        for number, path in enumerate(self.size_tables()):
+            if not path.is_file():
+                raise InputError(
+                    "there is no asset size table", where=path, expected="SimWorld's Bbox.json",
+                    fix=f"--set maps.simworld.sizes=[...] (now {'beside the world' if not self.sizes else f'entry {number}'})",
+                )  # fmt: skip
         return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(self.size_tables())}}
 
     def size_tables(self) -> list[Path]:

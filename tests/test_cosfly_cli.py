@@ -1,0 +1,95 @@
+"""The command line: what a person reads when something is wrong, and the exit codes."""
+
+import logging
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cosfly import cli, doctor
+from cosfly.doctor import Check
+from cosfly.store import write_json
+
+
+@pytest.fixture(autouse=True)
+def _own_log():
+    root = logging.getLogger()
+    before = root.handlers[:], root.level
+    yield
+    root.handlers[:], root.level = before
+
+
+def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
+    """Run a command in this process; gives its exit code and its last line on the error stream."""
+    monkeypatch.setattr(sys, "argv", ["cosfly", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    lines = capfd.readouterr().err.splitlines()
+    return int(end.value.code or 0), lines[-1] if lines else ""
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (("config", "check", "quikstart"), ("quikstart", "did you mean 'quickstart'", "simworld")),
+        (("config", "check", "quickstart", "--set", "a..b=1"), ("--set", "a..b=1", "key=value")),
+        (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
+        (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
+        (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
+    ],
+)
+def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, parts):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").write_text("a file")
+    status, line = answer(capfd, monkeypatch, *words)
+    assert status == 1
+    assert line.startswith("error: ")
+    for part in parts:
+        assert part in line
+
+
+def test_a_stage_that_kept_nothing_is_an_error(capfd, tmp_path):
+    write_json(tmp_path / "manifest.json", {"counts": {"kept": 0, "dropped": {"short": 4}, "failed": {}}})
+    with pytest.raises(cli.InputError, match=r"nothing was kept; got .*short.: 4"):
+        cli._made(tmp_path / "product", tmp_path)
+    write_json(tmp_path / "manifest.json", {"counts": {"kept": 1, "dropped": {"short": 3}, "failed": {}}})
+    cli._made(tmp_path / "product", tmp_path)
+
+
+def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
+    monkeypatch.setattr(doctor, "examine", lambda *given: [Check("x", "optional", 'pip install "cosfly[vllm]"')])
+    monkeypatch.setattr(sys, "argv", ["cosfly", "doctor"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "cosfly[vllm]" in capfd.readouterr().out
+
+
+STAND_IN = """
+import sys, time
+from cosfly import cli
+@cli.app.command()
+def wait() -> None:
+    '''Wait.'''
+    print("ready", flush=True)
+    time.sleep(30)
+sys.argv = ["cosfly", "wait"]
+cli.main()
+"""
+
+
+def test_ctrl_c_is_one_line():
+    process = subprocess.Popen(
+        [sys.executable, "-c", STAND_IN],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, text = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert text.startswith("error: interrupted")
+    assert text.count("\n") == 1
