@@ -246,11 +246,16 @@ def pedestrians(
     typer.echo(cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **spread))
 
 
-@app.command()
+plan_app = typer.Typer(invoke_without_command=True, help="Step 4: drone flights.")
+app.add_typer(plan_app, name="plan")
+
+
+@plan_app.callback()
 def plan(
-    map_: MapOption,
-    paths: Annotated[Path, typer.Option(help="Walks: path.json.")],
-    out: OutOption,
+    context: typer.Context,
+    map_: Annotated[Path | None, typer.Option("--map", help="Boxes: step2_simplified.json. [required]")] = None,
+    paths: Annotated[Path | None, typer.Option(help="Walks: path.json. [required]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder. [required]")] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
     seed: Seed = None,
@@ -258,11 +263,61 @@ def plan(
     resume: ResumeOption = ResumeMode.if_same,
 ) -> None:
     """Step 4: a drone flight for every walk, drone_trace.json."""
+    if context.invoked_subcommand is not None:
+        return
     import cosfly.planners
+
+    box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
+    cfg = _settings(config, overrides, seed, workers)
+    spread: Any = {"workers": _spread(cfg), "resume": resume.value}
+    _made(cosfly.planners.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **spread), folder)
+
+
+def _needed(name: str, value: Path | None) -> Path:
+    """An option that a stage needs but its subcommands do not: a usage error, exit 2, where it is missing."""
+    if value is None:
+        raise typer.BadParameter("it must be given", param_hint=f"'{name}'")
+    return value
+
+
+@plan_app.command("compare")
+def plan_compare(
+    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
+    paths: Annotated[Path, typer.Argument(metavar="PATHS", help="Walks: path.json.")],
+    out: OutOption,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Both planners on the same walks: a table, compare.json, the flights, and pictures."""
+    import cosfly.planners.compare
 
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    _made(cosfly.planners.run(cfg.plan, map_, paths, out, seed=cfg.seed, **spread), out)
+    product = cosfly.planners.compare.run(cfg.plan, map_, paths, out, seed=cfg.seed, **spread)
+    _compare_tables(cosfly.planners.compare.table_rows(product))
+    typer.echo(product)
+
+
+def _compare_tables(tables: dict[str, list[list[str]]]) -> None:
+    from rich.table import Table
+
+    from cosfly.console import console
+
+    planners = ("TA* + Smooth", "MuCO")
+    for name, title, columns in (
+        ("figures", "Means over the walks that both fly", ("figure", *planners, "difference", "%")),
+        ("axes", "Axis scores, higher is better", ("axis", *planners)),
+        ("wins", "TA* + Smooth against MuCO, walk by walk", ("criterion", "count", "rate")),
+    ):
+        table = Table(title=title, title_justify="left")
+        for k, column in enumerate(columns):
+            table.add_column(column, justify="right" if k else "left")
+        for row in tables[name]:
+            table.add_row(*row)
+        console.print(table)
 
 
 # --- stages 5-7 -------------------------------------------------------------------------------------------------------

@@ -287,10 +287,10 @@ def free_rays(index, boxes, num_boxes, x, y, z, target):
 
 
 @njit(cache=True)
-def window_rays(index, boxes, num_boxes, x, y, z, step_m, target, free):
+def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
     """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
 
-    The same tests as seven calls of `free_rays`, but each box sees each of the twelve ends of the rays once.
+    From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve ends of the rays once.
     """
     blocked = np.zeros((7, 5), dtype=np.bool_)
     ends, feet = np.empty((7, 3)), np.empty((5, 3))
@@ -299,7 +299,7 @@ def window_rays(index, boxes, num_boxes, x, y, z, step_m, target, free):
         for place in range(7):
             shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2
             ends[place, 0], ends[place, 1], ends[place, 2] = _in_box_frame(
-                index.rows,
+                rows,
                 box,
                 x + (shift if place > 0 and axis == 0 else 0.0),
                 y + (shift if place > 0 and axis == 1 else 0.0),
@@ -307,11 +307,11 @@ def window_rays(index, boxes, num_boxes, x, y, z, step_m, target, free):
             )
         for ray in range(5):
             feet[ray, 0], feet[ray, 1], feet[ray, 2] = _in_box_frame(
-                index.rows,
+                rows,
                 box,
-                target[0] + RAY_OFFSETS_M[ray, 0],
-                target[1] + RAY_OFFSETS_M[ray, 1],
-                target[2] + RAY_OFFSETS_M[ray, 2],
+                tx + RAY_OFFSETS_M[ray, 0],
+                ty + RAY_OFFSETS_M[ray, 1],
+                tz + RAY_OFFSETS_M[ray, 2],
             )
         for place in range(7):
             for ray in range(5):
@@ -320,7 +320,9 @@ def window_rays(index, boxes, num_boxes, x, y, z, step_m, target, free):
                 enter, leave = 0.0, 1.0
                 for axis in range(3):
                     foot = feet[ray, axis]
-                    enter, leave = _clip(foot, ends[place, axis] - foot, index.rows[box, 3 + axis], enter, leave)
+                    enter, leave = _clip(foot, ends[place, axis] - foot, rows[box, 3 + axis], enter, leave)
+                    if enter > leave:
+                        break
                 blocked[place, ray] = enter <= leave
     for place in range(7):
         free[place] = 1.0 - blocked[place].sum() / 5.0

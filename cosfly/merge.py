@@ -25,7 +25,9 @@ class MergeRule(NamedTuple):
     min_fill: float
 
 
-def merge(box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | None = None) -> BoxMap:
+def merge(
+    box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | None = None, *, by_center: bool = False
+) -> BoxMap:
     """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; what is alone keeps its rotation.
 
     A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than `min_fill` of the enclosing footprint is
@@ -34,7 +36,8 @@ def merge(box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | Non
     Args:
         rules: kind -> rule; other kinds stay.
         groups: (n,) bool, vegetation of different groups is no neighbour; None: one group.
-    Source: sec:step2, "Merging adjacent boxes"; the guard is ours.
+        by_center: neighbours are boxes whose centres, not faces, lie within the gap on every axis.
+    Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
     mins, maxs = box_map.mins, box_map.maxs
     labels, min_fill = np.arange(len(box_map)), np.zeros(len(box_map))
@@ -44,7 +47,8 @@ def merge(box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | Non
         split = groups if groups is not None and kind == VEGETATION else np.zeros(len(box_map), dtype=bool)
         for group in np.unique(split[of_kind]):
             rows = np.flatnonzero(of_kind & (split == group))
-            labels[rows] = rows[clusters(mins[rows], maxs[rows], rule.gap_m)]
+            lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
+            labels[rows] = rows[clusters(lows[rows], highs[rows], rule.gap_m)]
     labels = _halve_sparse(box_map, mins, maxs, labels, min_fill)
     order = np.lexsort((box_map.ids, labels))
     if len(order) == 0:

@@ -5,7 +5,10 @@ Two rules of the paper lose more than they should on real maps, so each has a gu
 so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`, `min_canopy_fill`; 0 is the
 paper's rule).
 *crop_tree* keeps the full footprint below the cut, so that nobody walks below a tree, although that is what the cut is for:
-`trunk: stem` leaves stems instead (`trunk: full` is the paper's rule).
+`trunk: stem` leaves stems instead (`trunk: full` is the paper's rule). The report holds the walkable area of both.
+
+The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants are settings: `merge_by: center`,
+`crop_strategy: adaptive`, `below_ground: clip`, `nested_tolerance_m: 1e-6`.
 """
 
 from __future__ import annotations
@@ -51,6 +54,10 @@ class SimplifyConfig(Config):
     """The four passes of Step 2."""
 
     merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
+    merge_by: Literal["gap", "center"] = Field(
+        "gap",
+        description="neighbours: boxes with gaps below merge_gap_m on every axis, or with centres so near (SimWorld)",
+    )
     merge_gap_m: MergeGaps = Field(default_factory=MergeGaps, description="neighbourhood by kind")
     min_fill: float = Field(
         0.85,
@@ -65,13 +72,22 @@ class SimplifyConfig(Config):
         description="the same for vegetation, whose round crowns never fill a box; 0: the paper's rule",
     )
     crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
+    crop_strategy: Literal["fixed", "adaptive"] = Field(
+        "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
+    )
     cut_height_m: float = Field(2.0, gt=0.0, description="height over the ground of the split, m")
     lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
     trunk: Literal["stem", "full"] = Field(
         "stem", description="below the cut: stems, or the full footprint as in the paper"
     )
     stem_radius_m: float = Field(0.25, gt=0.0, description="half width of a stem, m")
+    split_z_m: float = Field(5.0, gt=0.0, description="adaptive: height over the ground of the lowest cut, m")
+    adaptive_height_m: float = Field(5.0, gt=0.0, description="adaptive: vegetation higher than this is cut, m")
+    cell_size_m: float = Field(0.5, gt=0.0, description="adaptive: width of what stands below the lowest cut, m")
     crop_below_ground: bool = Field(True, description="drop boxes, surfaces apart, whose top lies below the ground")
+    below_ground: Literal["drop", "clip"] = Field(
+        "drop", description="clip: also cut off what a box has below the ground (SimWorld); drop: leave boxes whole"
+    )
     ground_z_m: float = Field(0.0, description="height of the ground, m")
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
@@ -95,17 +111,18 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
     its own, stems and trunks get the smallest numbers that the input does not use.
     """
     passes = [("input", box_map.counts())]
-    feet = _feet(box_map, cfg) if cfg.crop_tree and cfg.trunk == "stem" else None
+    feet = _feet(box_map, cfg) if _has_stems(cfg) else None
     used_ids = box_map.ids
     result = box_map
     if cfg.merge:
-        result = merge(result, _merge_rules(cfg), _merge_groups(box_map, cfg))
+        result = merge(result, _merge_rules(cfg), _merge_groups(box_map, cfg), by_center=cfg.merge_by == "center")
         passes.append(("merge", result.counts()))
     if cfg.crop_tree:
-        result = crop_tree(result, cfg, used_ids, feet)
+        fixed = cfg.crop_strategy == "fixed"
+        result = crop_tree(result, cfg, used_ids, feet) if fixed else crop_tree_adaptive(result, cfg, used_ids)
         passes.append(("crop_tree", result.counts()))
     if cfg.crop_below_ground:
-        result = crop_below_ground(result, cfg.ground_z_m)
+        result = crop_below_ground(result, cfg.ground_z_m, clip=cfg.below_ground == "clip")
         passes.append(("crop_below_ground", result.counts()))
     if cfg.prune_nested:
         result = prune_nested(result, cfg.nested_tolerance_m)
@@ -134,8 +151,13 @@ def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     """Groups that never merge with each other, (n,). With stems, bushes and hedges must not vanish below the cut of a tree."""
-    has_stems = cfg.crop_tree and cfg.trunk == "stem"
-    return (box_map.maxs[:, 2] > cfg.ground_z_m + cfg.cut_height_m) if has_stems else np.zeros(len(box_map), dtype=bool)
+    if not _has_stems(cfg):
+        return np.zeros(len(box_map), dtype=bool)
+    return box_map.maxs[:, 2] > cfg.ground_z_m + cfg.cut_height_m
+
+
+def _has_stems(cfg: SimplifyConfig) -> bool:
+    return cfg.crop_tree and cfg.crop_strategy == "fixed" and cfg.trunk == "stem"
 
 
 # --- crop_tree --------------------------------------------------------------------------------------------------------
@@ -195,6 +217,51 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
     return _concatenate(canopies, trunks)
 
 
+def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
+    """Cut vegetation that is higher than `adaptive_height_m` into a stem below `split_z_m` and pieces no higher than that above.
+
+    The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid from afar, but
+    no rule; this is ours. The stem is one cell wide. The lowest piece above the cut keeps the id; without one, the stem does.
+
+    Args:
+        used_ids: ids that new boxes may not take.
+    Source: app:simworld:step3, "crop_tree".
+    """
+    split = cfg.ground_z_m + cfg.split_z_m
+    low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
+    is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, cfg.ground_z_m) > cfg.adaptive_height_m)
+    rows, is_first, lows, highs = [], [], [], []
+    for row in np.flatnonzero(is_tall):
+        cuts = [float(low[row])]
+        if low[row] < split < high[row]:
+            cuts.append(split)
+        num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
+        cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
+        rows += [row] * (len(cuts) - 1)
+        is_first += [piece == int(len(cuts) > 2 and low[row] < split) for piece in range(len(cuts) - 1)]
+        lows += cuts[:-1]
+        highs += cuts[1:]
+    pieces = np.array(rows, dtype=np.int64)
+    low_z, high_z = np.array(lows), np.array(highs)
+    is_tilted = (box_map.rotations_deg[pieces][:, [0, 2]] != 0).any(axis=1)[:, None]
+    bounds = axis_aligned_half_extents(box_map.half_extents[pieces], box_map.rotations_deg[pieces])
+    half = np.where(is_tilted, bounds, box_map.half_extents[pieces])
+    is_stem = ((low_z < split) & (low_z <= cfg.ground_z_m + 1.0))[:, None]
+    half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
+    half[:, 2] = (high_z - low_z) / 2
+    keeps_id = np.array(is_first, dtype=bool)
+    ids = box_map.ids[pieces].copy()
+    ids[~keeps_id] = _free_ids(used_ids, int((~keeps_id).sum()))
+    cut = BoxMap(
+        np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2]),
+        half,
+        np.where(is_tilted, 0.0, box_map.rotations_deg[pieces]),
+        box_map.kinds[pieces],
+        ids,
+    )
+    return _concatenate(box_map.select(~is_tall), cut)
+
+
 def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
     """Give the smallest positive numbers that are not used, (count,) uint64. Not max + 1: CARLA's ids fill 64 bits."""
     candidates = np.arange(1, len(used) + count + 1, dtype=np.uint64)
@@ -204,9 +271,24 @@ def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
 # --- removal ----------------------------------------------------------------------------------------------------------
 
 
-def crop_below_ground(box_map: BoxMap, ground_z_m: float) -> BoxMap:
-    """Drop boxes whose top face lies below the ground; surfaces stay (sec:step2, "Below-ground removal")."""
-    return box_map.select((box_map.maxs[:, 2] >= ground_z_m) | np.isin(box_map.kinds, SURFACE_KINDS))
+def crop_below_ground(box_map: BoxMap, ground_z_m: float, *, clip: bool = False) -> BoxMap:
+    """Drop boxes whose top face lies below the ground; surfaces stay (sec:step2, "Below-ground removal").
+
+    Args:
+        clip: also cut off what upright boxes, surfaces apart, have below the ground; what only just reaches it goes too
+            (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
+    """
+    is_surface = np.isin(box_map.kinds, SURFACE_KINDS)
+    lows, tops = box_map.mins[:, 2], box_map.maxs[:, 2]
+    if not clip:
+        return box_map.select((tops >= ground_z_m) | is_surface)
+    is_upright = (box_map.rotations_deg[:, [0, 2]] == 0).all(axis=1)
+    is_cut = (lows < ground_z_m) & (tops > ground_z_m) & is_upright & ~is_surface
+    centers, half_extents = box_map.centers.copy(), box_map.half_extents.copy()
+    centers[is_cut, 2] = (tops[is_cut] + ground_z_m) / 2
+    half_extents[is_cut, 2] = (tops[is_cut] - ground_z_m) / 2
+    clipped = replace(box_map, centers=centers, half_extents=half_extents)
+    return clipped.select((tops > ground_z_m) | is_surface)
 
 
 def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
@@ -303,7 +385,18 @@ def report(raw: BoxMap, result: Simplified, cfg: SimplifyConfig) -> dict:
         },
         "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
         "grid": cross_validate(raw, result.box_map, cfg.ground_z_m),
+        "trunks": _compare_trunks(raw, cfg),
     }
+
+
+def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
+    """What either rule for trunks leaves people to walk on; empty where these rules are not used."""
+    if not (cfg.crop_tree and cfg.crop_strategy == "fixed"):
+        return {}
+    results = {trunk: simplify(raw, cfg.model_copy(update={"trunk": trunk})) for trunk in ("stem", "full")}
+    names = ("cell_agreement", "iou", "simplified_walkable_m2", "simplified_largest_part_m2")
+    grids = {trunk: cross_validate(raw, result.box_map, cfg.ground_z_m) for trunk, result in results.items()}
+    return {trunk: {name: grid[name] for name in names} for trunk, grid in grids.items()}
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:

@@ -15,6 +15,7 @@ from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.maps import MapsConfig, load_map, run
 from cosfly.maps.boxlist import BoxList
+from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
 from cosfly.maps.cityjson_file import read_model, rule_of
 from cosfly.maps.footprints import Rectangle, cover, covered_ground, oriented_rectangle, rectangle_polygon, united
@@ -64,6 +65,20 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     walkable = cross_validate(town, result.box_map)
     assert walkable["simplified_largest_part_m2"] > 45_000
     assert walkable["simplified_largest_part_m2"] > 0.98 * walkable["simplified_walkable_m2"]
+
+
+def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand():
+    cfg = build(MapsConfig, {"synthetic": {"preset": "town10"}}, "x")
+    town, other = (load_map(cfg, seed=seed) for seed in (0, 1))
+    assert town.counts() == other.counts() == CENSUS
+    assert len(town) == 65_614
+    assert not np.array_equal(town.centers, other.centers)
+    low, high = town.bounds()
+    np.testing.assert_allclose(high[:2] - low[:2], (619, 506))
+    result = simplify(town, SimplifyConfig())
+    assert 2000 < len(result.box_map) < 4000
+    assert result.box_map.counts()["Vegetation"] < 1000
+    assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
 
 
 def test_surfaces_of_a_town_do_not_share_a_plane():

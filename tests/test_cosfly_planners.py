@@ -17,6 +17,7 @@ from cosfly import kernels
 from cosfly.errors import InputError, NoPathError, ResumeError
 from cosfly.geometry import look_at
 from cosfly.planners import MucoConfig, PlanConfig, loss, metrics, muco, start
+from cosfly.planners.nearby import nothing_nearby
 from cosfly.schema import DT_S, KINDS, PedestrianPath, make_box_map, read_traces, write_boxes, write_paths
 
 CFG = PlanConfig()
@@ -273,10 +274,10 @@ def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():
     scenario, obstacles = scenario_of("tower_behind")
     problem = problem_of(scenario)
     point = np.array([-17.0, 1.0, 20.0])
-    assert loss.push_out(point, problem, obstacles) == pytest.approx(3.0, abs=1e-5)
+    assert loss.push_out(point, problem, obstacles, nothing_nearby(1), 0) == pytest.approx(3.0, abs=1e-5)
     slit = kernels.obstacle_index(town_of(((-5, 0, 60), (2.3, 500, 60)), ((5, 0, 60), (2.3, 500, 60))))  # 5.4 m wide
     point = np.array([1.0, 0.0, 20.0])
-    assert 2.5 <= loss.push_out(point, problem, slit) < 2.75
+    assert 2.5 <= loss.push_out(point, problem, slit, nothing_nearby(1), 0) < 2.75
 
 
 # --- flights ----------------------------------------------------------------------------------------------------------

@@ -213,6 +213,59 @@ def test_new_ids_never_repeat_one_of_64_bits():
     assert sorted(simplify(tree, SimplifyConfig()).box_map.ids.tolist()) == [1, 2, 2**64 - 1]
 
 
+def test_centres_near_each_other_make_neighbours_whatever_their_faces():
+    row = [("Vegetation", (x, 0, 0), (x + 0.2, 0.2, 0.2)) for x in (0.0, 2.0, 4.0, 6.01)]
+    near = box_map(*row)
+    assert len(simplify(near, only("merge", merge_by="center", min_canopy_fill=0.0)).box_map) == 2
+    wide = box_map(("Vegetation", (0, 0, 0), (9, 9, 9)), ("Vegetation", (7, 7, 7), (8, 8, 8)))  # one inside the other
+    assert len(simplify(wide, only("merge", merge_by="center", min_canopy_fill=0.0)).box_map) == 2
+    assert len(simplify(wide, only("merge", min_canopy_fill=0.0)).box_map) == 1
+
+
+def test_adaptive_cropping_cuts_tall_trees_into_a_stem_and_low_pieces():
+    plants = box_map(
+        ("Vegetation", (0, 0, 0), (4, 6, 13)),  # stem and two pieces
+        ("Vegetation", (9, 0, 0), (13, 4, 5)),  # just not too high
+        ("Vegetation", (20, 0, 3), (24, 4, 9)),  # hangs: no stem
+        ("Buildings", (30, 0, 0), (40, 9, 30)),
+        ids=[7, 8, 9, 1],
+    )
+    result = simplify(plants, only("crop_tree", crop_strategy="adaptive")).box_map
+    assert result.ids.tolist() == [8, 1, 2, 7, 3, 4, 9]
+    np.testing.assert_allclose(result.mins[2:], [(1.75, 2.75, 0), (0, 0, 5), (0, 0, 9), (20, 0, 3), (20, 0, 5)])
+    np.testing.assert_allclose(result.maxs[2:], [(2.25, 3.25, 5), (4, 6, 9), (4, 6, 13), (24, 4, 5), (24, 4, 9)])
+    again = simplify(result, only("crop_tree", crop_strategy="adaptive")).box_map
+    assert sorted(again.ids.tolist()) == sorted(result.ids.tolist())
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_adaptive_cropping_keeps_heights_and_leaves_nothing_high(seed):
+    boxes = random_map(seed, 60)
+    boxes = replace(boxes, half_extents=boxes.half_extents * [1, 1, 4])
+    result = simplify(boxes, only("crop_tree", crop_strategy="adaptive")).box_map
+    plants = result.select(result.kinds == VEGETATION)
+    over_ground = plants.maxs[:, 2] - np.maximum(plants.mins[:, 2], 0)
+    assert over_ground.max() <= 5.0 + 1e-9
+    raw = boxes.select(boxes.kinds == VEGETATION)
+    heights = (plants.half_extents[:, 2].sum(), raw.half_extents[:, 2].sum())
+    assert heights[0] == pytest.approx(heights[1])
+    assert len(set(result.ids.tolist())) == len(result)
+
+
+def test_the_simworld_variants_work_together():
+    boxes = random_map(9, 150)
+    cfg = SimplifyConfig(
+        merge_by="center", min_fill=0.0, min_canopy_fill=0.0, crop_strategy="adaptive", below_ground="clip",
+        nested_tolerance_m=1e-6,
+    )  # fmt: skip
+    result = simplify(boxes, cfg)
+    assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
+    solid = result.box_map.select(result.box_map.kinds != ROADS)
+    assert solid.mins[:, 2].min() >= -1e-9
+    assert "trunks" not in result.box_map.header
+
+
 # --- removal ----------------------------------------------------------------------------------------------------------
 
 
@@ -225,6 +278,22 @@ def test_below_ground_goes_by_the_top_face_and_spares_surfaces():
         ("Water", (0, 0, -2), (9, 9, -0.5)),
     )
     assert crop_below_ground(boxes, 0.0).ids.tolist() == [2, 3, 4, 5]
+
+
+def test_clipping_cuts_off_what_lies_below_the_ground():
+    boxes = box_map(
+        ("Static", (0, 0, -3), (1, 1, 0)),  # only touches the ground: nothing of it is left
+        ("Static", (0, 0, -30), (1, 1, 0.2), 30.0),
+        ("Static", (0, 0, 1), (1, 1, 2)),
+        ("Roads", (0, 0, -1), (9, 9, 0.5)),  # a surface stays whole
+    )
+    result = crop_below_ground(boxes, 0.0, clip=True)
+    assert result.ids.tolist() == [2, 3, 4]
+    np.testing.assert_allclose(result.mins[:, 2], [0, 1, -1])
+    np.testing.assert_allclose(result.maxs[:, 2], [0.2, 2, 0.5])
+    leaning = replace(boxes, rotations_deg=np.full((4, 3), [20.0, 0, 0]))
+    stays = crop_below_ground(leaning, 0.0, clip=True)
+    np.testing.assert_array_equal(stays.half_extents, leaning.select(leaning.maxs[:, 2] > 0).half_extents)
 
 
 @pytest.mark.parametrize(
@@ -330,6 +399,9 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
     assert report["passes"][-1]["counts"] == simplified.counts()
     assert 0 < report["grid"]["iou"] <= 1
+    trunks = report["trunks"]
+    assert trunks["stem"]["simplified_walkable_m2"] == report["grid"]["simplified_walkable_m2"]
+    assert trunks["stem"]["simplified_walkable_m2"] > trunks["full"]["simplified_walkable_m2"]
     assert (tmp_path / "out/simplify.png").read_bytes()[:4] == b"\x89PNG"
 
     written = product.read_bytes()

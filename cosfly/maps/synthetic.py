@@ -10,12 +10,14 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.config import Config
 from cosfly.maps.boxlist import BoxList
+from cosfly.maps.census_town import census_town
 from cosfly.maps.town_blocks import (
     BASE_TOP_M,
     BLOCKS,
@@ -42,6 +44,10 @@ class SyntheticConfig(Config):
     """The synthetic town."""
 
     name: str = Field("SynthTown", min_length=1, description="map name, the head of the playback tree's folder names")
+    preset: Literal["small_town", "town10"] = Field(
+        "small_town",
+        description="town10: as many boxes of each kind as the paper's town, over 619 x 506 m; the fields below then count for nothing",
+    )
     size_m: float = Field(280.0, ge=80.0, le=4000.0, description="side of the square town, m")
     num_blocks: int = Field(3, ge=1, le=60, description="building blocks along each side")
     street_m: float = Field(20.0, ge=12.0, le=60.0, description="width of a street from front to front, m")
@@ -85,6 +91,8 @@ class Strip:
 
 def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
     """Build the town of a seed."""
+    if cfg.preset == "town10":
+        return census_town(cfg.name, seed)
     boxes = BoxList()
     strips = _strips(cfg)
     half = cfg.size_m / 2

@@ -40,7 +40,7 @@ from cosfly.store import Resume, StageFolder, write_bytes
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
 
-PLANNERS = {"muco": "cosfly.planners.muco:plan"}
+PLANNERS = {"muco": "cosfly.planners.muco:plan", "track_astar": "cosfly.planners.track_astar:plan"}
 
 CLEARANCE_CAP_M = 100.0  # a product holds finite numbers: obstacles farther away than this count as this far
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
@@ -103,10 +103,33 @@ class MucoConfig(Config):
         return self
 
 
+class TrackAStarConfig(Config):
+    """Settings of TA*+Smooth (subsec:appendix_planner_tastar); what the terms are stands in track_astar.py."""
+
+    voxel_m: float = Field(4.0, gt=0, description="voxel size in the plane, m")
+    voxel_height_m: float = Field(4.0, gt=0, description="voxel height, m")
+    corridor_m: float = Field(45.0, gt=0, description="horizontal margin of the grid round the walk, m")
+    beam: int = Field(2048, ge=1, description="places kept per time layer")
+    weight_tracking: float = Field(2.0, ge=0, description="weight of the squared deviation from the preferred place")
+    weight_visibility: float = Field(18.0, ge=0, description="weight of the blocked part of the five rays")
+    weight_path: float = Field(1.0, ge=0, description="weight of the way, in voxels")
+    weight_safety: float = Field(8.0, ge=0, description="weight of the squared intrusion into influence_m")
+    weight_smoothness: float = Field(0.15, ge=0, description="weight of the squared change of the move, in voxels")
+    influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
+    shortcut_frames: int = Field(12, ge=0, description="longest run replaced by a straight line, frames; 0: none")
+    elastic_iterations: int = Field(30, ge=0, description="iterations of the elastic band at most; 0: none")
+    elastic_step: float = Field(0.35, gt=0, le=1, description="step towards the middle of the neighbours")
+    elastic_step_min: float = Field(0.02, gt=0, le=1, description="a step that is not valid is halved down to this")
+    anchor_visibility: float = Field(0.999, ge=0, le=1, description="visibility above this counts as full")
+    visibility_loss_point: float = Field(0.05, ge=0, le=1, description="visibility that one change may cost a frame")
+    visibility_loss_frame: float = Field(0.10, ge=0, le=1, description="visibility that smoothing may cost a frame")
+    visibility_loss_mean: float = Field(0.05, ge=0, le=1, description="mean visibility that smoothing may cost")
+
+
 class PlanConfig(Config):
     """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walk."""
 
-    planner: Literal["muco"] = Field("muco", description="which planner flies")
+    planner: Literal["muco", "track_astar"] = Field("muco", description="which planner flies")
     safety_distance_m: float = Field(3.0, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(2.5, gt=0, description="distance that must be kept where the nominal one cannot, m")
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude, m")
@@ -123,6 +146,7 @@ class PlanConfig(Config):
     accel_rms_max_mps2: float = Field(5.0, gt=0, description="drop a flight of greater RMS acceleration, m/s^2")
     jerk_rms_max_mps3: float = Field(10.0, gt=0, description="drop a flight of greater RMS jerk, m/s^3")
     muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
+    track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
 
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from cosfly.kernels import collect_hits, nearest_box, normal_of_box, window_rays
+from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box, window_rays
+from cosfly.planners.nearby import Nearby, hits_among, known, nearest_among, nearest_of, nothing_nearby, remember
 
 TERM_NAMES = (
     "tracking",
@@ -64,6 +65,7 @@ class State(NamedTuple):
     band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of each
     waypoint in the terms that have kinks and stairs, visibility and safety.
     blockers: (k,) room for box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, else zero.
+    nearby: boxes remembered from earlier evaluations; states may share them.
     """
 
     terms: np.ndarray
@@ -74,6 +76,7 @@ class State(NamedTuple):
     rough: np.ndarray
     blockers: np.ndarray
     contacts: np.ndarray
+    nearby: Nearby
 
 
 def make_state(num_points: int, num_boxes: int) -> State:
@@ -81,7 +84,15 @@ def make_state(num_points: int, num_boxes: int) -> State:
     return State(
         np.zeros(len(TERM_NAMES)), np.zeros((num_points, 3)), np.zeros((num_points, 3)), np.zeros((BAND_ROWS, 3 * num_points)),
         np.zeros(num_points), np.zeros(num_points), np.zeros(num_boxes, dtype=np.int64), np.zeros((num_points, 3)),
+        nothing_nearby(num_points),
     )  # fmt: skip
+
+
+@njit(cache=True)
+def remember_boxes(points, problem, index, nearby):
+    """Look up which boxes matter to each waypoint of a trajectory that will be evaluated and projected, in place."""
+    reach = max(problem.influence_m, problem.safety_m)
+    remember(nearby, index, points, problem.targets, reach, max(RAY_SPREAD_M, problem.difference_m))
 
 
 @njit(cache=True)
@@ -95,12 +106,11 @@ def evaluate(points, problem, index, masked, state):
     state.terms[:] = 0.0
     state.gradient[:] = 0.0
     state.visibility_gradient[:] = 0.0
-    state.band[:] = 0.0
     state.contacts[:] = 0.0
     state.rough[:] = 0.0
-    for i in range(len(points)):
-        point_terms(points, i, problem, index, masked[i], state)
-        visibility_term(points, i, problem, index, masked[i], state)
+    chain_curvature(problem, state)
+    point_terms(points, 0, len(points), problem, index, masked, state)
+    visibility_terms(points, problem, index, masked, state)
     chain_terms(points, 0, len(points), problem, state)
     return state.terms.sum()
 
@@ -108,146 +118,202 @@ def evaluate(points, problem, index, masked, state):
 # --- terms of one waypoint --------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
-def _add_square(state, term, i, weight, residual, ax, ay, az, in_model):
+# These functions run over many waypoints each, with arrays taken out of their tuples first: handing a tuple of arrays on costs an
+# atomic count for each array, which for one waypoint is more than the arithmetic.
+
+
+@njit(cache=True, inline="always")
+def _add_square(terms, gradient, band, term, i, weight, residual, ax, ay, az, in_model):
     """Add weight * residual^2 of waypoint i, where (ax, ay, az) is the residual's derivative."""
-    state.terms[term] += weight * residual * residual
-    if not in_model:
-        return
-    slope, k = 2.0 * weight * residual, 3 * i
-    state.gradient[i, 0] += slope * ax
-    state.gradient[i, 1] += slope * ay
-    state.gradient[i, 2] += slope * az
-    state.band[0, k] += 2.0 * weight * ax * ax
-    state.band[0, k + 1] += 2.0 * weight * ay * ay
-    state.band[0, k + 2] += 2.0 * weight * az * az
-    state.band[1, k] += 2.0 * weight * ax * ay
-    state.band[1, k + 1] += 2.0 * weight * ay * az
-    state.band[2, k] += 2.0 * weight * ax * az
+    terms[term] += weight * residual * residual
+    if in_model:
+        slope, k = 2.0 * weight * residual, 3 * i
+        gradient[i, 0] += slope * ax
+        gradient[i, 1] += slope * ay
+        gradient[i, 2] += slope * az
+        band[0, k] += 2.0 * weight * ax * ax
+        band[0, k + 1] += 2.0 * weight * ay * ay
+        band[0, k + 2] += 2.0 * weight * az * az
+        band[1, k] += 2.0 * weight * ax * ay
+        band[1, k + 1] += 2.0 * weight * ay * az
+        band[2, k] += 2.0 * weight * ax * az
 
 
 @njit(cache=True)
-def point_terms(points, i, problem, index, masked, state):
-    """Tracking, safety, view angle, altitude bounds and pitch band of waypoint i."""
-    x, y, z = points[i, 0], points[i, 1], points[i, 2]
-    dx, dy, dz = x - problem.targets[i, 0], y - problem.targets[i, 1], z - problem.targets[i, 2]
-    weights = problem.weights
-    distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
-    _add_square(
-        state, TRACKING, i, weights[TRACKING], distance - problem.distance_m, dx / distance, dy / distance, dz / distance, True
-    )  # fmt: skip
+def point_terms(points, begin, end, problem, index, masked, state):
+    """Tracking, safety, view angle, altitude bounds and pitch band of waypoints [begin, end)."""
+    terms, gradient, band, rough, contacts = state.terms, state.gradient, state.band, state.rough, state.contacts
+    anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
+    targets, headings, weights = problem.targets, problem.headings_rad, problem.weights
+    influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
+    low, high = problem.altitudes[0], problem.altitudes[1]
+    for i in range(begin, end):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy, dz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
+        distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+        ax, ay, az = dx / distance, dy / distance, dz / distance
+        excess = distance - problem.distance_m
+        _add_square(terms, gradient, band, TRACKING, i, weights[TRACKING], excess, ax, ay, az, True)
 
-    gap, box = nearest_box(index, x, y, z, problem.influence_m)
-    if box >= 0:
-        nx, ny, nz = normal_of_box(index.rows, box, x, y, z)
-        _add_square(state, SAFETY, i, 0.5 * weights[SAFETY], gap - problem.influence_m, nx, ny, nz, True)
-        state.rough[i] += 0.5 * weights[SAFETY] * (gap - problem.influence_m) ** 2
-        if gap < problem.safety_m + 0.01:
-            state.contacts[i, 0], state.contacts[i, 1], state.contacts[i, 2] = nx, ny, nz
+        count = known(anchors, num_around, i, x, y, z)
+        if count != 0:
+            if count > 0:
+                gap, box = nearest_among(rows, around, i, count, x, y, z, influence)
+            else:
+                gap, box = nearest_box(index, x, y, z, influence)
+            if box >= 0:
+                nx, ny, nz = normal_of_box(rows, box, x, y, z)
+                _add_square(terms, gradient, band, SAFETY, i, half_safety, gap - influence, nx, ny, nz, True)
+                rough[i] += half_safety * (gap - influence) ** 2
+                if gap < problem.safety_m + 0.01:
+                    contacts[i, 0], contacts[i, 1], contacts[i, 2] = nx, ny, nz
 
-    # View angle: deviations, in radians, of the downward pitch from 45 degrees and of the view's azimuth from the walking
-    # direction. Straight above the target both lose their meaning: a floor of one metre keeps their derivatives finite.
-    flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
-    pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
-    px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
-    _add_square(state, VIEW_ANGLE, i, weights[VIEW_ANGLE], pitch - problem.pitch_rad, px, py, pz, not masked)
-    turn = np.arctan2(-dy, -dx) - problem.headings_rad[i]
-    turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
-    _add_square(state, VIEW_ANGLE, i, weights[VIEW_ANGLE], turn, -dy / flat / flat, dx / flat / flat, 0.0, not masked)
-    outside = min(pitch - problem.pitch_low_rad, 0.0) + max(pitch - problem.pitch_high_rad, 0.0)
-    if outside != 0.0:
-        _add_square(state, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
+        # View angle: deviations, in radians, of the downward pitch from 45 degrees and of the view's azimuth from the walking
+        # direction. Straight above the target both lose their meaning: a floor of one metre keeps their derivatives finite.
+        flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
+        pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
+        px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
+        off, is_free = pitch - problem.pitch_rad, not masked[i]
+        _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], off, px, py, pz, is_free)
+        turn = np.arctan2(-dy, -dx) - headings[i]
+        turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
+        tx, ty = -dy / flat / flat, dx / flat / flat
+        _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], turn, tx, ty, 0.0, is_free)
+        outside = min(pitch - problem.pitch_low_rad, 0.0) + max(pitch - problem.pitch_high_rad, 0.0)
+        if outside != 0.0:
+            _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
 
-    below, above = problem.altitudes[0] - z, z - problem.altitudes[1]
-    if below > 0.0:
-        _add_square(state, ALTITUDE, i, problem.altitude_weights[0], below, 0.0, 0.0, -1.0, True)
-    if above > 0.0:
-        _add_square(state, ALTITUDE, i, problem.altitude_weights[1], above, 0.0, 0.0, 1.0, True)
+        if z < low:
+            _add_square(terms, gradient, band, ALTITUDE, i, problem.altitude_weights[0], low - z, 0.0, 0.0, -1.0, True)
+        if z > high:
+            _add_square(terms, gradient, band, ALTITUDE, i, problem.altitude_weights[1], z - high, 0.0, 0.0, 1.0, True)
 
 
 @njit(cache=True)
-def visibility_term(points, i, problem, index, masked, state):
-    """(1 - V)^2 of waypoint i, V the five-ray fraction averaged over the difference window: the waypoint and its six
+def visibility_terms(points, problem, index, masked, state):
+    """(1 - V)^2 of every waypoint, V the five-ray fraction averaged over the difference window: the waypoint and its six
     neighbours at +-difference_m. The raw fraction is a staircase; the average rises in steps of 1/35 and the central
     difference over the same window is its slope.
     """
-    x, y, z, target = points[i, 0], points[i, 1], points[i, 2], problem.targets[i]
     # Any ray of the window stays within this of the middle ray, at its foot and at its head.
-    spread = max(0.8, problem.difference_m)
-    count = collect_hits(index, target[0], target[1], target[2], x, y, z, spread, state.blockers)
-    state.visibility[i] = 1.0
-    if count == 0:
-        return
+    spread = max(RAY_SPREAD_M, problem.difference_m)
     weight, step, free = problem.weights[VISIBILITY], problem.difference_m, np.empty(7)
-    window_rays(index, state.blockers, count, x, y, z, step, target, free)
-    state.visibility[i] = free[0]
-    slope = state.visibility_gradient[i]
-    for axis in range(3):
-        slope[axis] = (free[1 + 2 * axis] - free[2 + 2 * axis]) / (2.0 * step)
-    hidden = 1.0 - free.sum() / 7.0
-    state.rough[i] += weight * hidden * hidden
-    state.terms[VISIBILITY] += weight * hidden * hidden
-    for a in range(3):
-        for b in range(a + 1 if not masked else 0):
-            state.band[a - b, 3 * i + b] += 2.0 * weight * slope[a] * slope[b]
-    slope *= 0.0 if masked else 2.0 * weight * hidden
+    visible, blockers, band, rough, rows = state.visibility, state.blockers, state.band, state.rough, index.rows
+    anchors, on_view, num_on_view = state.nearby.anchors, state.nearby.on_view, state.nearby.num_on_view
+    slope, slopes, targets = np.empty(3), state.visibility_gradient, problem.targets
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        visible[i] = 1.0
+        tx, ty, tz = targets[i, 0], targets[i, 1], targets[i, 2]
+        count = known(anchors, num_on_view, i, x, y, z)
+        if count > 0:
+            count = hits_among(rows, on_view, i, count, tx, ty, tz, x, y, z, spread, blockers)
+        elif count < 0:
+            count = collect_hits(index, tx, ty, tz, x, y, z, spread, blockers)
+        if count == 0:
+            continue
+        window_rays(rows, blockers, count, x, y, z, step, tx, ty, tz, free)
+        visible[i] = free[0]
+        hidden = 1.0 - free.sum() / 7.0
+        rough[i] += weight * hidden * hidden
+        state.terms[VISIBILITY] += weight * hidden * hidden
+        if masked[i]:
+            continue
+        for axis in range(3):
+            slope[axis] = (free[1 + 2 * axis] - free[2 + 2 * axis]) / (2.0 * step)
+            slopes[i, axis] = 2.0 * weight * hidden * slope[axis]
+        for a in range(3):
+            for b in range(a + 1):
+                band[a - b, 3 * i + b] += 2.0 * weight * slope[a] * slope[b]
 
 
 # --- terms that couple neighbours -------------------------------------------------------------------------------------
 
 
 @njit(cache=True)
-def _add_difference(state, term, points, first, axis, coefficients, weight):
-    """Add weight * (sum_k c_k p_{first + k})^2 for one axis."""
-    residual = 0.0
-    for k in range(len(coefficients)):
-        residual += coefficients[k] * points[first + k, axis]
-    state.terms[term] += weight * residual * residual
-    for k in range(len(coefficients)):
-        state.gradient[first + k, axis] += 2.0 * weight * residual * coefficients[k]
-        for m in range(k + 1):
-            state.band[3 * (k - m), 3 * (first + m) + axis] += 2.0 * weight * coefficients[k] * coefficients[m]
+def chain_curvature(problem, state):
+    """Set the curvature to that of smoothness, jerk and altitude oscillation: the same wherever the waypoints are."""
+    band, num_points, weights = state.band, len(problem.targets), problem.weights
+    band[:] = 0.0
+    for coefficients, weight in (
+        (SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK]),
+    ):  # fmt: skip
+        for first in range(num_points - len(coefficients) + 1):
+            for k in range(len(coefficients)):
+                for m in range(k + 1):
+                    value = 2.0 * weight * coefficients[k] * coefficients[m]
+                    for axis in range(3):
+                        band[3 * (k - m), 3 * (first + m) + axis] += value
+    swing = 2.0 * problem.altitude_weights[2]
+    for i in range(num_points - 1):
+        band[0, 3 * i + 2] += swing
+        band[0, 3 * i + 5] += swing
+        band[3, 3 * i + 2] -= swing
 
 
 @njit(cache=True)
 def chain_terms(points, begin, end, problem, state):
-    """Smoothness, jerk, path length and altitude oscillation of the differences that start in [begin, end)."""
-    num_points, weights = len(points), problem.weights
+    """Smoothness, jerk, path length and altitude oscillation of the differences that start in [begin, end).
+
+    Adds to terms and gradient, and the path length's curvature to the band; the rest is `chain_curvature`.
+    """
+    num_points, weights, gradient = len(points), problem.weights, state.gradient
+    smoothness, jerk = weights[SMOOTHNESS], weights[JERK]
+    swing = problem.altitude_weights[2]
+    bends, jerks, swings = 0.0, 0.0, 0.0
     for i in range(max(begin, 0), min(end, num_points - 1)):
         for axis in range(3):
+            p, q = points[i, axis], points[i + 1, axis]
             if i + 2 < num_points:
-                _add_difference(state, SMOOTHNESS, points, i, axis, SECOND_DIFFERENCE, weights[SMOOTHNESS])
-            if i + 3 < num_points:
-                _add_difference(state, JERK, points, i, axis, THIRD_DIFFERENCE, weights[JERK])
-        _add_length(state, points, i, 0.1 * weights[PATH_LENGTH])
+                r = points[i + 2, axis]
+                bend = p - 2.0 * q + r
+                bends += bend * bend
+                gradient[i, axis] += 2.0 * smoothness * bend
+                gradient[i + 1, axis] -= 4.0 * smoothness * bend
+                gradient[i + 2, axis] += 2.0 * smoothness * bend
+                if i + 3 < num_points:
+                    third = points[i + 3, axis] - 3.0 * r + 3.0 * q - p
+                    jerks += third * third
+                    gradient[i, axis] -= 2.0 * jerk * third
+                    gradient[i + 1, axis] += 6.0 * jerk * third
+                    gradient[i + 2, axis] -= 6.0 * jerk * third
+                    gradient[i + 3, axis] += 2.0 * jerk * third
         # Oscillation: the squared change of altitude from waypoint to waypoint.
-        change, weight, k = points[i + 1, 2] - points[i, 2], problem.altitude_weights[2], 3 * i + 2
-        state.terms[ALTITUDE] += weight * change * change
-        state.gradient[i, 2] -= 2.0 * weight * change
-        state.gradient[i + 1, 2] += 2.0 * weight * change
-        state.band[0, k] += 2.0 * weight
-        state.band[0, k + 3] += 2.0 * weight
-        state.band[3, k] -= 2.0 * weight
+        change = points[i + 1, 2] - points[i, 2]
+        swings += change * change
+        gradient[i, 2] -= 2.0 * swing * change
+        gradient[i + 1, 2] += 2.0 * swing * change
+    state.terms[SMOOTHNESS] += smoothness * bends
+    state.terms[JERK] += jerk * jerks
+    state.terms[ALTITUDE] += swing * swings
+    _add_lengths(points, max(begin, 0), min(end, num_points - 1), 0.1 * weights[PATH_LENGTH], state)
 
 
 @njit(cache=True)
-def _add_length(state, points, i, weight):
+def _add_lengths(points, begin, end, weight, state):
     """Add weight * |p_{i+1} - p_i|; its curvature is (1 - u u^T) / length, with a floor under the length."""
-    step = points[i + 1] - points[i]
-    length = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    state.terms[PATH_LENGTH] += weight * length
-    if length < 1e-9:
-        return
-    unit, stiffness = step / length, weight / max(length, 0.1)
-    for a in range(3):
-        state.gradient[i, a] -= weight * unit[a]
-        state.gradient[i + 1, a] += weight * unit[a]
-        for b in range(3):
-            value = stiffness * ((1.0 if a == b else 0.0) - unit[a] * unit[b])
-            if b <= a:
-                state.band[a - b, 3 * i + b] += value
-                state.band[a - b, 3 * i + 3 + b] += value
-            state.band[3 + a - b, 3 * i + b] -= value  # row: axis a of waypoint i + 1, column: axis b of waypoint i
+    gradient, band = state.gradient, state.band
+    unit, total = np.empty(3), 0.0
+    for i in range(begin, end):
+        for a in range(3):
+            unit[a] = points[i + 1, a] - points[i, a]
+        length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
+        total += length
+        if length < 1e-9:
+            continue
+        stiffness = weight / max(length, 0.1)
+        for a in range(3):
+            unit[a] /= length
+            gradient[i, a] -= weight * unit[a]
+            gradient[i + 1, a] += weight * unit[a]
+        for a in range(3):
+            for b in range(3):
+                value = stiffness * ((1.0 if a == b else 0.0) - unit[a] * unit[b])
+                if b <= a:
+                    band[a - b, 3 * i + b] += value
+                    band[a - b, 3 * i + 3 + b] += value
+                band[3 + a - b, 3 * i + b] -= value  # row: axis a of waypoint i + 1, column: axis b of waypoint i
+    state.terms[PATH_LENGTH] += weight * total
 
 
 @njit(cache=True)
@@ -268,7 +334,7 @@ def difference_gradient(points, problem, index, masked, state, gradient):
                     places[side] = min(max(places[side], problem.altitudes[0]), problem.altitudes[2])
                 points[i, axis] = places[side]
                 state.terms[:] = 0.0
-                point_terms(points, i, problem, index, masked[i], state)
+                point_terms(points, i, i + 1, problem, index, masked, state)
                 chain_terms(points, i - 3, i + 1, problem, state)
                 losses[side] = state.terms.sum() - (state.terms[VIEW_ANGLE] if masked[i] else 0.0)
             points[i, axis] = middle
@@ -301,8 +367,74 @@ def hold_bounds(points, problem, contacts, band, gradient):
 
 
 @njit(cache=True)
-def push_out(point, problem, index):
-    """Move one waypoint in place out of obstacles, within the altitude bounds; give its clearance, at most safety_m.
+def solve_band(band, damping, gradient):
+    """Give the step -(H + damping)^-1 g of the interior waypoints, (n - 2, 3), by Cholesky's factors of a band.
+
+    Args:
+        band: (BAND_ROWS, 3 n) lower band of H. damping: (n,) per waypoint. gradient: (n, 3).
+    Returns:
+        each waypoint's step by its own curvature alone, should rounding have made the model indefinite.
+    """
+    size, rows = 3 * len(gradient) - 6, BAND_ROWS
+    factor, step = np.empty((size + rows, rows)), np.empty(size)  # factor[j, k]: row j + k, column j
+    factor[size:] = 0.0
+    for j in range(size):
+        for k in range(rows):
+            factor[j, k] = band[k, j + 3] if j + k < size else 0.0
+        factor[j, 0] += damping[j // 3 + 1]
+        step[j] = -gradient[j // 3 + 1, j % 3]
+    for j in range(size):
+        if factor[j, 0] <= 0.0:
+            for m in range(size):
+                step[m] = -gradient[m // 3 + 1, m % 3] / (band[0, m + 3] + damping[m // 3 + 1])
+            return step.reshape(-1, 3)
+        pivot = 1.0 / np.sqrt(factor[j, 0])
+        for k in range(rows):
+            factor[j, k] *= pivot
+        for k in range(1, rows):
+            share = factor[j, k]
+            for m in range(k, rows):
+                factor[j + k, m - k] -= share * factor[j, m]
+        step[j] /= factor[j, 0]
+        for k in range(1, min(rows, size - j)):
+            step[j + k] -= factor[j, k] * step[j]
+    for j in range(size - 1, -1, -1):
+        for k in range(1, min(rows, size - j)):
+            step[j] -= factor[j, k] * step[j + k]
+        step[j] /= factor[j, 0]
+    return step.reshape(-1, 3)
+
+
+@njit(cache=True)
+def try_step(points, band, gradient, damping, scale, cap_m, as_a_whole, problem, index, masked, state, trial):
+    """Solve, cap, project and evaluate one trial step of the interior waypoints.
+
+    Args:
+        points: (n, 3) m, kept. band, gradient, damping: see `solve_band`. scale: share of the step that is taken. cap_m: longest
+            move of a waypoint; longer ones are shortened each on its own, or all by the same factor (as_a_whole).
+        state, trial: written, what `evaluate` fills and the projected trajectory.
+    Returns:
+        the trial's loss, infinity if it is not feasible, and whether the step was capped.
+    """
+    steps = solve_band(band, damping, gradient)
+    lengths = np.empty(len(steps))
+    for i in range(len(steps)):
+        lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
+    longest = lengths.max()
+    trial[:] = points
+    for i in range(len(steps)):
+        share = scale * min(1.0, cap_m / max(longest if as_a_whole else lengths[i], 1e-12))
+        for axis in range(3):
+            trial[i + 1, axis] += share * steps[i, axis]
+    loss = np.inf
+    if project(trial, problem, index, 1, len(trial) - 1, state.nearby):
+        loss = evaluate(trial, problem, index, masked, state)
+    return loss, longest > cap_m
+
+
+@njit(cache=True)
+def push_out(point, problem, index, nearby, i):
+    """Move waypoint i in place out of obstacles, within the altitude bounds; give its clearance, at most safety_m.
 
     Up to pushes_max times along the outward normal of the nearest box. If the nominal distance is not reached, the best
     place seen remains (the relaxed floor is for the caller to judge).
@@ -311,7 +443,7 @@ def push_out(point, problem, index):
     last_x, last_y, last_z, share = 0.0, 0.0, 0.0, 1.0
     for push in range(problem.pushes_max + 1):
         point[2] = min(max(point[2], problem.altitudes[0]), problem.altitudes[2])
-        gap, box = nearest_box(index, point[0], point[1], point[2], problem.safety_m)
+        gap, box = nearest_of(nearby, i, index, point[0], point[1], point[2], problem.safety_m)
         if gap > best:
             best, bx, by, bz = gap, point[0], point[1], point[2]
         if box < 0 or push == problem.pushes_max:
@@ -329,41 +461,67 @@ def push_out(point, problem, index):
 
 
 @njit(cache=True)
-def project(points, problem, index, begin, end):
+def project(points, problem, index, begin, end, nearby):
     """Bring waypoints [begin, end) into the feasible region in place and tell whether the whole trajectory is feasible.
 
     Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
     longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a box.
     """
+    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(begin, end):
-        points[i, 2] = min(max(points[i, 2], problem.altitudes[0]), problem.altitudes[2])
+        points[i, 2] = min(max(points[i, 2], low), high)
         if i > 0:
-            step = points[i] - points[i - 1]
-            length = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-            if length > problem.step_max_m:
-                points[i] = points[i - 1] + step * (problem.step_max_m / length)
-        push_out(points[i], problem, index)
-    return is_feasible(points, problem, index)
+            dx, dy, dz = (
+                points[i, 0] - points[i - 1, 0],
+                points[i, 1] - points[i - 1, 1],
+                points[i, 2] - points[i - 1, 2],
+            )
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            if length > step_max:
+                share = step_max / length
+                points[i, 0] = points[i - 1, 0] + share * dx
+                points[i, 1] = points[i - 1, 1] + share * dy
+                points[i, 2] = points[i - 1, 2] + share * dz
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        count = known(anchors, num_around, i, x, y, z)
+        if count > 0:
+            _, box = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
+            count = count if box >= 0 else 0  # nothing too near
+        if count != 0:
+            push_out(points[i], problem, index, nearby, i)
+    return _is_feasible(points, problem, index, nearby)
 
 
 @njit(cache=True)
 def is_feasible(points, problem, index):
     """Tell whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between waypoints."""
+    return _is_feasible(points, problem, index, nothing_nearby(len(points)))
+
+
+@njit(cache=True)
+def _is_feasible(points, problem, index, nearby):
     one, before = np.empty(1, dtype=np.int64), 0.0
+    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(len(points)):
-        p = points[i]
-        if p[2] < problem.altitudes[0] - 1e-6 or p[2] > problem.altitudes[2] + 1e-6:
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if z < low - 1e-6 or z > high + 1e-6:
             return False
-        gap, _ = nearest_box(index, p[0], p[1], p[2], problem.safety_m)
+        count = known(anchors, num_around, i, x, y, z)
+        if count >= 0:
+            gap, _ = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
+        else:
+            gap, _ = nearest_box(index, x, y, z, problem.safety_m)
         if gap < problem.floor_m:
             return False
         if i > 0:
-            q = points[i - 1]
-            length = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-            if length > problem.step_max_m * (1.0 + 1e-9):
+            u, v, w = points[i - 1, 0], points[i - 1, 1], points[i - 1, 2]
+            length = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
+            if length > step_max * (1.0 + 1e-9):
                 return False
             # A segment shorter than the clearances at its ends together reaches no box.
-            if length >= gap + before and collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], 0.0, one) > 0:
+            if length >= gap + before and collect_hits(index, u, v, w, x, y, z, 0.0, one) > 0:
                 return False
         before = gap
     return True

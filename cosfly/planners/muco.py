@@ -8,7 +8,6 @@ the loss falls; `step: paper` keeps the plain step for comparison. Every accepte
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import LinAlgError, solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.errors import NoPathError
@@ -23,11 +22,15 @@ from cosfly.planners.loss import (
     is_feasible,
     make_state,
     project,
+    remember_boxes,
+    try_step,
 )
+from cosfly.planners.nearby import nothing_nearby
 from cosfly.planners.start import behind, search_start, smoothed_headings
 from cosfly.schema import DT_S
 
-TRIES, TRIES_WITH_VISIBILITY = 10, 4  # of one step
+TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
+REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere
 DAMPING_LEAST = 1e-3  # keeps the band system positive definite where no term has curvature
 DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5  # of a waypoint whose rough terms rise
 
@@ -84,7 +87,7 @@ def start_trajectory(
     """
     targets = problem.targets
     plain = behind(targets, headings_rad, cfg.behind_distance_m, float(problem.altitudes[1]))
-    plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain)))
+    plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
     if plain_is_free and visibility(obstacles, plain, targets).mean() >= cfg.muco.start_visibility:
         return plain, "behind"
     for climbing, clearance_m in (
@@ -118,7 +121,7 @@ def _rounded_off(found: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np
     """Smooth the corners of a searched trajectory as far as it stays feasible: that saves many capped steps."""
     for smoothing_s in (3.0, 1.5, 0.75):
         smooth = gaussian_filter1d(found, smoothing_s / DT_S, axis=0, mode="nearest")
-        if project(smooth, problem, obstacles, 0, len(smooth)):
+        if project(smooth, problem, obstacles, 0, len(smooth), nothing_nearby(len(smooth))):
             return smooth
     return found
 
@@ -150,6 +153,7 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
             break
     facts = {
         "iterations": len(history) - 1,
+        "evaluations": descent.num_tried,
         "stopped": reason,
         "loss_start": round(history[0], 6),
         "loss_end": round(history[-1], 6),
@@ -162,7 +166,10 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
 
 def low_visibility_runs(fractions: np.ndarray, threshold: float, frames: int) -> np.ndarray:
     """Mark the waypoints in runs of at least `frames` neighbours that all see less than `threshold`, (n,) bool."""
-    low = np.concatenate([[False], np.asarray(fractions) < threshold, [False]])
+    is_low = np.asarray(fractions) < threshold
+    if is_low.sum() < frames:
+        return np.zeros(len(is_low), dtype=np.bool_)
+    low = np.concatenate([[False], is_low, [False]])
     begins, ends = np.flatnonzero(~low[:-1] & low[1:]), np.flatnonzero(low[:-1] & ~low[1:])
     marked = np.zeros(len(low) - 2, dtype=np.bool_)
     for begin, end in zip(begins, ends, strict=True):
@@ -175,9 +182,13 @@ class Descent:
 
     def __init__(self, points: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: MucoConfig) -> None:
         self.points, self.problem, self.obstacles, self.cfg = points, problem, obstacles, cfg
-        self.now, self.next = (make_state(len(points), obstacles.num_boxes) for _ in range(2))
+        self.now = make_state(len(points), obstacles.num_boxes)
+        self.next = make_state(len(points), obstacles.num_boxes)._replace(nearby=self.now.nearby)
+        remember_boxes(points, problem, obstacles, self.now.nearby)
         self.masked = np.zeros(len(points), dtype=np.bool_)
         self.damping = np.zeros(len(points))  # of single waypoints, Levenberg's way
+        self.rest, self.rest_next = 0, 1  # iterations without the visibility slope, now and after its next failure
+        self.num_tried = 0
         self.loss = evaluate(points, problem, obstacles, self.masked, self.now)
         self._mask()
 
@@ -188,19 +199,24 @@ class Descent:
         without it.
         """
         smooth, pulls = self._gradient(), self.now.visibility_gradient
-        if pulls.any() and self._descend(smooth + pulls, TRIES_WITH_VISIBILITY):
-            return True
+        if pulls.any() and self.rest == 0:
+            if self._descend(smooth + pulls, TRIES_WITH_VISIBILITY):
+                self.rest_next = 1
+                return True
+            self.rest, self.rest_next = self.rest_next, min(2 * self.rest_next, REST_MAX)
+        self.rest = max(self.rest - 1, 0)
         return self._descend(smooth, TRIES)
 
     def paper_step(self) -> bool:
         """Move by learning rate times gradient, whatever that does to the loss; False if projection is refused."""
         gradient = self._gradient() + self.now.visibility_gradient
-        trial = self.points.copy()
-        trial[1:-1] += _clipped(-self.cfg.learning_rate * gradient[1:-1], self.cfg.step_cap_m)
-        loss = self._try(trial)
-        if np.isinf(loss):
+        trial, steps = self.points.copy(), -self.cfg.learning_rate * gradient[1:-1]
+        lengths = np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+        trial[1:-1] += steps * np.minimum(1.0, self.cfg.step_cap_m / lengths)
+        if not project(trial, self.problem, self.obstacles, 1, len(trial) - 1, self.now.nearby):
             return False
-        self._keep(trial, loss)
+        self.num_tried += 1
+        self._keep(trial, evaluate(trial, self.problem, self.obstacles, self.masked, self.next))
         return True
 
     def _descend(self, gradient: np.ndarray, num_tries: int) -> bool:
@@ -212,11 +228,12 @@ class Descent:
         hold_bounds(self.points, self.problem, self.now.contacts, band, gradient)
         scale, damping, as_a_whole = 1.0, self.damping.copy(), False
         for _ in range(num_tries):
-            steps = _solve(band, damping, gradient)
-            capped = _clipped(steps, self.cfg.step_cap_m, as_a_whole)
-            trial = self.points.copy()
-            trial[1:-1] += scale * capped
-            loss = self._try(trial)
+            trial = np.empty_like(self.points)
+            loss, is_capped = try_step(
+                self.points, band, gradient, damping + DAMPING_LEAST, scale, self.cfg.step_cap_m, as_a_whole,
+                self.problem, self.obstacles, self.masked, self.next, trial,
+            )  # fmt: skip
+            self.num_tried += 1
             if loss < self.loss:
                 self.damping = np.where(damping > DAMPING_FIRST / 10, damping * DAMPING_FALL, 0.0)
                 self._keep(trial, loss)
@@ -225,7 +242,7 @@ class Descent:
             if np.isfinite(loss) and rise.sum() > loss - self.loss:
                 worse = rise > 0.0
                 damping[worse] = np.maximum(DAMPING_RISE * damping[worse], DAMPING_FIRST)
-            elif not as_a_whole and capped is not steps:
+            elif not as_a_whole and is_capped:
                 as_a_whole = True
             else:
                 scale *= 0.25
@@ -239,15 +256,10 @@ class Descent:
         difference_gradient(self.points, self.problem, self.obstacles, self.masked, self.next, gradient)
         return gradient
 
-    def _try(self, trial: np.ndarray) -> float:
-        """Project a trial in place and give its loss, infinity if it is not feasible."""
-        if not project(trial, self.problem, self.obstacles, 1, len(trial) - 1):
-            return np.inf
-        return evaluate(trial, self.problem, self.obstacles, self.masked, self.next)
-
     def _keep(self, trial: np.ndarray, loss: float) -> None:
         self.points, self.loss = trial, loss
         self.now, self.next = self.next, self.now
+        remember_boxes(trial, self.problem, self.obstacles, self.now.nearby)
         self._mask()
 
     def _mask(self) -> None:
@@ -256,23 +268,3 @@ class Descent:
         if (masked != self.masked).any():
             self.masked = masked
             evaluate(self.points, self.problem, self.obstacles, masked, self.now)
-
-
-def _solve(band: np.ndarray, damping: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Give -(H + damping)^-1 g of the interior waypoints, (n - 2, 3). damping: (n,) per waypoint."""
-    interior = band[:, 3:-3].copy()
-    interior[0] += DAMPING_LEAST + np.repeat(damping[1:-1], 3)
-    right = -gradient[1:-1].reshape(-1)
-    rows = min(len(interior), interior.shape[1])
-    try:
-        return solveh_banded(interior[:rows], right, lower=True, check_finite=False).reshape(-1, 3)
-    except LinAlgError:  # rounding has made the model indefinite: each waypoint by its own curvature
-        return (right / interior[0]).reshape(-1, 3)
-
-
-def _clipped(steps: np.ndarray, cap_m: float, as_a_whole: bool = False) -> np.ndarray:
-    """Shorten steps to `cap_m`, each on its own or all by the same factor; gives `steps` itself if all are short."""
-    lengths = np.sqrt((steps**2).sum(axis=1, keepdims=True))
-    if lengths.max() <= cap_m:
-        return steps
-    return steps * np.minimum(1.0, cap_m / np.maximum(lengths.max() if as_a_whole else lengths, 1e-12))

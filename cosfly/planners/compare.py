@@ -1,0 +1,271 @@
+"""The planners side by side on the same walks: `cosfly plan compare` (app:three_axis_eval).
+
+The paper's axes, as its table's figures have them: visibility is the mean; path efficiency is the shortest mean length of a planner
+without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 - collision fraction) * clamp(least
+clearance / 5 m); each from the planner's means over all walks. "Blocked" is what is not visible, of all rays.
+Only walks that both planners fly are compared; the others are counted by the planner that failed.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import NoPathError
+from cosfly.planners import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
+from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.schema import DroneTrace, PedestrianPath, read_boxes, read_paths, write_traces
+from cosfly.store import Resume, StageFolder, read_json, write_bytes, write_json
+
+SCHEMA, VERSION = "cosfly.plan_compare", "1.0"
+FIRST, SECOND = "track_astar", "muco"  # deltas are the first's less the second's, rates the first's wins
+CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
+
+# Figures of one flight, in the order of the tables: name, title, digits.
+FIGURES = (
+    ("visibility_mean", "average visibility", 3),
+    ("blocked_fraction", "blocked visibility fraction", 3),
+    ("length_m", "path length (m)", 1),
+    ("duration_s", "flight time (s)", 1),
+    ("target_distance_mean_m", "target distance (m)", 1),
+    ("altitude_mean_m", "altitude (m)", 1),
+    ("accel_rms_mps2", "acceleration RMS (m/s2)", 3),
+    ("jerk_rms_mps3", "jerk RMS (m/s3)", 3),
+    ("smoothness_score", "smoothness score S", 3),
+    ("collision_fraction", "collision fraction", 3),
+    ("clearance_min_m", "min signed clearance (m)", 2),
+)
+AXES = ("visibility", "path_efficiency", "smoothness", "safety")
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def flight_figures(trace: DroneTrace) -> dict[str, float]:
+    """Give the figures of FIGURES of one flight."""
+    figures = {name: float(trace.metrics[name]) for name, _, _ in FIGURES if name in trace.metrics}
+    figures["blocked_fraction"] = round(1.0 - figures["visibility_mean"], 4)
+    figures["collision_fraction"] = round(float((trace.clearances_m < 0).mean()), 4)
+    return {name: figures[name] for name, _, _ in FIGURES}
+
+
+def mean_figures(flights: list[dict[str, float]]) -> dict[str, float]:
+    """Average figures over flights."""
+    return {name: round(float(np.mean([flight[name] for flight in flights])), 4) for name, _, _ in FIGURES}
+
+
+def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Give the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores).
+
+    Args:
+        means: planner -> mean figures.
+    """
+    free = [figures["length_m"] for figures in means.values() if figures["collision_fraction"] == 0]
+    shortest_m = min(free or [figures["length_m"] for figures in means.values()])
+    scores = {}
+    for planner, figures in means.items():
+        clear = float(np.clip(figures["clearance_min_m"] / CLEARANCE_SCALE_M, 0.0, 1.0))
+        axes = {
+            "visibility": figures["visibility_mean"],
+            "path_efficiency": shortest_m / figures["length_m"] if figures["length_m"] > 0 else 1.0,
+            "smoothness": 1.0 / (1.0 + figures["jerk_rms_mps3"]),
+            "safety": (1.0 - figures["collision_fraction"]) * clear,
+        }
+        axes["mean"] = sum(axes.values()) / len(axes)
+        scores[planner] = {name: round(value, 4) for name, value in axes.items()}
+    return scores
+
+
+def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
+    """Give difference and relative difference in percent for each figure; none where the second's is 0."""
+    table: dict[str, dict[str, float | None]] = {}
+    for name, _, _ in FIGURES:
+        change = first[name] - second[name]
+        relative = round(100.0 * change / second[name], 3) if second[name] else None
+        table[name] = {"delta": round(change, 4), "relative_percent": relative}
+    return table
+
+
+def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Count on how many walks the first planner is strictly better (tab:appendix_h_tastar_muco_win_rates)."""
+    pairs = list(zip(first, second, strict=True))
+    wins = {
+        "visibility_higher": [a["visibility_mean"] > b["visibility_mean"] for a, b in pairs],
+        "path_shorter": [a["length_m"] < b["length_m"] for a, b in pairs],
+        "jerk_lower": [a["jerk_rms_mps3"] < b["jerk_rms_mps3"] for a, b in pairs],
+        "clearance_larger": [a["clearance_min_m"] > b["clearance_min_m"] for a, b in pairs],
+        "both_collision_free": [a["collision_fraction"] == b["collision_fraction"] == 0 for a, b in pairs],
+    }
+    return {
+        name: {"count": sum(won), "of": len(pairs), "rate": round(sum(won) / len(pairs), 4)}
+        for name, won in wins.items()
+    }
+
+
+def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
+    """Compare flights of the same walks.
+
+    Args:
+        flights: planner -> traces, the same walks in the same order, at least one.
+    Returns:
+        The tables of `compare.json`.
+    """
+    figures = {planner: [flight_figures(trace) for trace in traces] for planner, traces in flights.items()}
+    means = {planner: mean_figures(rows) for planner, rows in figures.items()}
+    ids = [trace.path_id for trace in flights[FIRST]]
+    return {
+        "means": means,
+        "deltas": deltas(means[FIRST], means[SECOND]),
+        "axes": axis_scores(means),
+        "win_rates": win_rates(figures[FIRST], figures[SECOND]),
+        "scenarios": [
+            {"id": path_id, **{planner: rows[i] for planner, rows in figures.items()}} for i, path_id in enumerate(ids)
+        ],
+    }
+
+
+# --- stage ------------------------------------------------------------------------------------------------------------
+
+
+def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
+    """Load and index the map once; give the function that plans one walk with both planners."""
+    from cosfly.kernels import obstacle_index
+
+    obstacles = obstacle_index(read_boxes(simplified_map))
+    settings = {name: cfg.model_copy(update={"planner": name}) for name in (FIRST, SECOND)}
+    for planner in settings.values():
+        _warm_up(planner)
+
+    def work(item: Item) -> Outcome:
+        flights: dict[str, dict] = {}
+        errors: dict[str, NoPathError] = {}
+        times_ms: dict[str, float] = {}
+        for name, planner in settings.items():
+            begin_s = time.perf_counter()
+            try:
+                flights[name] = plan_flight(item.payload, obstacles, planner, seed).as_json()
+            except NoPathError as error:
+                errors[name] = error
+            times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
+        if len(errors) == len(settings):
+            raise errors[FIRST]
+        missing = f"no_{next(iter(errors))}_flight" if errors else None
+        result = {"flights": flights, "errors": {k: str(e) for k, e in errors.items()}, "times_ms": times_ms}
+        return Outcome(result, missing)
+
+    return work
+
+
+def run(
+    cfg: PlanConfig,
+    simplified_map: Path,
+    paths: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    resume: Resume = "if-same",
+) -> Path:
+    """Reads a simplified map and `path.json`, writes `compare.json`, both planners' flights and three pictures; gives the first.
+
+    A walk that one planner cannot fly is dropped with that planner's name, one that neither can is a failure.
+
+    Raises:
+        InputError: a file is not what it must be.
+        NoPathError: there is no walk that both fly.
+    """
+    from cosfly.planners.compare_plots import draw_overlay, draw_radar, draw_series
+
+    stage = StageFolder.open(
+        out, "plan_compare", config=cfg.model_dump(mode="json"), inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
+    )  # fmt: skip
+    product = out / "compare.json"
+    if stage.is_complete:
+        return product
+    box_map, walks = read_boxes(simplified_map), read_paths(paths)
+    _check_ids(walks, paths)
+    items = [Item(walk.path_id, walk) for walk in walks]
+    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
+    shared = [record for record in finished.records if record["status"] == "kept"]
+    if not shared:
+        raise NoPathError(
+            "there is no walk that both planners fly", where=paths, got=f"{len(walks)} walks", fix=f"see {out / 'items.jsonl'}"
+        )  # fmt: skip
+    flights = {
+        name: [
+            DroneTrace.from_json(r["result"]["flights"][name], f"{out}/items.jsonl: {r['id']}: {name}") for r in shared
+        ]
+        for name in (FIRST, SECOND)
+    }
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
+    summary = {
+        "planners": {name: PLANNERS[name] for name in flights},
+        **summarize(flights),
+        "left_out": _left_out(finished.records),
+    }
+    write_json(product, {"schema": SCHEMA, "schema_version": VERSION, **header, **summary})
+    outputs = [product]
+    for name, traces in flights.items():
+        outputs.append(out / f"drone_trace_{name}.json")
+        write_traces(outputs[-1], traces, {**header, "planner": name})
+    by_id = {walk.path_id: walk for walk in walks}
+    flown: list[PedestrianPath] = [by_id[record["id"]] for record in shared]
+    pictures = {
+        "compare_overlay.png": draw_overlay(box_map, flown, flights),
+        "compare_series.png": draw_series(flown, flights),
+        "compare_radar.png": draw_radar(summary["axes"]),
+    }
+    for name, picture in pictures.items():
+        outputs.append(out / name)
+        write_bytes(outputs[-1], picture)
+    stage.finish(outputs, finished.tally, timings=_timings(shared))
+    return product
+
+
+def _left_out(records: list[dict]) -> list[dict[str, str]]:
+    """Walks that are not compared, with the reason of the planner that failed; of a walk that neither flies, the shared one."""
+    rows = []
+    for record in records:
+        if record["status"] == "failed":
+            rows.append({"id": record["id"], "planner": "both", "message": record["message"]})
+        elif record["status"] == "dropped":
+            rows += [{"id": record["id"], "planner": k, "message": v} for k, v in record["result"]["errors"].items()]
+    return rows
+
+
+def _timings(shared: list[dict]) -> dict[str, dict[str, float]]:
+    """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
+    table = {}
+    for name in (FIRST, SECOND):
+        times_ms = np.array([record["result"]["times_ms"][name] for record in shared])
+        table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
+    return table
+
+
+def table_rows(product: Path) -> dict[str, list[list[str]]]:
+    """Read `compare.json` and its manifest back as rows of text for the terminal: figures, axes, wins."""
+    record = read_json(product, what="comparison")
+    timings = read_json(product.parent / "manifest.json", what="manifest").get("timings", {})
+    means, change = record["means"], record["deltas"]
+    figures = []
+    for name, title, digits in FIGURES:
+        relative = change[name]["relative_percent"]
+        figures.append([
+            title, *(f"{means[planner][name]:.{digits}f}" for planner in (FIRST, SECOND)),
+            f"{change[name]['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}",
+        ])  # fmt: skip
+    if timings:
+        figures.append(
+            ["planning time (ms)", *(f"{timings[planner]['mean_ms']:.1f}" for planner in (FIRST, SECOND)), "", ""]
+        )
+    axes = [
+        [name.replace("_", " "), *(f"{record['axes'][planner][name]:.3f}" for planner in (FIRST, SECOND))]
+        for name in (*AXES, "mean")
+    ]
+    wins = [
+        [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
+        for name, row in record["win_rates"].items()
+    ]
+    return {"figures": figures, "axes": axes, "wins": wins}

@@ -1,0 +1,123 @@
+"""What an optimiser remembers between iterations: for each waypoint, the few boxes that can matter to it while it stays near a place.
+
+A waypoint moves half a metre an iteration, so the boxes round it and between it and its target are the same for several. Answers do
+not depend on what is remembered: a waypoint that has left its place, or has too many boxes round it, is looked up in the index.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cosfly.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box
+
+MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often
+MOVED_M = 0.9  # looked up anew beyond this, so that the trial steps of the next iteration stay within MARGIN_M
+ROOM = 32  # boxes that are remembered for a waypoint; a list longer than this is not kept
+
+
+class Nearby(NamedTuple):
+    """Remembered boxes of n waypoints.
+
+    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is remembered. around, on_view: (n, ROOM) boxes within
+    reach of the waypoint, and across the view of its target. num_around, num_on_view: (n,) how many, -1 for more than ROOM.
+    """
+
+    anchors: np.ndarray
+    around: np.ndarray
+    num_around: np.ndarray
+    on_view: np.ndarray
+    num_on_view: np.ndarray
+
+
+@njit(cache=True)
+def nothing_nearby(num_points):
+    """Give a memory that holds nothing yet: every question goes to the index."""
+    return Nearby(
+        np.full((num_points, 3), np.inf),
+        np.zeros((num_points, ROOM), dtype=np.int64),
+        np.zeros(num_points, dtype=np.int64),
+        np.zeros((num_points, ROOM), dtype=np.int64),
+        np.zeros(num_points, dtype=np.int64),
+    )
+
+
+@njit(cache=True)
+def remember(nearby, index, points, targets, reach_m, spread_m):
+    """Look up the boxes of waypoints that have moved since they were looked up, in place.
+
+    Args:
+        points, targets: (n, 3) m. reach_m, spread_m: greatest distance and growth of boxes that will be asked for.
+    """
+    found = np.empty(ROOM + 1, dtype=np.int64)
+    for i in range(len(points)):
+        p, x = points[i], targets[i]
+        dx, dy, dz = p[0] - nearby.anchors[i, 0], p[1] - nearby.anchors[i, 1], p[2] - nearby.anchors[i, 2]
+        if dx * dx + dy * dy + dz * dz <= MOVED_M * MOVED_M:
+            continue
+        nearby.anchors[i] = p
+        # A segment without length, grown: every box nearer than that on each axis of its own frame.
+        grown = reach_m + MARGIN_M
+        count = collect_hits(index, p[0], p[1], p[2], p[0], p[1], p[2], grown, found)
+        nearby.num_around[i] = count if count <= ROOM else -1
+        nearby.around[i] = found[:ROOM]
+        count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], spread_m + MARGIN_M, found)
+        nearby.num_on_view[i] = count if count <= ROOM else -1
+        nearby.on_view[i] = found[:ROOM]
+
+
+@njit(cache=True, inline="always")
+def _moved(nearby, i, x, y, z):
+    """Squared distance of a place from where waypoint i was looked up."""
+    dx, dy, dz = x - nearby.anchors[i, 0], y - nearby.anchors[i, 1], z - nearby.anchors[i, 2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@njit(cache=True, inline="always")
+def known(anchors, numbers, i, x, y, z):
+    """Number of boxes that memory holds for a place of waypoint i, -1 where the index must be asked.
+
+    numbers: num_around or num_on_view. Arrays come one by one: see loss.py on the cost of tuples.
+    """
+    dx, dy, dz = x - anchors[i, 0], y - anchors[i, 1], z - anchors[i, 2]
+    return numbers[i] if dx * dx + dy * dy + dz * dz <= MARGIN_M * MARGIN_M else -1
+
+
+@njit(cache=True)
+def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
+    """The same as `nearest_box`, of boxes[i, :count] only."""
+    best, best_box = reach_m, -1
+    for k in range(count):
+        box = boxes[i, k]
+        dx = max(rows[box, 15] - x, 0.0, x - rows[box, 18])
+        dy = max(rows[box, 16] - y, 0.0, y - rows[box, 19])
+        dz = max(rows[box, 17] - z, 0.0, z - rows[box, 20])
+        gap = dx * dx + dy * dy + dz * dz
+        if gap > 0.0 and (best <= 0.0 or gap >= best * best):
+            continue
+        distance = distance_to_box(rows, box, x, y, z)
+        if distance < best:
+            best, best_box = distance, box
+    return best, best_box
+
+
+@njit(cache=True)
+def nearest_of(nearby, i, index, x, y, z, reach_m):
+    """The same as `nearest_box` for a place of waypoint i, from memory where that suffices."""
+    count = known(nearby.anchors, nearby.num_around, i, x, y, z)
+    if count < 0:
+        return nearest_box(index, x, y, z, reach_m)
+    return nearest_among(index.rows, nearby.around, i, count, x, y, z, reach_m)
+
+
+@njit(cache=True)
+def hits_among(rows, boxes, i, count, ax, ay, az, bx, by, bz, inflate_m, out):
+    """The same as `collect_hits`, of boxes[i, :count] only."""
+    found = 0
+    for k in range(count):
+        if segment_hits_box(rows, boxes[i, k], ax, ay, az, bx, by, bz, inflate_m):
+            out[found] = boxes[i, k]
+            found += 1
+    return found

@@ -1,0 +1,169 @@
+"""How long planners take for a flight, how good the flights are, and how MuCO's optimiser compares with scipy's L-BFGS-B.
+
+python tests/benchmarks/bench_planning.py [--maps a b c] [--planners muco ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+import numpy as np
+import scenes
+from scipy.optimize import minimize
+
+from cosfly.errors import NoPathError
+from cosfly.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
+from cosfly.planners import PLANNERS, PlanConfig, Scenario, load_planner, make_scenario, metrics, muco, start
+from cosfly.planners.loss import evaluate, make_state
+from cosfly.runner import rng_for
+
+SHORT_POINTS = 121  # the paper's SimWorld flight
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Twenty scenarios on one map."""
+
+    name: str
+    obstacles: BoxIndex
+    scenarios: list[Scenario]
+
+
+def make_scenes(wanted: list[str]) -> list[Scene]:
+    found = []
+    if "a" in wanted:
+        town = scenes.simplified(scenes.town())
+        walks, obstacles = scenes.walks_on(town), obstacle_index(town)
+        short = [scenes.first_points(walk, SHORT_POINTS) for walk in walks if len(walk.time_s) >= SHORT_POINTS]
+        for name, chosen in (("(a) town", walks), (f"(a) first {SHORT_POINTS} points", short)):
+            found.append(Scene(name, obstacles, [make_scenario(walk, obstacles) for walk in chosen]))
+    city = scenes.city() if {"b", "c"} & set(wanted) else None
+    if city is not None:
+        simple = scenes.simplified(city)
+        walks = scenes.walks_on(simple, ground="paved")
+        tiles = {"b": (1, 1), "c": (12, 12)}
+        for key, (columns, rows) in tiles.items():
+            if key not in wanted:
+                continue
+            obstacles = obstacle_index(scenes.tiled(simple, columns, rows))
+            low, high = simple.bounds()
+            shift = np.append((high - low + scenes.CITY_GAP_M)[:2] * (columns // 2, rows // 2), 0.0)
+            scenarios = [make_scenario(scenes.moved(walk, shift), obstacles) for walk in walks]
+            found.append(Scene(f"({key}) city {columns} x {rows}", obstacles, scenarios))
+    return found
+
+
+def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
+    """Times and quality of one planner over a scene."""
+    plan = load_planner(planner)
+    times, facts, failed = [], [], 0
+    for scenario in scene.scenarios:
+        try:
+            ms, made = scenes.cpu_ms(
+                lambda s=scenario: plan(s, scene.obstacles, cfg, rng_for(scenes.SEED, "plan", s.path_id))
+            )
+        except NoPathError:
+            failed += 1
+            continue
+        p = made.positions_m
+        seen = visibility(scene.obstacles, p, scenario.targets_m).mean()
+        hits = segments_hit(scene.obstacles, p[:-1], p[1:]).any()
+        accel, jerk = metrics.accel_rms(p), metrics.jerk_rms(p)
+        smooth = accel <= cfg.accel_rms_max_mps2 and jerk <= cfg.jerk_rms_max_mps3
+        times.append(ms)
+        facts.append(
+            (len(p), seen, signed_distances(scene.obstacles, p, 100.0)[0].min(), hits, smooth, metrics.length_m(p))
+        )
+    table, all_ms = np.array(facts, dtype=float), np.array(times)
+    return [
+        scene.name, planner, scene.obstacles.num_boxes, f"{len(facts)} + {failed}", round(table[:, 0].mean()), float(all_ms.mean()),
+        float(np.percentile(all_ms, 95)), float(all_ms.max()), f"{table[:, 1].mean():.3f}", f"{table[:, 1].min():.3f}",
+        f"{table[:, 2].min():.2f}", int(table[:, 3].sum()), f"{int(table[:, 4].sum())} of {len(facts)}", float(table[:, 5].mean()),
+    ]  # fmt: skip
+
+
+def best_possible(scene: Scene, cfg: PlanConfig) -> float:
+    """Mean over frames of the best visibility from any free place on a lattice round the walker: no flight can see more.
+
+    Every sixth frame; 24 directions, seven distances up to 55 m, seven altitudes up to the greatest. A flight must also be
+    continuous, so this is above what one can reach.
+    """
+    radii, turns = np.array([0.0, 6.0, 12.0, 20.0, 28.0, 40.0, 55.0]), np.arange(24) * (2.0 * np.pi / 24)
+    heights = np.geomspace(cfg.altitude_min_m, cfg.altitude_max_m, 7)
+    radius, turn, height = (a.ravel() for a in np.meshgrid(radii, turns, heights, indexing="ij"))
+    lattice = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+    means = []
+    for scenario in scene.scenarios:
+        best = []
+        for target in scenario.targets_m[::6]:
+            places = lattice + np.array([target[0], target[1], scenario.ground_m])
+            free = places[signed_distances(scene.obstacles, places, cfg.safety_distance_m)[0] >= cfg.relaxed_safety_m]
+            best.append(visibility(scene.obstacles, free, np.repeat(target[None], len(free), axis=0)).max())
+        means.append(np.mean(best))
+    return float(np.mean(means))
+
+
+def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
+    """The same loss, start and bounds for both; times of the optimisation alone."""
+    rows = []
+    for scenario in scene.scenarios:
+        headings = start.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
+        problem = muco.make_problem(scenario, headings, cfg)
+        first, _ = muco.start_trajectory(scenario, headings, problem, scene.obstacles, cfg)
+        ms, (_, solver) = scenes.cpu_ms(lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, cfg.muco))
+        state, unmasked = make_state(len(first), scene.obstacles.num_boxes), np.zeros(len(first), dtype=bool)
+
+        def loss_and_gradient(interior, first=first, problem=problem, state=state, unmasked=unmasked):
+            points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
+            value = evaluate(points, problem, scene.obstacles, unmasked, state)
+            return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
+
+        bounds = [(None, None), (None, None), tuple(problem.altitudes[[0, 2]])] * (len(first) - 2)
+        peer_ms, peer = scenes.cpu_ms(
+            lambda f=first, call=loss_and_gradient, b=bounds: minimize(
+                call, f[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=b, options={"maxiter": 3000, "maxfun": 6000}
+            )
+        )  # fmt: skip
+        rows.append(
+            (ms, peer_ms, solver["loss_end"] / peer.fun, solver["iterations"], solver["evaluations"], peer.nfev)
+        )
+    table = np.array(rows)
+    return [
+        scene.name, float(table[:, 0].mean()), float(table[:, 1].mean()), f"{table[:, 1].mean() / table[:, 0].mean():.1f}",
+        f"{np.median(table[:, 2]):.3f}", f"{table[:, 2].max():.3f}", f"{int((table[:, 2] <= 1.05).sum())} of {len(table)}",
+        float(table[:, 3].mean()), float(table[:, 4].mean()), float(table[:, 5].mean()),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--maps", nargs="+", default=["a", "b", "c"], choices=["a", "b", "c"])
+    parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS))
+    options = parser.parse_args()
+    scenes.print_machine()
+    cfg, found, rows = PlanConfig(), make_scenes(options.maps), []
+    for planner in options.planners:
+        first = Scene("warm-up", found[0].obstacles, found[0].scenarios[:2])
+        warm_up_ms, _ = scenes.cpu_ms(lambda p=planner, s=first: measure(s, p, cfg))
+        print(f"{planner}: first two flights with compilation or its cache {warm_up_ms / 1e3:.2f} s")
+        rows += [measure(scene, planner, cfg) for scene in found]
+    print()
+    bounds = [[scene.name, f"{best_possible(scene, cfg):.3f}"] for scene in found if "(c)" not in scene.name]
+    scenes.print_table("mean visibility that no flight can exceed", ["map", "best of all free places"], bounds)
+    names = [
+        "map", "planner", "obstacles", "flights + failed", "points", "mean ms", "p95 ms", "max ms", "visibility", "worst",
+        "clearance, m", "collisions", "smooth", "length, m",
+    ]  # fmt: skip
+    scenes.print_table("planning, start included", names, rows)
+    names = [
+        "map", "MuCO, ms", "L-BFGS-B, ms", "times faster", "median loss ratio", "greatest", "within 5 %", "iterations",
+        "evaluations", "of L-BFGS-B",
+    ]  # fmt: skip
+    scenes.print_table(
+        "the same loss from the same start", names, [compare_with_scipy(s, cfg) for s in found if "(c)" not in s.name]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""What the benchmarks measure on, and how: three maps, walks over them, CPU times, tables. Writes nothing into the repository."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosfly.config import build
+from cosfly.maps import MapsConfig, load_map
+from cosfly.pedestrians import PedestriansConfig, make_walk, walkable_ground
+from cosfly.runner import rng_for
+from cosfly.schema import BoxMap, PedestrianPath
+from cosfly.simplify import SimplifyConfig, simplify
+
+SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+NUM_WALKS, SEED = 20, 0
+CITY_GAP_M = 20.0  # between the tiles of map (c)
+
+
+def town() -> BoxMap:
+    """Map (a): the synthetic town with the paper's box census, raw."""
+    return load_map(build(MapsConfig, {"synthetic": {"preset": "town10", "name": "Town"}}, "benchmark"), seed=SEED)
+
+
+def city() -> BoxMap | None:
+    """Map (b): the SimWorld city, raw; None where the shared data are absent."""
+    world = SHARED_DATA / "simworld-progen" / "progen_world.json"
+    if not world.is_file():
+        print(f"(map (b) is left out: {world} is not here)")
+        return None
+    return load_map(build(MapsConfig, {"source": "simworld", "simworld": {"world": str(world)}}, "benchmark"))
+
+
+def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
+    """Copies of a map side by side; the first copy stays where the map is."""
+    low, high = box_map.bounds()
+    step = high[:2] - low[:2] + CITY_GAP_M
+    shifts = np.array([(column * step[0], row * step[1], 0.0) for row in range(rows) for column in range(columns)])
+    count, tiles = len(box_map), len(shifts)
+    return BoxMap(
+        (box_map.centers[None] + shifts[:, None]).reshape(-1, 3),
+        np.tile(box_map.half_extents, (tiles, 1)),
+        np.tile(box_map.rotations_deg, (tiles, 1)),
+        np.tile(box_map.kinds, tiles),
+        np.arange(1, count * tiles + 1, dtype=np.uint64),
+        {**box_map.header, "name": f"{box_map.name}{columns}x{rows}"},
+    )
+
+
+def cut_to(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
+    """The boxes that lie within `size_m` of the map's low corner."""
+    low, _ = box_map.bounds()
+    return box_map.select((box_map.maxs[:, :2] <= low[:2] + np.array(size_m)).all(axis=1))
+
+
+def simplified(raw: BoxMap) -> BoxMap:
+    return simplify(raw, SimplifyConfig()).box_map
+
+
+def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianPath]:
+    """20 walks of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
+    cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
+    ground = walkable_ground(box_map, cfg)
+    names = [f"path_{k:05d}" for k in range(NUM_WALKS)]
+    return [make_walk(name, ground, cfg, rng_for(SEED, "pedestrians", name)).path for name in names]
+
+
+def moved(walk: PedestrianPath, shift_m: np.ndarray) -> PedestrianPath:
+    return replace(walk, polyline_m=walk.polyline_m + shift_m[:2], positions_m=walk.positions_m + shift_m)
+
+
+def first_points(walk: PedestrianPath, count: int) -> PedestrianPath:
+    return replace(
+        walk, time_s=walk.time_s[:count], positions_m=walk.positions_m[:count], speeds_mps=walk.speeds_mps[:count]
+    )
+
+
+def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Processor time of one call, all threads together, and what the call gave."""
+    begin = time.process_time()
+    result = function()
+    return 1e3 * (time.process_time() - begin), result
+
+
+def print_machine() -> None:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    print(
+        f"{len(models)} cores of {models[0] if models else 'an unknown processor'}; times are CPU times of one process\n"
+    )
+
+
+def print_table(title: str, names: list[str], rows: list[list[Any]]) -> None:
+    """Print a Markdown table."""
+    print(f"{title}\n\n| " + " | ".join(names) + " |\n|" + "---|" * len(names))
+    for row in rows:
+        print("| " + " | ".join(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row) + " |")
+    print()

@@ -1,0 +1,95 @@
+"""Remembered boxes give the answers of the index; the band solver those of a library; a flight does not depend on the memory."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import solveh_banded
+
+from cosfly import kernels
+from cosfly.planners import PlanConfig, Scenario, loss, muco, nearby, start
+
+
+def random_boxes(rng, count, size_m=40.0):
+    turn = rng.uniform(-np.pi, np.pi, count)
+    rotations = np.zeros((count, 3, 3))
+    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(turn)
+    rotations[:, 1, 0], rotations[:, 0, 1], rotations[:, 2, 2] = np.sin(turn), -np.sin(turn), 1.0
+    return kernels.index_boxes(
+        rng.uniform(-size_m, size_m, (count, 3)) * [1, 1, 0.3] + [0, 0, 10], rng.uniform(0.2, 6, (count, 3)), rotations
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), count=st.sampled_from([0, 1, 8, 40, 400]), far=st.booleans())
+def test_memory_answers_as_the_index_does(seed, count, far):
+    rng = np.random.default_rng(seed)
+    index = random_boxes(rng, count)  # 400 boxes: more round a waypoint than there is room for
+    places, targets = rng.uniform(-40, 40, (2, 6, 3)) * [1, 1, 0.3] + [0, 0, 10]
+    memory = nearby.nothing_nearby(len(places))
+    nearby.remember(memory, index, places, targets, 8.0, 0.8)
+    moves = rng.normal(size=places.shape)
+    moves *= (4.0 if far else rng.uniform(0, nearby.MARGIN_M)) / np.linalg.norm(moves, axis=1, keepdims=True)
+    room = np.empty(max(count, 1), dtype=np.int64)
+    for i, (p, x) in enumerate(zip(places + moves, targets, strict=True)):
+        gap, box = nearby.nearest_of(memory, i, index, *p, 8.0)
+        expected, nearest = kernels.nearest_box(index, *p, 8.0)
+        assert gap == expected
+        assert (box < 0) == (nearest < 0)
+        number = nearby.known(memory.anchors, memory.num_on_view, i, *p)
+        wanted = set(room[: kernels.collect_hits(index, *x, *p, 0.8, room)].tolist())
+        if number >= 0:
+            assert not far
+            hits = nearby.hits_among(index.rows, memory.on_view, i, number, *x, *p, 0.8, room)
+            assert set(room[:hits].tolist()) == wanted
+
+
+def test_a_memory_of_nothing_knows_nothing():
+    memory = nearby.nothing_nearby(2)
+    assert nearby.known(memory.anchors, memory.num_around, 0, 0.0, 0.0, 0.0) == -1
+
+
+@pytest.mark.parametrize("num_points", [3, 4, 5, 30])
+def test_the_band_solver_agrees_with_a_library(num_points):
+    rng = np.random.default_rng(num_points)
+    size = 3 * num_points
+    factor = np.tril(rng.normal(size=(size, size))) * (np.abs(np.subtract.outer(range(size), range(size))) < 10)
+    matrix = factor @ factor.T + 5 * np.eye(size)
+    matrix *= np.abs(np.subtract.outer(range(size), range(size))) < loss.BAND_ROWS
+    matrix += np.diag(np.abs(matrix).sum(axis=1))
+    band = np.zeros((loss.BAND_ROWS, size))
+    for k in range(min(loss.BAND_ROWS, size)):
+        band[k, : size - k] = np.diag(matrix, -k)
+    damping, gradient = rng.uniform(0, 3, num_points), rng.normal(size=(num_points, 3))
+    interior = band[: min(loss.BAND_ROWS, size - 6), 3:-3].copy()
+    interior[0] += np.repeat(damping[1:-1], 3)
+    expected = solveh_banded(interior, -gradient[1:-1].reshape(-1), lower=True).reshape(-1, 3)
+    np.testing.assert_allclose(loss.solve_band(band, damping, gradient), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_an_indefinite_model_gives_each_waypoint_its_own_step():
+    band = np.zeros((loss.BAND_ROWS, 15))
+    band[0], band[3] = 1.0, 5.0
+    steps = loss.solve_band(band, np.ones(5), np.ones((5, 3)))
+    np.testing.assert_allclose(steps, -0.5)
+
+
+def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
+    cfg, rng = PlanConfig(), np.random.default_rng(0)
+    obstacles = random_boxes(rng, 60)
+    obstacles.rows[:, 2] = 0.0  # low boxes: some hide the walk, some stand in the way
+    obstacles = kernels.index_boxes(
+        obstacles.rows[:, :3], obstacles.rows[:, 3:6] * [1, 1, 4], obstacles.rows[:, 6:15].reshape(-1, 3, 3)
+    )
+    targets = np.column_stack([np.linspace(-30, 30, 80), np.full(80, 2.0), np.full(80, 1.0)])
+    scenario = Scenario("w", targets, 0.0)
+    headings = start.smoothed_headings(targets, 4.0)
+    problem = muco.make_problem(scenario, headings, cfg)
+    first, _ = muco.start_trajectory(scenario, headings, problem, obstacles, cfg)
+    points, solver = muco.optimize(first, problem, obstacles, cfg.muco)
+    monkeypatch.setattr(muco, "remember_boxes", lambda *_: None)
+    without, solver_without = muco.optimize(first, problem, obstacles, cfg.muco)
+    np.testing.assert_array_equal(points, without)
+    assert solver == solver_without
+    assert solver["iterations"] > 5
+    assert solver["terms"]["visibility"] > 0

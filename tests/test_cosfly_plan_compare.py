@@ -1,0 +1,189 @@
+"""The comparison of planners: the paper's own tables as known answers, the stage, its pictures and its command."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from test_cosfly_planners import CANYON, town_of, walk_along
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import NoPathError
+from cosfly.planners import PlanConfig, compare, compare_plots
+from cosfly.schema import read_traces, write_boxes, write_paths
+
+CFG = PlanConfig()
+
+# tab:appendix_h_tastar_muco_delta and tab:appendix_h_four_axis_scores of the paper.
+PAPER = {
+    "track_astar": {"visibility_mean": 0.979, "length_m": 104.479, "accel_rms_mps2": 0.673, "jerk_rms_mps3": 0.919, "clearance_min_m": 4.029},
+    "muco": {"visibility_mean": 0.894, "length_m": 108.838, "accel_rms_mps2": 0.738, "jerk_rms_mps3": 0.773, "clearance_min_m": 2.754},
+    "spline": {"visibility_mean": 0.618, "length_m": 85.73, "jerk_rms_mps3": 1.433, "clearance_min_m": 1.775},
+}  # fmt: skip
+SCORES = {
+    "track_astar": (0.979, 0.821, 0.521, 0.806, 0.782),
+    "muco": (0.894, 0.788, 0.564, 0.551, 0.699),
+    "spline": (0.618, 1.000, 0.411, 0.355, 0.596),
+}
+
+
+def figures(**given):
+    return {name: 0.0 for name, _, _ in compare.FIGURES} | given
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def test_axis_scores_are_the_papers():
+    scores = compare.axis_scores({name: figures(**row) for name, row in PAPER.items()})
+    for name, expected in SCORES.items():
+        assert list(scores[name].values()) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_planner_that_collides_does_not_set_the_shortest_path_and_is_less_safe():
+    means = {name: figures(**row) for name, row in PAPER.items()}
+    means["jerk"] = figures(visibility_mean=0.624, length_m=84.4, jerk_rms_mps3=1.732, collision_fraction=0.002, clearance_min_m=1.137)  # fmt: skip
+    scores = compare.axis_scores(means)
+    assert scores["spline"]["path_efficiency"] == 1.0
+    assert scores["jerk"]["path_efficiency"] == pytest.approx(1.016, abs=1e-3)
+    assert scores["jerk"]["safety"] == pytest.approx(0.227, abs=1e-3)
+
+
+def test_clearance_counts_up_to_five_metres_and_not_below_zero():
+    scores = compare.axis_scores(
+        {"a": figures(length_m=1.0, clearance_min_m=50.0), "b": figures(length_m=1.0, clearance_min_m=-2.0)}
+    )
+    assert (scores["a"]["safety"], scores["b"]["safety"]) == (1.0, 0.0)
+
+
+def test_deltas_are_the_papers():
+    table = compare.deltas(figures(**PAPER["track_astar"]), figures(**PAPER["muco"]))
+    assert table["length_m"] == {"delta": -4.359, "relative_percent": pytest.approx(-4.005, abs=1e-3)}
+    assert table["clearance_min_m"]["relative_percent"] == pytest.approx(46.283, abs=0.02)
+    assert table["collision_fraction"] == {"delta": 0.0, "relative_percent": None}
+
+
+def test_win_rates_count_strict_wins():
+    first = [figures(visibility_mean=v, length_m=1.0, jerk_rms_mps3=2.0, clearance_min_m=3.0) for v in (0.9, 0.8, 0.7)]
+    second = [figures(visibility_mean=0.8, length_m=2.0, jerk_rms_mps3=1.0, clearance_min_m=3.0) for _ in first]
+    second[2]["collision_fraction"] = 0.1
+    rates = compare.win_rates(first, second)
+    assert {name: row["count"] for name, row in rates.items()} == {
+        "visibility_higher": 1, "path_shorter": 3, "jerk_lower": 0, "clearance_larger": 0, "both_collision_free": 2
+    }  # fmt: skip
+    assert rates["visibility_higher"]["rate"] == pytest.approx(1 / 3, abs=1e-4)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 1), (0, 93), (18, 60), (-0.03, 1.05), (0, 0.5)])
+def test_ticks_are_few_and_round(low, high):
+    ticks = compare_plots._ticks(low, high)
+    assert 3 <= len(ticks) <= 8
+    assert low - 1e-9 <= ticks[0]
+    assert ticks[-1] <= high + 1e-9
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
+    walks = [
+        walk_along("a", [(0, 0), (30, 0)]),
+        walk_along("into_wall", [(60, -50), (60, -30)]),
+        walk_along("b", [(30, 2), (60, 2)]),
+    ]
+    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
+    return folder / "map.json", folder / "path.json"
+
+
+@pytest.fixture(scope="module")
+def made(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("made") / "compare"
+    compare.run(CFG, *inputs, out)
+    return out
+
+
+def test_the_record_is_what_the_flights_are(made):
+    record = json.loads((made / "compare.json").read_text())
+    manifest = json.loads((made / "manifest.json").read_text())
+    assert manifest["counts"] == {"input": 3, "kept": 2, "dropped": {}, "failed": {"no_path": 1}}
+    assert record["left_out"][0]["id"] == "into_wall"
+    assert [row["id"] for row in record["scenarios"]] == ["a", "b"]
+    for planner in ("track_astar", "muco"):
+        traces = read_traces(made / f"drone_trace_{planner}.json")
+        assert {trace.planner for trace in traces} == {planner}
+        seen = np.mean([trace.visibility.mean() for trace in traces])
+        assert record["means"][planner]["visibility_mean"] == pytest.approx(seen, abs=1e-4)
+        assert record["means"][planner]["blocked_fraction"] == pytest.approx(1 - seen, abs=1e-3)
+        assert record["means"][planner]["collision_fraction"] == 0
+        assert manifest["timings"][planner]["mean_ms"] > 0
+    assert record["win_rates"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}
+
+
+def test_pictures_hold_both_colors(made):
+    for name in ("compare_overlay.png", "compare_series.png", "compare_radar.png"):
+        picture = cv2.imread(str(made / name))[..., ::-1].reshape(-1, 3).astype(int)
+        for color in compare_plots.COLORS.values():
+            assert (np.abs(picture - color).max(axis=1) <= 2).sum() > 100, name
+
+
+def test_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
+    compare.run(CFG, *inputs, tmp_path / "two", workers=2)
+    products = [entry["path"] for entry in json.loads((made / "manifest.json").read_text())["outputs"]]
+    assert len(products) == 6
+    for name in products:
+        assert (tmp_path / "two" / name).read_bytes() == (made / name).read_bytes(), name
+
+
+def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeypatch):
+    real = compare.plan_flight
+
+    def lame(walk, obstacles, cfg, seed):
+        if walk.path_id == "b" and cfg.planner == "muco":
+            raise NoPathError("lame", where="b")
+        return real(walk, obstacles, cfg, seed)
+
+    monkeypatch.setattr(compare, "plan_flight", lame)
+    record = json.loads(compare.run(CFG, *inputs, tmp_path / "out").read_text())
+    manifest = json.loads((tmp_path / "out/manifest.json").read_text())
+    assert manifest["counts"]["dropped"] == {"no_muco_flight": 1}
+    assert {(row["id"], row["planner"]) for row in record["left_out"]} == {("into_wall", "both"), ("b", "muco")}
+
+
+def test_nothing_to_compare_is_an_error(inputs, tmp_path):
+    write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
+    with pytest.raises(NoPathError, match="both planners"):
+        compare.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "out")
+    assert not (tmp_path / "out/manifest.json").exists()
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_the_tables(inputs, made):
+    result = CliRunner().invoke(app, ["plan", "compare", *map(str, inputs), "--out", str(made)])
+    assert result.exit_code == 0, result.output
+    assert str(made / "compare.json") in result.output.replace("\n", "")
+
+
+def test_rows_for_the_terminal(made):
+    tables = compare.table_rows(made / "compare.json")
+    assert len(tables["figures"]) == len(compare.FIGURES) + 1
+    assert ["both collision free", "2 of 2", "1.000"] in tables["wins"]
+    assert [row[0] for row in tables["axes"]] == ["visibility", "path efficiency", "smoothness", "safety", "mean"]
+
+
+@pytest.mark.parametrize("missing", ["--map", "--paths", "--out"])
+def test_the_stage_command_still_needs_its_options(missing):
+    given = {"--map": "m", "--paths": "p", "--out": "o"}
+    del given[missing]
+    result = CliRunner().invoke(app, ["plan", *[word for pair in given.items() for word in pair]])
+    assert result.exit_code == 2
+    assert missing in result.output
+
+
+def test_a_comparison_needs_map_and_paths():
+    assert CliRunner().invoke(app, ["plan", "compare"]).exit_code == 2

@@ -1,0 +1,273 @@
+"""TA*+Smooth: sight and search against slow plain versions, whole flights over hand-made maps, every acceptance criterion."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_cosfly_planners import CANYON, WORLDS, assert_safe, scenario_of, town_of, walk_along
+
+import cosfly.planners as planners
+from cosfly import kernels
+from cosfly.errors import NoPathError
+from cosfly.planners import PlanConfig, TrackAStarConfig, smooth, track_astar
+
+CFG = PlanConfig(planner="track_astar")
+
+
+def random_town(seed):
+    """Fifty turned boxes round the origin, some above it, some beside it, one of them small."""
+    rng = np.random.default_rng(seed)
+    centers = np.column_stack([rng.uniform(-60, 60, (50, 2)), rng.uniform(0, 40, 50)])
+    halves, turns = rng.uniform(0.2, 9, (50, 3)), rng.uniform(-180, 180, 50)
+    return kernels.obstacle_index(town_of(*zip(centers, halves, turns, strict=True)))
+
+
+# --- sight ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_look_sees_what_the_kernel_sees(seed):
+    obstacles, rng = random_town(seed), np.random.default_rng(seed)
+    target = np.array([*rng.uniform(-30, 30, 2), 1.0])
+    points = target + np.column_stack([rng.uniform(-60, 60, (800, 2)), rng.uniform(19, 90, 800)])
+    points[0] = target + np.array([0, 0, 30])  # straight above
+    horizon = track_astar.make_horizon(obstacles, target, np.hypot(*(points - target)[:, :2].T).max())
+    seen = [track_astar.look(obstacles, horizon, target, *point) for point in points]
+    expected = kernels.visibility(obstacles, points, np.repeat(target[None], len(points), axis=0))
+    np.testing.assert_array_equal(seen, expected)
+    assert 0.02 < expected.mean() < 0.98  # the sample holds both
+
+
+def test_without_boxes_everything_is_seen():
+    obstacles, target = kernels.obstacle_index(town_of()), np.array([0.0, 0.0, 1.0])
+    horizon = track_astar.make_horizon(obstacles, target, 50.0)
+    assert track_astar.look(obstacles, horizon, target, 10.0, 0.0, 20.0) == 1.0
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+
+
+def cost_of(places, targets, obstacles, cfg, start):
+    """The cost of a sequence of places, straight from the docstring of the module."""
+    s, total = cfg.track_astar, 0.0
+    for k, (p, x) in enumerate(zip(places, targets, strict=True)):
+        aside, climb = np.hypot(*(p - x)[:2]) - cfg.behind_distance_m, p[2] - cfg.altitude_preferred_m
+        total += s.weight_tracking * (aside**2 + climb**2) / cfg.behind_distance_m**2
+        total += s.weight_visibility * (1 - kernels.visibility(obstacles, p[None], x[None])[0])
+        gap = kernels.signed_distances(obstacles, p[None])[0][0]
+        total += s.weight_safety * max(0, 1 - gap / s.influence_m) ** 2
+        total += s.weight_path * np.linalg.norm(p - (places[k - 1] if k else start)) / s.voxel_m
+        before = places[k - 1] - places[k - 2] if k > 1 else np.zeros(3)
+        total += s.weight_smoothness * (((p - places[k - 1] - before) / s.voxel_m) ** 2).sum() if k else 0.0
+    return total
+
+
+def exhaustive(voxels, targets, obstacles, cfg, start):
+    """The cheapest way over all cells and layers, without smoothness, by plain dynamic programming."""
+    cells = [c for c in itertools.product(*map(range, voxels.shape)) if voxels.columns[c[0], c[1]]]
+    places = voxels.low + np.array(cells) * voxels.size
+    free = kernels.signed_distances(obstacles, places)[0] >= cfg.safety_distance_m
+    steps = np.abs(np.array(cells)[:, None] - np.array(cells)[None]).max(axis=2) <= 1
+    starts, ends = np.nonzero(steps)
+    hit = kernels.segments_hit(obstacles, places[starts], places[ends], cfg.safety_distance_m)
+    way = np.full(steps.shape, np.inf)
+    way[starts, ends] = np.linalg.norm(places[starts] - places[ends], axis=1) / cfg.track_astar.voxel_m
+    way[starts[hit], ends[hit]] = np.inf
+
+    def own(target):
+        only = [cost_of(p[None], target[None], obstacles, cfg, p) for p in places]
+        return np.where(free, only, np.inf)
+
+    cost = own(targets[0]) + np.linalg.norm(places - start, axis=1) / cfg.track_astar.voxel_m
+    for target in targets[1:]:
+        cost = (cost[:, None] + way).min(axis=0) + own(target)
+    return cost.min()
+
+
+@pytest.mark.parametrize("world", ["tower_behind", "corner"])
+def test_a_wide_beam_finds_the_cheapest_way(world):
+    box_map, corners = WORLDS[world]
+    obstacles = kernels.obstacle_index(box_map)
+    settings = TrackAStarConfig(voxel_m=8, voxel_height_m=8, corridor_m=28, beam=100000, weight_smoothness=0)
+    cfg = PlanConfig(altitude_max_m=40, relaxed_safety_m=3.0, track_astar=settings)
+    scenario = planners.make_scenario(walk_along(world, corners), obstacles)
+    scenario = replace(scenario, targets_m=scenario.targets_m[:16])  # layers of three frames
+    raw, facts = track_astar.search_flight(scenario, obstacles, cfg, 3.0)
+    layers = np.arange(0, 16, track_astar.frames_per_layer(cfg))
+    targets = scenario.targets_m[layers]
+    start = np.array(
+        [*(targets[0, :2] - 20 * (targets[1] - targets[0])[:2] / np.linalg.norm(targets[1] - targets[0])), 20]
+    )
+    voxels = track_astar.make_voxels(scenario, cfg)
+    best = exhaustive(voxels, targets, obstacles, cfg, start)
+    assert facts["cost"] == pytest.approx(cost_of(raw[layers], targets, obstacles, cfg, start), abs=1e-6)
+    # The plain version grows boxes by the distance; the search, which measures first, may pass a corner more closely.
+    assert facts["cost"] <= best + 1e-6
+
+
+def test_the_cost_has_all_five_terms():
+    scenario, obstacles = scenario_of("tower_behind")
+    raw, facts = track_astar.search_flight(scenario, obstacles, CFG, 3.0)
+    layers = np.unique([*range(0, len(raw), 2), len(raw) - 1])
+    cost = cost_of(raw[layers], scenario.targets_m[layers], obstacles, CFG, np.array([-20.0, 0, 20]))
+    assert facts["cost"] == pytest.approx(cost)
+
+
+def test_a_narrow_beam_looks_less_and_costs_no_less():
+    scenario, obstacles = scenario_of("corner")
+    wide = track_astar.search_flight(scenario, obstacles, CFG, 3.0)[1]
+    narrow_cfg = CFG.model_copy(update={"track_astar": TrackAStarConfig(beam=32)})
+    narrow = track_astar.search_flight(scenario, obstacles, narrow_cfg, 3.0)[1]
+    assert narrow["states_seen"] < wide["states_seen"] / 4
+    assert narrow["cost"] >= wide["cost"]
+
+
+def test_layers_last_long_enough_for_a_diagonal():
+    assert track_astar.frames_per_layer(CFG) == 2  # 6.9 m at 10 m/s
+    assert track_astar.frames_per_layer(PlanConfig(speed_max_mps=3.0)) == 5
+
+
+# --- flights ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_flights_are_safe_and_see(world):
+    scenario, obstacles = scenario_of(world)
+    made = track_astar.plan(scenario, obstacles, CFG, np.random.default_rng(0))
+    assert_safe(made.positions_m, obstacles)
+    assert kernels.signed_distances(obstacles, made.positions_m)[0].min() >= 3.0 - 1e-6
+    seen = kernels.visibility(obstacles, made.positions_m, scenario.targets_m)
+    assert seen.mean() >= 0.95
+    assert made.solver["smoothing"] == "accepted"
+    again = track_astar.plan(scenario, obstacles, CFG, np.random.default_rng(1))
+    np.testing.assert_array_equal(made.positions_m, again.positions_m)
+
+
+def test_smoothing_makes_flights_smoother_and_loses_no_sight():
+    scenario, obstacles = scenario_of("corner")
+    raw, _ = track_astar.search_flight(scenario, obstacles, CFG, 3.0)
+    points, facts = smooth.smooth_flight(raw, scenario.targets_m, obstacles, CFG, 3.0, 0.0)
+    assert facts["smoothing"] == "accepted"
+    assert planners.metrics.jerk_rms(points) < 0.5 * planners.metrics.jerk_rms(raw)
+    assert planners.metrics.length_m(points) <= planners.metrics.length_m(raw)
+    before, after = (kernels.visibility(obstacles, p, scenario.targets_m) for p in (raw, points))
+    assert (after >= before - 0.05).all()
+    np.testing.assert_array_equal(points[[0, -1]], raw[[0, -1]])
+
+
+def test_a_slit_needs_the_relaxed_distance():
+    walls = [((0, side * 302.7, 60), (500, 300, 60)) for side in (-1, 1)]  # 5.4 m between them, 120 m high
+    obstacles = kernels.obstacle_index(town_of(*walls))
+    scenario = planners.make_scenario(walk_along("slit", [(0, 0), (30, 0)]), obstacles)
+    cfg = CFG.model_copy(update={"track_astar": TrackAStarConfig(corridor_m=44.0)})  # a row of voxels in the middle
+    made = track_astar.plan(scenario, obstacles, cfg, np.random.default_rng(0))
+    assert made.solver["safety_m"] == 2.5
+    assert_safe(made.positions_m, obstacles)
+
+
+@pytest.mark.parametrize(
+    ("rows", "length_m", "words"),
+    [([((0, 0, 60), (300, 300, 50))], 50, "no free voxels"), ([], 60000, "too long")],
+)
+def test_hopeless_walks_are_clear_errors(rows, length_m, words):
+    walk = walk_along("w", [(0, 0), (length_m, length_m)], speed_mps=1.2 if length_m < 100 else 1000)
+    with pytest.raises(NoPathError, match=words) as caught:
+        planners.plan_flight(walk, kernels.obstacle_index(town_of(*rows)), CFG, 0)
+    assert caught.value.where == "w"
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+
+
+def limits(safety_m=3.0):
+    return np.array([safety_m, 5.0, 20.0, 100.0])
+
+
+def test_anchors_are_the_edges_of_an_occlusion():
+    seen = np.array([1, 1, 0.8, 0.2, 1, 1, 1, 0.6, 1])
+    assert smooth.anchor_flags(seen, 0.999).tolist() == [False, True, False, False, True, False, True, False, True]
+    assert not smooth.anchor_flags(np.ones(5), 0.999).any()
+
+
+def test_a_shortcut_takes_the_longest_free_line():
+    obstacles = kernels.obstacle_index(town_of(((12, -9, 20), (3, 6, 20))))  # its corner is 3 m below the line y = 0
+    x = np.arange(25.0)
+    points = np.column_stack([x, np.where(x % 2 == 0, 0.0, 2.0), np.full(25, 20.0)])
+    targets, floors = np.column_stack([x, np.full(25, 30.0), np.ones(25)]), np.zeros(25)
+    assert smooth.shortcut(points, targets, floors, obstacles, limits(), 12) == 2
+    np.testing.assert_allclose(points[:, 1], 0)
+    shifted = np.column_stack([x, np.where(x % 2 == 0, -0.5, 2.0), np.full(25, 20.0)])
+    smooth.shortcut(shifted, targets, floors, obstacles, limits(), 12)
+    assert kernels.signed_distances(obstacles, shifted[[x for x in range(25) if shifted[x, 1] != -0.5]])[0].min() >= 3.0
+    untouched = np.column_stack([x, np.where(x % 2 == 0, 0.0, 2.0), np.full(25, 20.0)])
+    assert smooth.shortcut(untouched, targets, floors, obstacles, limits(), 1) == 0
+
+
+def test_the_band_moves_all_but_anchors_and_stops_when_straight():
+    obstacles = kernels.obstacle_index(town_of())
+    x = np.arange(9.0)
+    bent = np.column_stack([x, np.zeros(9), 20 + np.minimum(x, 8 - x)])
+    targets, none = np.column_stack([x, np.zeros(9), np.ones(9)]), np.zeros(9, dtype=bool)
+    held, points = none.copy(), bent.copy()
+    held[4] = True
+    smooth.relax(points, targets, none * 1.0, held, obstacles, limits(), 30, 0.35, 0.02)
+    assert points[4, 2] == 24
+    smooth.relax(points, targets, none * 1.0, none, obstacles, limits(), 30, 0.35, 0.02)
+    assert points[4, 2] < 22.5
+    straight = np.column_stack([x, np.zeros(9), np.full(9, 20.0)])
+    assert smooth.relax(straight, targets, none * 1.0, none, obstacles, limits(), 30, 0.35, 0.02) == 1
+
+
+def test_candidates_keep_distance_altitude_and_sight():
+    obstacles = kernels.obstacle_index(town_of(((10, 0, 15), (1, 20, 15))))
+    blockers, target = np.empty(obstacles.num_boxes, dtype=np.int64), np.array([0.0, 0, 1])
+
+    def valid(x, z, floor):
+        return smooth.candidate_is_valid(x, 0.0, z, target, floor, obstacles, limits(), blockers)
+
+    assert valid(-10.0, 20.0, 1.0)
+    assert not valid(7.5, 20.0, 0.0)  # 1.5 m from the wall
+    assert not valid(-10.0, 19.0, 0.0)
+    assert not valid(-10.0, 101.0, 0.0)
+    assert not valid(20.0, 20.0, 0.2)  # behind the wall
+    assert valid(20.0, 20.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "raw_loss", "verdict"),
+    [(20.0, 0.0, "accepted"), (20.0, 0.04, "accepted"), (31.0, 0.0, "clearance")],
+)
+def test_the_verdict_on_distance(height_m, raw_loss, verdict):
+    obstacles = kernels.obstacle_index(town_of(((0, 0, 33), (30, 30, 1))))
+    points = np.column_stack([np.arange(10.0), np.full(10, -15.0), np.full(10, height_m)])
+    targets = points - [0, 0, 19]
+    seen = np.full(10, 1.0 - raw_loss)
+    assert smooth.judge(points, seen, targets, obstacles, CFG.track_astar, 3.0) == verdict
+
+
+def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
+    obstacles = kernels.obstacle_index(town_of(((10, 0, 15), (1, 200, 15))))
+    points = np.column_stack([np.full(40, -10.0), np.arange(40.0), np.full(40, 20.0)])
+    targets = np.column_stack([np.zeros(40), np.arange(40.0), np.ones(40)])
+    settings = CFG.track_astar
+    one_hidden, all_hidden = points.copy(), points + np.array([30.0, 0, 0])
+    one_hidden[7, 0] = 20.0
+    assert smooth.judge(one_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "frame_visibility"
+    assert smooth.judge(all_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "mean_visibility"
+    assert smooth.judge(all_hidden, np.zeros(40), targets, obstacles, settings, 3.0) == "accepted"  # as blind as before
+    monkeypatch.setattr(smooth, "judge", lambda *_: "clearance")
+    result, facts = smooth.smooth_flight(points, targets, obstacles, CFG, 3.0, 0.0)
+    assert result is points
+    assert facts["smoothing"] == "clearance"
+
+
+def test_the_stage_flies_it(tmp_path):
+    from cosfly.schema import read_traces, write_boxes, write_paths
+
+    write_boxes(tmp_path / "map.json", town_of(*CANYON))
+    write_paths(tmp_path / "path.json", [walk_along("a", [(0, 0), (40, 0)])], {})
+    product = planners.run(CFG, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
+    (trace,) = read_traces(product)
+    assert trace.planner == "track_astar"
+    assert trace.solver["smoothing"] == "accepted"
