@@ -5,7 +5,9 @@ The observed frames and the future leave this module as two types, so that a pro
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -20,20 +22,28 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
 
 def iterate_samples(flight: Flight, cfg: WindowConfig) -> Iterator[Sample]:
     """Yield a flight's samples in order of time. A flight shorter than a window gives none."""
-    missing = set(flight.missing_frames(("rgb.png",))) if cfg.require_images else set()
     clean_positions, clean_yaw_deg = flight.positions_m, flight.rotations_deg[:, 1]
     if cfg.label_without_perturbation:
         clean_positions = clean_positions - flight.drone_offsets_m
         clean_yaw_deg = clean_yaw_deg - flight.rotation_offsets_deg[:, 1]
     folders = [flight.frame_folder(i) for i in range(len(flight))]
+    files = [_files_in(folder) for folder in folders]
+    missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
     for current in current_frames(len(flight), cfg):
-        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders)
+        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders, files)
         problem = "missing_frame" if missing.intersection(observed.indices) else None
         future = cut_future(flight, clean_positions, clean_yaw_deg, current, cfg.future_frames)
         yield Sample(observed, future, problem)
 
 
-def _observe(flight: Flight, span: slice, folders: list) -> ObservedWindow:
+def _files_in(folder: Path) -> frozenset[str]:
+    try:
+        return frozenset(os.listdir(folder))
+    except OSError:  # no such frame: the window says so
+        return frozenset()
+
+
+def _observe(flight: Flight, span: slice, folders: list[Path], files: list[frozenset[str]]) -> ObservedWindow:
     """Copy the observed frames out of a flight: nothing of what follows stays reachable."""
     return ObservedWindow(
         sample_id=sample_id(flight.flight_id, span.stop - 1),
@@ -54,6 +64,7 @@ def _observe(flight: Flight, span: slice, folders: list) -> ObservedWindow:
         visible=flight.target_visible[span].copy(),
         visibility=flight.visibility[span].copy(),
         frame_folders=tuple(folders[span]),
+        frame_files=tuple(files[span]),
     )
 
 
