@@ -42,7 +42,7 @@ TEXT_FAULTS: dict[str, Callable[[dict], str]] = {
     "empty_text": lambda answer: "",
 }
 FAULTS = (
-    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "empty_choices", "null_content", "slow",
+    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "empty_choices", "null_content", "slow", "drip",
     "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "echo_key",
 )  # fmt: skip
 
@@ -185,8 +185,22 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             data = json.dumps(reply, ensure_ascii=False).encode()
             if fault == "truncated_body":
                 self._send_bytes(200, data[: len(data) // 2])
+            elif fault == "drip":
+                self._drip(data)
             else:
                 self._send_bytes(200, data)
+
+        def _drip(self, data: bytes) -> None:
+            """Send a byte now and then: a limit on the silence between two bytes never ends it."""
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            try:
+                for at in range(len(data)):
+                    self.wfile.write(data[at : at + 1])
+                    time.sleep(0.05)
+            except OSError:
+                self.close_connection = True
 
         def _send(self, status: int, value: dict, headers: dict[str, str] | None = None) -> None:
             self._send_bytes(status, json.dumps(value).encode(), headers)
