@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,10 +17,12 @@ from caption.answers import AnswerBook, flight_of
 from caption.budget import Budget, BudgetSpent
 from caption.client import NoAnswer
 from caption.flights import Allotted
+from caption.judge import open_judge
 from caption.progress import Display
 from caption.regenerate import caption_window
 from caption.schema import CaptionConfig, Sample
 from caption.teacher import EndpointTeacher, Teacher, first_budget, shown_url
+from caption.vllm_teacher import PREFIX, VllmTeacher
 from cosfly.coc import Caption, write_captions
 from cosfly.errors import CosflyError, InputError, TeacherError
 from cosfly.store import StageFolder, Tally, dump_json, parse_json, write_bytes
@@ -65,6 +66,8 @@ class Asking:
         self.unanswered: list[dict] = []
         self.quarantine = _read_quarantine(stage.path / QUARANTINE)
         self.only = frozenset(self.quarantine) if retry_failed else None
+        in_flight = cfg.vllm.batch if cfg.teacher.startswith(PREFIX) else cfg.endpoint.concurrency
+        self.most_open = in_flight + WAITING_WINDOWS
         self.failed_in_row = self.num_flights_left = 0
         self.stopped: str | None = None
 
@@ -85,7 +88,10 @@ class Asking:
         self.book = book
         try:
             with book, Display(sum(guesses.values()), budget) as self.display:
-                async with open_teacher(self.cfg, book, self.seed, budget) as teacher:
+                async with (
+                    open_teacher(self.cfg, book, self.seed, budget) as teacher,
+                    open_judge(self.cfg.judge, self.stage.path, self.seed) as self.judge,
+                ):
                     teacher.kept.only = self.only
                     await self._ask_all(allotted, teacher, asked.flights, guesses)
         finally:
@@ -94,9 +100,7 @@ class Asking:
         asked.unanswered, asked.num_flights_left, asked.stopped = self.unanswered, self.num_flights_left, self.stopped
         return asked
 
-    async def _ask_all(
-        self, allotted: list[Allotted], teacher: EndpointTeacher, tally: Tally, guesses: dict[str, int]
-    ) -> None:
+    async def _ask_all(self, allotted: list[Allotted], teacher: Teacher, tally: Tally, guesses: dict[str, int]) -> None:
         """Keep `concurrency` requests in flight, whatever flight they belong to."""
         running: set[asyncio.Task] = set()
         flights_to_retry = None if self.only is None else {flight_of(sample_id) for sample_id in self.only}
@@ -118,7 +122,7 @@ class Asking:
             await asyncio.gather(*running, return_exceptions=True)
 
     async def _ask_flight(
-        self, allotted: Allotted, teacher: EndpointTeacher, tally: Tally, guessed: int, running: set[asyncio.Task]
+        self, allotted: Allotted, teacher: Teacher, tally: Tally, guessed: int, running: set[asyncio.Task]
     ) -> set[asyncio.Task]:
         flight = self.open[allotted.name] = _OpenFlight(allotted)
         num_windows = 0
@@ -127,7 +131,7 @@ class Asking:
                 num_windows += 1
                 flight.pending += 1
                 running.add(asyncio.create_task(self._one(flight, sample, teacher)))
-                if len(running) >= self.cfg.endpoint.concurrency + WAITING_WINDOWS:
+                if len(running) >= self.most_open:
                     running = await _some_done(running)
                 if self.stopped:
                     flight.has_gap = True
@@ -149,7 +153,7 @@ class Asking:
     async def _one(self, flight: _OpenFlight, sample: Sample, teacher: Teacher) -> None:
         sample_id = sample.observed.sample_id
         try:
-            caption = await caption_window(sample, teacher, self.cfg)
+            caption = await caption_window(sample, teacher, self.cfg, self.judge)
         except BudgetSpent as error:
             self.stopped = self.stopped or str(error)
             self._leave_out(flight, {"id": sample_id, "code": "not_asked", "message": str(error)})
@@ -209,13 +213,13 @@ class Asking:
             write_bytes(self.stage.path / name, "".join(dump_json(record) + "\n" for record in records).encode())
 
 
-@contextlib.asynccontextmanager
-async def open_teacher(
+def open_teacher(
     cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget
-) -> AsyncIterator[EndpointTeacher]:
-    """Start the teacher that the settings name."""
-    async with EndpointTeacher(cfg.teacher, cfg.endpoint, cfg.image, book, seed, budget) as teacher:
-        yield teacher
+) -> contextlib.AbstractAsyncContextManager[EndpointTeacher | VllmTeacher]:
+    """Make the teacher that the settings name; it is ready inside `async with`."""
+    if cfg.teacher.startswith(PREFIX):
+        return VllmTeacher(cfg, book, seed, budget)
+    return EndpointTeacher(cfg.teacher, cfg.endpoint, cfg.image, book, seed, budget)
 
 
 async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:

@@ -45,7 +45,7 @@ class Allotted:
             InputError: it cannot be read.
         """
         flight = read_flight(self.folder, strict=False)
-        for number, sample in enumerate(iterate_samples(flight, cfg.window)):
+        for number, sample in enumerate(iterate_samples(flight, cfg.window, cfg.label)):
             if number == self.most:
                 return
             yield sample
@@ -82,7 +82,7 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[All
     for name, folder in flights:
         try:
             flight = read_flight(folder, strict=False)
-            count = sum(1 for _ in iterate_samples(flight, cfg.window))
+            count = sum(1 for _ in iterate_samples(flight, cfg.window, cfg.label))
         except InputError:
             count = 0  # the work itself records the failure
         if left == 0 and count > 0:

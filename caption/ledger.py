@@ -28,6 +28,9 @@ class Ledger:
         self.recovered: Counter[str] = Counter()
         self.structured: Counter[str] = Counter()
         self.tokens: Counter[str] = Counter()
+        self.judgements: Counter[str] = Counter()
+        self.keyframes: Counter[str] = Counter()
+        self.num_skipped = self.num_missed = 0
         self.teacher: dict[str, Any] = {}
 
     def add(self, caption: Caption) -> None:
@@ -48,6 +51,15 @@ class Ledger:
         if caption.repair:
             self.repairs[caption.repair["rung"] or caption.repair["outcome"]] += 1
             self.repair_asks[caption.repair["asks"]] += 1
+        if caption.judge:
+            self.judgements[caption.judge["verdict"]] += 1
+            if "overruled_by" in caption.judge:
+                self.judgements[f"overruled_by_{caption.judge['overruled_by']}"] += 1
+        keyframe = caption.checks.get("keyframe")
+        if keyframe:
+            self.keyframes[keyframe["reason"]] += 1
+            self.num_skipped += keyframe["skipped"]
+            self.num_missed += keyframe["missed"]
         self._add_checks(caption)
 
     def _add_checks(self, caption: Caption) -> None:
@@ -93,9 +105,25 @@ class Ledger:
                 "rungs": _sorted(self.repairs),
                 "asks": {str(asks): count for asks, count in sorted(self.repair_asks.items())},
             },
+            "judgements": _sorted(self.judgements),
+            "keyframes": self._keyframe_report(),
             "bilingual": _sorted(self.bilingual),
             "evidence_contradictions": _sorted(self.evidence),
             "recovered": _sorted(self.recovered),
+        }
+
+    def _keyframe_report(self) -> dict | None:
+        """Say what keyframes saved and what they missed; None where all windows were taken."""
+        taken = sum(self.keyframes.values())
+        if not taken:
+            return None
+        calls = self.num_asks / taken
+        return {
+            "windows": taken + self.num_skipped,
+            "taken": taken,
+            "reasons": _sorted(self.keyframes),
+            "calls_saved": round(self.num_skipped * calls),
+            "changes_missed": self.num_missed,
         }
 
 

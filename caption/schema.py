@@ -17,6 +17,7 @@ from cosfly.coc import Verdict
 from cosfly.config import Config
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
+Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
 Modality = Literal["rgb", "depth", "segmentation"]
 
 
@@ -78,6 +79,7 @@ class Sample:
     observed: ObservedWindow
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
+    keyframe: dict[str, Any] | None = None  # why it was taken, and how many windows after it were not
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,12 @@ class WindowConfig(Config):
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, 0.5 s apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
+    keyframes: bool = Field(
+        False, description="take only the windows at which the label changes, and each keyframe_stride-th after one"
+    )
+    keyframe_stride: int = Field(
+        10, ge=1, description="longest way, in windows, from one keyframe to the next within a label"
+    )
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
     label_without_perturbation: bool = Field(
         True, description="take the recorded perturbation off the future poses, so that noise gives no label"
@@ -201,6 +209,26 @@ class VllmConfig(Config):
     engine: dict[str, Any] = Field(default_factory=dict, description="further arguments of vllm.LLM")
 
 
+class JudgeConfig(Config):
+    """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+
+    url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
+    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
+    concurrency: int = Field(16, ge=1, le=4096, description="most requests in flight")
+    timeout_s: float = Field(120.0, gt=0, description="limit of one request")
+    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
+    open_flights: int = Field(64, ge=1, description="flights whose judgements are kept in memory")
+    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
+
+    @model_validator(mode="after")
+    def _is_url(self) -> Self:
+        if self.url is not None and not self.url.startswith(("http://", "https://")):
+            raise ValueError(f"judge.url must begin with http:// or https://, got {self.url!r}")
+        return self
+
+
 class RepairConfig(Config):
     verdicts: tuple[Verdict, ...] = Field(("HARD_CONFLICT",), description="verdicts that are re-generated")
     strategy: Strategy = Field(
@@ -226,6 +254,7 @@ class CaptionConfig(Config):
     vllm: VllmConfig = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
     budget: BudgetConfig = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
+    judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
     limit: int | None = Field(None, ge=1, description="caption at most this many windows; empty takes all")

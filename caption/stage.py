@@ -14,9 +14,10 @@ from pathlib import Path
 
 from caption.asking import ANSWERS, Asked, Asking, common_causes
 from caption.flights import PARTS, Allotted, allot, named_flights, parts_of
+from caption.judge import open_judge
 from caption.ledger import Ledger
 from caption.regenerate import caption_window
-from caption.schema import CaptionConfig, Sample
+from caption.schema import CaptionConfig
 from caption.teacher import RuleTeacher, Teacher, shown_url
 from cosfly.coc import Caption, read_captions, write_captions
 from cosfly.errors import ConfigError, InputError, TeacherError
@@ -56,7 +57,7 @@ def run(
         TeacherError: the endpoint cannot be used, a budget is used up, or windows stayed without an answer; what was
             answered is kept.
     """
-    stage = StageFolder.open(out, "caption", config=_recorded(cfg), inputs={"data": data}, seed=seed, resume=resume)
+    stage = open_stage(cfg, data, out, seed, resume)
     if stage.is_complete and not _has_more(stage, cfg):
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data), cfg)
@@ -82,6 +83,15 @@ def run(
     return out / PRODUCT
 
 
+def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
+    """Open the stage's folder for these settings.
+
+    Raises:
+        ResumeError: it holds work made with another prompt, model or input; names what differs.
+    """
+    return StageFolder.open(out, "caption", config=_recorded(cfg), inputs={"data": data}, seed=seed, resume=resume)
+
+
 def _recorded(cfg: CaptionConfig) -> dict:
     """Give the settings that decide what is asked: not the endpoint's address, which may hold a password, manners, limits."""
     config = cfg.model_dump(mode="json")
@@ -91,6 +101,8 @@ def _recorded(cfg: CaptionConfig) -> dict:
     config["endpoint"] = {name: value for name, value in config["endpoint"].items() if name not in MANNERS}
     for name in ("limit", "budget", "vllm"):
         del config[name]
+    judge = {name: value for name, value in config["judge"].items() if name not in (*MANNERS, "open_flights")}
+    config["judge"] = judge | {"url": None if cfg.judge.url is None else "endpoint"}
     return config
 
 
@@ -152,7 +164,7 @@ def start_rules(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 
     def work(item: Item) -> Outcome:
         flight: Allotted = item.payload
-        num_windows = asyncio.run(_caption_in_order(flight.samples(cfg), teacher, cfg, flight.part(stage_path)))
+        num_windows = asyncio.run(_caption_in_order(flight, teacher, cfg, stage_path, seed))
         if num_windows == 0:
             return Outcome({}, drop_reason="too_short")
         return Outcome({"windows": num_windows})
@@ -160,10 +172,11 @@ def start_rules(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
     return work
 
 
-async def _caption_in_order(samples: Iterator[Sample], teacher: Teacher, cfg: CaptionConfig, part: Path) -> int:
-    captions = [await caption_window(sample, teacher, cfg) for sample in samples]
+async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path, seed: int) -> int:
+    async with open_judge(cfg.judge, stage_path, seed) as judge:
+        captions = [await caption_window(sample, teacher, cfg, judge) for sample in flight.samples(cfg)]
     if captions:
-        write_captions(part, captions)
+        write_captions(flight.part(stage_path), captions)
     return len(captions)
 
 
