@@ -57,6 +57,11 @@ class AnswerBook:
         flight = self._flights.get(key)
         return None if flight is None else self._by_flight[flight][key]
 
+    def latency_s(self, sample_id: str) -> float:
+        """Give the time that the answers about one window took, one after the other."""
+        kept = self._by_flight.get(flight_of(sample_id), {}).values()
+        return sum(record["latency_s"] for record in kept if record["sample_id"] == sample_id)
+
     def forget(self, flight: str) -> None:
         """Drop a flight that was worked on from memory; its answers stay on the disk, and the index says where."""
         for key in self._by_flight.pop(flight, {}):
