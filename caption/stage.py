@@ -17,6 +17,7 @@ from caption.flights import PARTS, Allotted, allot, named_flights, parts_of
 from caption.judge import open_judge
 from caption.ledger import Ledger
 from caption.regenerate import caption_window
+from caption.report import write_page
 from caption.schema import CaptionConfig
 from caption.teacher import RuleTeacher, Teacher, shown_url
 from cosfly.coc import Caption, read_captions, write_captions
@@ -26,7 +27,7 @@ from cosfly.store import Resume, StageFolder, Tally, write_json
 
 log = logging.getLogger(__name__)
 
-PRODUCT, REPORT = "captions.jsonl", "caption_report.json"
+PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
 # Settings that change how a teacher is asked, not what is asked: a run may be continued with others.
 MANNERS = (
     "concurrency", "timeout_s", "total_timeout_s", "max_tries", "backoff_s", "max_backoff_s", "stop_after_failures",
@@ -72,11 +73,14 @@ def run(
     is_whole = not (asked.unanswered or asked.num_flights_left)
     if tally.num_input == 0 and is_whole:
         _complain_of_nothing(stage, cfg, data, asked.flights)
-    write_json(stage.path / REPORT, ledger.report(asked.flights, tally))
+    report = ledger.report(asked.flights, tally)
+    write_json(stage.path / REPORT, report)
+    folders = {flight.name: flight.folder for flight in allotted}
+    write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
-    outputs = [path for path in (out / PRODUCT, out / REPORT, out / ANSWERS) if path.exists()]
+    outputs = [path for path in (out / PRODUCT, out / REPORT, out / PAGE, out / ANSWERS) if path.exists()]
     stage.finish(outputs, tally, flights=asked.flights.as_dict(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
