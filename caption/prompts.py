@@ -6,6 +6,7 @@ hash of what was asked.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.resources
 import re
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from caption.glossary import load_glossary
 from caption.images import EncodedImage, FrameEncoder, available_modalities
 from caption.schema import ImageConfig, Modality, ObservedWindow
 from cosfly.coc import ACTIONS, FIELDS, Coc, Language, Prompt
-from cosfly.store import dump_json, sha256_bytes
+from cosfly.store import dump_json
 
 _MODALITY_WORDS: dict[Language, dict[Modality, str]] = {
     "en": {
@@ -90,7 +91,17 @@ def build_prompts(
 
 
 def prompt_hash(prompts: dict[Language, Prompt]) -> str:
-    return sha256_bytes("\x00".join(f"{p.system}\x00{p.user}" for p in prompts.values()).encode())[:16]
+    digest = hashlib.sha256()
+    for number, prompt in enumerate(prompts.values()):
+        digest.update(b"\x00" if number else b"")
+        digest.update(_encoded(prompt.system))
+        digest.update(b"\x00" + prompt.user.encode())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=8)
+def _encoded(system: str) -> bytes:
+    return system.encode()
 
 
 def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, images: str, language: Language) -> str:

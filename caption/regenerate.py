@@ -149,7 +149,7 @@ class _Loop:
     async def ask_freely(self, question: Question) -> str | None:
         parsed = Parsed(None)
         for ask in range(self.cfg.structure_asks):
-            asked = replace(question, ask=ask)
+            asked = replace(question, ask=ask) if ask else question
             parsed = self._read(await self.teacher.ask(asked), "en")
             if parsed.coc is not None:
                 self._accept(parsed.coc, asked)

@@ -87,6 +87,7 @@ class _Form:
     sign: dict[str, int]
     sources: dict[str, tuple[str, ...]]
     trend_of: str | None
+    may_trend: bool
     is_silent: bool  # nothing in it can be compared with a measurement
 
 
@@ -109,15 +110,16 @@ _DIGITS = re.compile(r"\d+")
 
 @lru_cache(maxsize=64)  # both checks read a text
 def _clauses(text: str, language: Language) -> tuple[_Clause, ...]:
-    found = []
-    for part in _CLAUSES.split(text):
-        if not part or part.isspace():
-            continue
-        runs = _DIGITS.findall(part)
-        form = _read_form(_DIGITS.sub("0", part) if runs else part, language)
-        numbers = [_number(number, runs) for number in form.numbers] if runs else []
-        found.append(_Clause(part, form, numbers))
-    return tuple(found)
+    return tuple([_read_clause(part, language) for part in _CLAUSES.split(text) if part and not part.isspace()])
+
+
+@lru_cache(maxsize=4096)  # neighbouring windows share most clauses
+def _read_clause(text: str, language: Language) -> _Clause:
+    runs = _DIGITS.findall(text)
+    if not runs:
+        return _Clause(text, _read_form(text, language), [])
+    form = _read_form(_DIGITS.sub("0", text), language)
+    return _Clause(text, form, [_number(number, runs) for number in form.numbers])
 
 
 def _number(form: _NumberForm, runs: list[str]) -> Number:
@@ -146,13 +148,15 @@ def _read_form(text: str, language: Language) -> _Form:
     sides: dict[str, set[int]] = {}
     for name, sign in poles:
         sides.setdefault(name, set()).add(sign)
+    taken = {name: min(signs) for name, signs in sides.items() if len(signs) == 1}
     return _Form(
         numbers=tuple(numbers),
         poles=poles,
         words=frozenset(words),
-        sign={name: min(signs) for name, signs in sides.items() if len(signs) == 1},
+        sign=taken,
         sources=_sources(words),
         trend_of=_trend_subject(words, {number.unit for number in numbers}),
+        may_trend="stable" in words or not taken.keys().isdisjoint(("comparison", "trend", "vertical")),
         is_silent=not numbers and not poles and "stable" not in words,
     )
 
@@ -176,13 +180,20 @@ def _clause_problems(clause: _Clause, facts: Facts, cfg: EvidenceConfig, decisio
     if "decision" in form.words:
         return ["decision"] if _decision_differs(form, decision) else []
     problems = []
+    sizes = facts.sizes
     for number in clause.numbers:
-        if number.unit in form.sources and not _number_holds(number, form.sources[number.unit], facts, cfg):
-            problems.append("number")
-            break
+        sources = form.sources.get(number.unit, ())
+        claimed = abs(number.value)
+        for name in sources:  # most numbers are copied: look before computing
+            if claimed in sizes[name]:
+                break
+        else:
+            if sources and not _number_holds(number, sources, facts, cfg):
+                problems.append("number")
+                break
     if "box" in form.words and clause.numbers and _pair_differs(clause, facts, cfg):
         problems.append("box")
-    if _trend_differs(clause, facts):
+    if form.may_trend and _trend_differs(clause, facts):
         problems.append("trend")
     if "side" in form.sign and _side_differs(clause, facts):
         problems.append("side")
@@ -231,10 +242,7 @@ def _sources(words: set[str]) -> dict[str, tuple[str, ...]]:
 
 def _number_holds(number: Number, sources: tuple[str, ...], facts: Facts, cfg: EvidenceConfig) -> bool:
     """Tell whether a number is a measured value or the difference of two of one series; without such a series it holds."""
-    claimed, sizes = abs(number.value), facts.sizes
-    for name in sources:  # most numbers are copied: look before computing
-        if claimed in sizes[name]:
-            return True
+    claimed = abs(number.value)
     tolerance = {"m": cfg.tolerance_m, "mps": cfg.tolerance_mps, "deg": cfg.tolerance_deg, "px": cfg.tolerance_px}
     step = 0.5 * 10.0**-number.digits
     slack = tolerance[number.unit] + step

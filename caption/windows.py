@@ -5,6 +5,7 @@ The observed frames and the future leave this module as two types, so that a pro
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -125,5 +126,5 @@ def cut_future(
         yaw_deg=yaw_deg[span],
         targets_m=flight.targets_m[span],
         visible=flight.target_visible[span],
-        speed_before_mps=float(np.linalg.norm(positions_m[current] - positions_m[current - 1]) / step_s),
+        speed_before_mps=math.dist(positions_m[current].tolist(), positions_m[current - 1].tolist()) / float(step_s),
     )
