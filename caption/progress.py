@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -110,9 +110,13 @@ class Display:
             self._line_s = self._clock()
             log.info("%s", self.line())
 
-    def _panel(self) -> RenderableType:
-        bar = ProgressBar(total=max(self.total, 1), completed=self.num_done, width=48)
-        return Group(bar, Text(self.line(), overflow="fold"))
+    def panel(self) -> RenderableType:
+        """Give what stands on a terminal: the bar, which counts windows, and the figures below it."""
+        grid = Table.grid()
+        grid.add_row(ProgressBar(total=max(self.total, 1), completed=self.num_done, width=48))
+        for part in self.line().split("; "):
+            grid.add_row(Text(part, overflow="fold"))
+        return grid
 
     def closing_table(self) -> Table:
         """Give what this run did, for the end of it."""
@@ -136,7 +140,7 @@ class Display:
     def __enter__(self) -> Display:
         if console.is_terminal:
             self._live = Live(
-                get_renderable=self._panel, console=console, transient=True, refresh_per_second=REFRESHES_PER_S
+                get_renderable=self.panel, console=console, transient=True, refresh_per_second=REFRESHES_PER_S
             )
             self._live.start()
         return self

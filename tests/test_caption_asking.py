@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import logging
 import os
@@ -15,6 +16,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from teacher_server import TeacherServer, is_mirror
 
 from caption.answers import AnswerBook, flight_of
@@ -255,6 +257,25 @@ def test_rate_and_time_left():
     assert display.left_s == 100.0  # 50 windows at one in two seconds; those of earlier runs do not count as speed
     assert display.tokens() == (0, 0)
     assert [duration(seconds) for seconds in (42, 420, 12_240, 200_000)] == ["42 s", "7 min", "3.4 h", "2.3 days"]
+
+
+def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
+    budget = Budget(BudgetConfig(price_prompt=2.0), Counter(), first_prompt=1, first_completion=1)
+    display = Display(100, budget, Clock())
+    display.num_accepted, display.num_repaired = 40, 3
+    display.dropped.update(structure_cut_short=2, bilingual_number=1)
+    budget.totals.update(prompt_tokens=100_000, completion_tokens=9_000, answers=88)
+    for renderable in (display.panel(), display.closing_table()):
+        file = io.StringIO()
+        Console(file=file, width=100).print(renderable)
+        text = file.getvalue()
+        for words in ("40", "structure_cut_short", "100,000 in", "9,000 out", "0.20", "windows/s"):
+            assert words in text, text
+    file = io.StringIO()
+    Console(file=file, width=100).print(display.panel())
+    lines = file.getvalue().splitlines()
+    assert "caption" not in lines[0]
+    assert lines[1].strip() == "caption: 43 of 100 windows"
 
 
 # --- the journal's index ----------------------------------------------------------------------------------------------
