@@ -6,10 +6,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
+from itertools import pairwise
 
 from caption.schema import FutureMotion, LabelConfig
 from cosfly.coc import ACTION_GROUPS, ACTIONS, Verdict
@@ -36,29 +36,30 @@ class Motion:
 
 def measure(future: FutureMotion) -> Motion:
     """Measure a future; invariant to translation, to rotation about z and to a shift in time."""
-    positions, targets = future.positions_m, future.targets_m
+    positions, yaw_deg = future.positions_m.tolist(), future.yaw_deg.tolist()
     duration_s = float(future.time_s[-1] - future.time_s[0])
-    steps = positions[1:] - positions[:-1]
-    mean_speed_mps = float(np.sqrt((steps * steps).sum(axis=1)).sum()) / duration_s
-    yaw_steps = (future.yaw_deg[1:] - future.yaw_deg[:-1] + 180.0) % 360.0 - 180.0
-    moved = positions[-1] - positions[0]
-    yaw_rad = np.radians(future.yaw_deg[0])
-    cos, sin = float(np.cos(yaw_rad)), float(np.sin(yaw_rad))
-    start, end = positions[0, :2] - targets[0, :2], positions[-1, :2] - targets[-1, :2]
-    cross, dot = start[0] * end[1] - start[1] * end[0], start[0] * end[0] + start[1] * end[1]
-    target_moved = targets[-1, :2] - targets[0, :2]
+    mean_speed_mps = sum(math.dist(p, q) for p, q in pairwise(positions)) / duration_s
+    first, last = positions[0], positions[-1]
+    first_target, last_target = future.targets_m[0].tolist(), future.targets_m[-1].tolist()
+    moved_x, moved_y = last[0] - first[0], last[1] - first[1]
+    yaw_rad = math.radians(yaw_deg[0])
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    # Drone seen from the target, at both ends.
+    x0, y0 = first[0] - first_target[0], first[1] - first_target[1]
+    x1, y1 = last[0] - last_target[0], last[1] - last_target[1]
+    visible = future.visible.tolist()
     return Motion(
-        yaw_deg=float(yaw_steps.sum()),
-        altitude_m=float(moved[2]),
+        yaw_deg=sum((b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(yaw_deg)),
+        altitude_m=last[2] - first[2],
         mean_speed_mps=mean_speed_mps,
         speed_change_mps=mean_speed_mps - future.speed_before_mps,
-        forward_m=float(moved[0] * cos + moved[1] * sin),
-        left_m=float(moved[1] * cos - moved[0] * sin),
-        approach_m=float(np.hypot(*start) - np.hypot(*end)),
-        sweep_deg=float(-np.degrees(np.arctan2(cross, dot))),
-        target_path_m=float(np.hypot(*target_moved)),
-        visible_now=bool(future.visible[0]),
-        visible_share=float(future.visible[1:].mean()),
+        forward_m=moved_x * cos + moved_y * sin,
+        left_m=moved_y * cos - moved_x * sin,
+        approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
+        sweep_deg=-math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)),
+        target_path_m=math.hypot(last_target[0] - first_target[0], last_target[1] - first_target[1]),
+        visible_now=bool(visible[0]),
+        visible_share=sum(map(bool, visible[1:])) / len(visible[1:]),
     )
 
 

@@ -1,14 +1,23 @@
 """`answers.jsonl`: every answer of a teacher, kept before anything is derived from it; nothing answered is asked twice.
 
-One process writes it. In memory are only the answers of flights that are not finished.
+One process writes it, on a thread of its own: answers that arrive together share one wait for the disk, and the event loop
+never waits. In memory are only the answers of flights that are not finished. `answers.index.jsonl` tells, for each flight that
+was worked on, which bytes of the journal hold its answers, so that a later start reads the tail and the unfinished flights
+instead of a week of answers. The index is a help, not a truth: without it the whole journal is read.
 """
 
 from __future__ import annotations
 
+import asyncio
+from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from cosfly.errors import CosflyError
 from cosfly.store import Journal
+
+COUNTED = ("prompt_tokens", "completion_tokens")
 
 
 def flight_of(sample_id: str) -> str:
@@ -20,44 +29,144 @@ class AnswerBook:
     """The journal with an index by key. Use as a context manager."""
 
     def __init__(self, path: Path, is_finished: Callable[[str], bool]) -> None:
-        """Read the journal of an earlier run.
+        """Read what is needed of the journal of an earlier run.
 
         Args:
             is_finished: tells whether a flight needs no more answers; those are not kept in memory.
         """
+        self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
+        self.num_read = 0  # lines read at the start
         self._journal = Journal(path)
+        self._index = Journal(path.with_name("answers.index.jsonl"))
         self._by_flight: dict[str, dict[str, dict]] = {}
         self._flights: dict[str, str] = {}
-        finished: dict[str, bool] = {}
-        for record in self._journal.read():
-            flight = flight_of(record["sample_id"])
-            if flight not in finished:
-                finished[flight] = is_finished(flight)
-            if not finished[flight]:
-                self._remember(flight, record)
-        self.num_damaged = self._journal.num_damaged
+        self._spans: dict[str, tuple[int, int]] = {}  # this run's bytes of each open flight
+        self._size = self._journal.start()
+        self._is_finished = is_finished
+        self._finished: dict[str, bool] = {}
+        self.num_damaged = 0
+        self._read_earlier()
         self.num_found = len(self._flights)
+        self._waiting: list[tuple[dict, asyncio.Future]] = []
+        self._disk = ThreadPoolExecutor(1, "journal")
+        self._writing: asyncio.Task | None = None
 
-    def _remember(self, flight: str, record: dict) -> None:
-        self._by_flight.setdefault(flight, {})[record["key"]] = record
-        self._flights[record["key"]] = flight
+    # --- what is known ---
 
     def get(self, key: str) -> dict | None:
         flight = self._flights.get(key)
         return None if flight is None else self._by_flight[flight][key]
 
-    def put(self, record: dict) -> None:
-        """Write an answer to the disk; it is there when this returns."""
-        self._journal.append(record)
-        self._remember(flight_of(record["sample_id"]), record)
+    def latency_s(self, sample_id: str) -> float:
+        """Give the time that the answers about one window took, one after the other."""
+        kept = self._by_flight.get(flight_of(sample_id), {}).values()
+        return sum(record["latency_s"] for record in kept if record["sample_id"] == sample_id)
 
     def forget(self, flight: str) -> None:
-        """Drop a finished flight's answers from memory; they stay on the disk."""
+        """Drop a flight that was worked on from memory; its answers stay on the disk, and the index says where."""
         for key in self._by_flight.pop(flight, {}):
             del self._flights[key]
+        start, end = self._spans.pop(flight, (0, 0))
+        # Lines before `open_from` belong to flights that the index names; a start need not read them again.
+        open_from = min((first for first, _ in self._spans.values()), default=self._size)
+        line = {"flight": flight, "start": start, "end": end, "open_from": open_from, "size": self._size}
+        self._index.append(line | {"totals": dict(self.totals)}, sync=False)
+
+    def _read_earlier(self) -> None:
+        spans: dict[str, list[tuple[int, int]]] = {}
+        scan_from = counted_to = 0
+        for line in self._index.read():
+            if line["size"] > self._size:  # the journal was cut or replaced: its index is worth nothing
+                spans, scan_from, counted_to = {}, 0, 0
+                self.totals.clear()
+                break
+            spans.setdefault(line["flight"], []).append((line["start"], line["end"]))
+            scan_from, counted_to, self.totals = line["open_from"], line["size"], Counter(line["totals"])
+        for flight, found in spans.items():
+            if not self._needs_no_more(flight):
+                for start, end in found:
+                    self._scan(start, min(end, scan_from), flight, counted_to)
+        self._scan(scan_from, None, None, counted_to)
+        for flight in [name for name in self._spans if self._needs_no_more(name)]:
+            self.forget(flight)  # finished just before a kill, so the index does not name it yet
+
+    def _scan(self, start: int, end: int | None, wanted: str | None, counted_to: int) -> None:
+        if end is not None and end <= start:
+            return
+        for first, after, record in self._journal.lines(start, end):
+            self.num_read += 1
+            flight = flight_of(record["sample_id"])
+            if first >= counted_to:
+                self._count(record)
+            if wanted is None:
+                self._extend(flight, first, after)
+            if wanted in (None, flight) and not self._needs_no_more(flight):
+                self._remember(flight, record)
+        self.num_damaged += self._journal.num_damaged
+
+    def _needs_no_more(self, flight: str) -> bool:
+        if flight not in self._finished:
+            self._finished[flight] = self._is_finished(flight)
+        return self._finished[flight]
+
+    def _remember(self, flight: str, record: dict) -> None:
+        self._by_flight.setdefault(flight, {})[record["key"]] = record
+        self._flights[record["key"]] = flight
+
+    def _extend(self, flight: str, first: int, after: int) -> None:
+        start, end = self._spans.get(flight, (first, after))
+        self._spans[flight] = (min(start, first), max(end, after))
+
+    def _count(self, record: dict) -> None:
+        self.totals["answers"] += 1
+        self.totals.update({name: record["usage"].get(name, 0) for name in COUNTED})
+
+    # --- what is new ---
+
+    async def put(self, record: dict) -> None:
+        """Write an answer to the disk; it is there when this returns.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        written = asyncio.get_running_loop().create_future()
+        self._waiting.append((record, written))
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.create_task(self._write())
+        await written
+
+    async def _write(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._waiting:
+            batch, self._waiting = self._waiting, []
+            try:
+                ends = await loop.run_in_executor(self._disk, self._append, [record for record, _ in batch])
+            except CosflyError as error:  # a full disk: every window that waits for it is told
+                for _, written in batch:
+                    if not written.done():
+                        written.set_exception(error)
+                continue
+            for (record, written), (first, after) in zip(batch, ends, strict=True):
+                flight = flight_of(record["sample_id"])
+                self._remember(flight, record)
+                self._extend(flight, first, after)
+                self._count(record)
+                self._size = after
+                if not written.done():
+                    written.set_result(None)
+
+    def _append(self, records: list[dict]) -> list[tuple[int, int]]:
+        """Append records, with one wait for the disk, and give their bytes in the journal. Runs on the journal's thread."""
+        ends: list[tuple[int, int]] = []
+        for number, record in enumerate(records):
+            after = self._journal.append(record, sync=number == len(records) - 1)
+            ends.append((ends[-1][1] if ends else self._size, after))
+        return ends
 
     def __enter__(self) -> AnswerBook:
         return self
 
     def __exit__(self, *exc: object) -> None:
+        self._disk.shutdown(wait=True)
         self._journal.close()
+        self._index.close()

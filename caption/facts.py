@@ -5,14 +5,20 @@ Values are rounded here, once, as they are printed, so that text and check compa
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Literal
-
-import numpy as np
 
 from caption.schema import ObservedWindow
 
 VisibilityWord = Literal["visible", "partly_occluded", "occluded", "out_of_view"]
+NUMBER_SERIES = (
+    "speed_mps", "altitude_m", "yaw_deg", "pitch_deg", "distance_m", "slant_m", "target_speed_mps", "target_turn_deg",
+    "box_width_px", "box_height_px", "offset_x_px", "offset_y_px",
+)  # fmt: skip
 PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as partly hidden
 
 
@@ -46,58 +52,70 @@ class Facts:
     def is_visible_now(self) -> bool:
         return self.visibility[-1] in ("visible", "partly_occluded")
 
+    @cached_property
+    def sizes(self) -> dict[str, tuple[float, ...]]:
+        """Absolute values of every series, without what is not known."""
+        return {name: tuple([abs(v) for v in self.series(name) if v is not None]) for name in NUMBER_SERIES}
+
+    def series(self, name: str) -> tuple[float | None, ...]:
+        """Give a measured series by name; a single value counts as a series of one."""
+        values = getattr(self, name)
+        return values if isinstance(values, tuple) else (values,)
+
 
 def measure_facts(window: ObservedWindow) -> Facts:
     """Measure a window. Reads nothing but the window."""
-    positions, targets = window.positions_m, window.targets_m
-    steps_s = np.diff(window.time_s)
-    steps = np.diff(positions, axis=0)
-    speeds = np.sqrt((steps * steps).sum(axis=1)) / steps_s
-    yaw = window.rotations_deg[:, 1]
-    turned = (np.diff(yaw) + 180.0) % 360.0 - 180.0
-    away = targets - positions
-    walked = np.diff(targets[:, :2], axis=0)
-    walking_mps = np.sqrt((walked * walked).sum(axis=1)) / steps_s
-    box = window.target_bbox
-    center = np.array([window.width_px, window.height_px]) / 2.0
+    # Plain numbers: for five frames they are several times faster than arrays.
+    time_s, positions, targets = window.time_s.tolist(), window.positions_m.tolist(), window.targets_m.tolist()
+    rotations, boxes = window.rotations_deg.tolist(), window.target_bbox.tolist()
+    steps_s = [after - before for before, after in pairwise(time_s)]
+    walked = [(q[0] - p[0], q[1] - p[1]) for p, q in pairwise(targets)]
+    walking_mps = [math.hypot(x, y) / step_s for (x, y), step_s in zip(walked, steps_s, strict=True)]
+    away = [(q[0] - p[0], q[1] - p[1], q[2] - p[2]) for p, q in zip(positions, targets, strict=True)]
+    yaw_deg, turned_deg = [0.0], 0.0
+    for before, after in pairwise(rotations):
+        turned_deg += (after[1] - before[1] + 180.0) % 360.0 - 180.0
+        yaw_deg.append(turned_deg)
     # The middle of the box is where the person is seen; uv (the hip) stands in where a tree has no box.
-    seen = np.where(np.isnan(box[:, :1]), window.target_uv, (box[:, :2] + box[:, 2:]) / 2.0) - center
+    seen = [
+        uv if box[0] != box[0] else ((box[0] + box[2]) / 2.0, (box[1] + box[3]) / 2.0)
+        for box, uv in zip(boxes, window.target_uv.tolist(), strict=True)
+    ]
+    flags = zip(window.in_view.tolist(), window.visible.tolist(), window.visibility.tolist(), strict=True)
+    speeds = (math.dist(p, q) / step_s for (p, q), step_s in zip(pairwise(positions), steps_s, strict=True))
     return Facts(
         speed_mps=(None, *_rounded(speeds, 2)),
-        altitude_m=tuple(round(float(z), 1) + 0.0 for z in positions[:, 2]),
-        yaw_deg=tuple(round(float(a), 1) + 0.0 for a in np.concatenate([[0.0], np.cumsum(turned)])),
-        pitch_deg=tuple(round(float(a), 1) + 0.0 for a in window.rotations_deg[:, 0]),
-        distance_m=_rounded(np.hypot(away[:, 0], away[:, 1]), 1),
-        slant_m=_rounded(np.sqrt((away * away).sum(axis=1)), 1),
-        target_speed_mps=_rounded([walking_mps.mean()], 2)[0],
-        target_turn_deg=_turn_deg(walked, walking_mps),
-        box_width_px=_pixels(box[:, 2] - box[:, 0]),
-        box_height_px=_pixels(box[:, 3] - box[:, 1]),
-        offset_x_px=_pixels(seen[:, 0]),
-        offset_y_px=_pixels(seen[:, 1]),
-        visibility=tuple(
-            _word(bool(i), bool(v), float(s))
-            for i, v, s in zip(window.in_view, window.visible, window.visibility, strict=True)
-        ),
+        altitude_m=tuple([round(p[2], 1) + 0.0 for p in positions]),
+        yaw_deg=tuple([round(a, 1) + 0.0 for a in yaw_deg]),
+        pitch_deg=tuple([round(r[0], 1) + 0.0 for r in rotations]),
+        distance_m=_rounded([math.hypot(x, y) for x, y, _ in away], 1),
+        slant_m=_rounded([math.sqrt(x * x + y * y + z * z) for x, y, z in away], 1),
+        target_speed_mps=_rounded([sum(walking_mps) / len(walking_mps)], 2)[0],
+        target_turn_deg=_turn_deg(walked[0], walked[-1], min(walking_mps[0], walking_mps[-1])),
+        box_width_px=_pixels([box[2] - box[0] for box in boxes]),
+        box_height_px=_pixels([box[3] - box[1] for box in boxes]),
+        offset_x_px=_pixels([u - window.width_px / 2.0 for u, _ in seen]),
+        offset_y_px=_pixels([v - window.height_px / 2.0 for _, v in seen]),
+        visibility=tuple([_word(in_view, visible, score) for in_view, visible, score in flags]),
         width_px=window.width_px,
         height_px=window.height_px,
     )
 
 
-def _rounded(values, digits: int) -> tuple[float | None, ...]:
-    return tuple(None if v != v else round(float(v), digits) + 0.0 for v in values)
+def _rounded(values: Iterable[float], digits: int) -> tuple[float | None, ...]:
+    return tuple([None if v != v else round(v, digits) + 0.0 for v in values])  # NaN is not equal to itself
 
 
-def _pixels(values: np.ndarray) -> tuple[int | None, ...]:
-    return tuple(None if v != v else round(float(v)) for v in values)
+def _pixels(values: list[float]) -> tuple[int | None, ...]:
+    return tuple([None if v != v else round(v) for v in values])
 
 
-def _turn_deg(walked: np.ndarray, walking_mps: np.ndarray) -> float | None:
+def _turn_deg(first: tuple[float, float], last: tuple[float, float], slowest_mps: float) -> float | None:
     """Heading change of the target; None where it stands (a heading of no motion is noise) or is unknown."""
-    if not (walking_mps[[0, -1]] > 0.2).all():
+    (x0, y0), (x1, y1) = first, last
+    if not slowest_mps > 0.2 or x0 != x0 or x1 != x1:
         return None
-    (x0, y0), (x1, y1) = walked[0], walked[-1]
-    return round(float(np.degrees(np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1))), 1) + 0.0
+    return round(math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)), 1) + 0.0
 
 
 def _word(in_view: bool, visible: bool, score: float) -> VisibilityWord:

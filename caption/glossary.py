@@ -6,9 +6,9 @@ One reader, one frozen record with its patterns compiled; everything that writes
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -46,8 +46,7 @@ class _GlossaryFile(Config):
     not_terms: _Spellings = Field(description="spellings that hold a term but do not mean it")
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number in a text: `unit` is a key of the glossary's units, "" where none; `digits` after the point."""
 
     value: float

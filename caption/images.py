@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,9 +36,7 @@ class EncodedImage:
 def available_modalities(window: ObservedWindow, wanted: Sequence[Modality]) -> tuple[Modality, ...]:
     """Give the wanted modalities that every observed frame has (public trees can lack depth)."""
     return tuple(
-        modality
-        for modality in wanted
-        if all((folder / MODALITY_FILES[modality]).is_file() for folder in window.frame_folders)
+        modality for modality in wanted if all(MODALITY_FILES[modality] in names for names in window.frame_files)
     )
 
 
@@ -48,6 +47,11 @@ class FrameEncoder:
         self.cfg = cfg
         self.num_encoded = 0
         self._cache: OrderedDict[tuple[Path, tuple[Modality, ...]], list[EncodedImage]] = OrderedDict()
+        self._lock = threading.Lock()  # frames are encoded on several threads
+
+    def holds(self, frame: Path, modalities: tuple[Modality, ...]) -> bool:
+        """Tell whether a frame is encoded already."""
+        return (frame, modalities) in self._cache
 
     def encode(self, frame: Path, modalities: tuple[Modality, ...]) -> list[EncodedImage]:
         """Give the pictures of one frame: one per modality, or one in all when tiled.
@@ -56,18 +60,20 @@ class FrameEncoder:
             InputError: a file is missing or not an image.
         """
         key = (frame, modalities)
-        if key in self._cache:
-            self._cache.move_to_end(key)
-            return self._cache[key]
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
         views = [self._view(frame, modality) for modality in modalities]
         if self.cfg.layout == "tiled":
             height = min(view.shape[0] for view in views)
             views = [np.hstack([view[:height] for view in views])]
         images = [self._encode(view, frame) for view in views]
-        self.num_encoded += 1
-        self._cache[key] = images
-        while len(self._cache) > self.cfg.cache_frames:
-            self._cache.popitem(last=False)
+        with self._lock:
+            self.num_encoded += 1
+            self._cache[key] = images
+            while len(self._cache) > self.cfg.cache_frames:
+                self._cache.popitem(last=False)
         return images
 
     def _view(self, frame: Path, modality: Modality) -> np.ndarray:

@@ -112,7 +112,8 @@ def _capital(text: str) -> str:
 
 def _causes(f: Facts, token: str) -> list[tuple[Both, ...]]:
     """Give the reasons for a decision that the facts hold, else its general reason."""
-    found = [wording for wording in (cause(f, find_cues(f)) for cause in _EVIDENCE.get(token, ())) if wording]
+    cues = find_cues(f)
+    found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
     return [(wording,) for wording in found[:2]] or [_GENERAL[token]]
 
 

@@ -17,6 +17,7 @@ from cosfly.coc import Verdict
 from cosfly.config import Config
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
+Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
 Modality = Literal["rgb", "depth", "segmentation"]
 
 
@@ -29,7 +30,8 @@ class ObservedWindow:
 
     indices: frame indices (n,). time_s (n,); positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll;
     targets_m (n, 3) NaN where unknown; target_uv (n, 2) and target_bbox (n, 4) px, NaN where unknown; target_depth_m (n,);
-    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; frame_folders: n folders.
+    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; frame_folders: n folders; frame_files:
+    the names that each holds.
     """
 
     sample_id: str
@@ -50,6 +52,7 @@ class ObservedWindow:
     visible: np.ndarray
     visibility: np.ndarray
     frame_folders: tuple[Path, ...]
+    frame_files: tuple[frozenset[str], ...]
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class Sample:
     observed: ObservedWindow
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
+    keyframe: dict[str, Any] | None = None  # why it was taken, and how many windows after it were not
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,12 @@ class WindowConfig(Config):
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, 0.5 s apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
+    keyframes: bool = Field(
+        False, description="take only the windows at which the label changes, and each keyframe_stride-th after one"
+    )
+    keyframe_stride: int = Field(
+        10, ge=1, description="longest way, in windows, from one keyframe to the next within a label"
+    )
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
     label_without_perturbation: bool = Field(
         True, description="take the recorded perturbation off the future poses, so that noise gives no label"
@@ -157,15 +167,66 @@ class EndpointConfig(Config):
     concurrency: int = Field(
         16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
     )
-    timeout_s: float = Field(120.0, gt=0, description="limit of one request")
+    timeout_s: float = Field(120.0, gt=0, description="limit of one request, from its first byte to its last")
+    total_timeout_s: float = Field(
+        900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
+    )
     max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
     backoff_s: float = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
     max_backoff_s: float = Field(60.0, gt=0, description="longest wait between two tries")
     stop_after_failures: int = Field(20, ge=1, description="windows in a row without an answer that end the run")
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
+    image_uuid: bool = Field(
+        False, description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it"
+    )
     extra_body: dict[str, Any] = Field(
         default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"
     )
+
+
+class BudgetConfig(Config):
+    """What a teacher may use up, counted over all runs into one folder."""
+
+    price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
+    price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
+    max_cost: float | None = Field(None, gt=0, description="stop before this cost is passed; empty: no limit")
+    max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are passed; empty: no limit")
+
+    @model_validator(mode="after")
+    def _priced(self) -> Self:
+        if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
+            raise ValueError("max_cost needs price_prompt and price_completion, else it could never be reached")
+        return self
+
+
+class VllmConfig(Config):
+    """The engine in this process, for teacher `vllm:MODEL_DIR`."""
+
+    batch: int = Field(256, ge=1, description="requests handed to the engine at once")
+    max_model_len: int | None = Field(None, ge=1024, description="context length; empty takes the model's")
+    gpu_memory_utilization: float = Field(0.9, gt=0, le=1, description="share of the accelerator's memory")
+    tensor_parallel_size: int = Field(1, ge=1, description="accelerators that share the model")
+    engine: dict[str, Any] = Field(default_factory=dict, description="further arguments of vllm.LLM")
+
+
+class JudgeConfig(Config):
+    """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+
+    url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
+    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
+    concurrency: int = Field(16, ge=1, le=4096, description="most requests in flight")
+    timeout_s: float = Field(120.0, gt=0, description="limit of one request")
+    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
+    open_flights: int = Field(64, ge=1, description="flights whose judgements are kept in memory")
+    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
+
+    @model_validator(mode="after")
+    def _is_url(self) -> Self:
+        if self.url is not None and not self.url.startswith(("http://", "https://")):
+            raise ValueError(f"judge.url must begin with http:// or https://, got {self.url!r}")
+        return self
 
 
 class RepairConfig(Config):
@@ -182,22 +243,27 @@ class CaptionConfig(Config):
     """Settings of stage `caption`."""
 
     teacher: str = Field(
-        "rules", description="`rules` (embedded, no model) or the URL of an OpenAI-compatible endpoint"
+        "rules",
+        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, or `vllm:MODEL_DIR`",
     )
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
+    vllm: VllmConfig = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
+    budget: BudgetConfig = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
+    judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
     limit: int | None = Field(None, ge=1, description="caption at most this many windows; empty takes all")
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:
-        if self.teacher != "rules" and not self.teacher.startswith(("http://", "https://")):
+        if self.teacher != "rules" and not self.teacher.startswith(("http://", "https://", "vllm:")):
             raise ValueError(
-                f"teacher must be `rules` or a URL that begins with http:// or https://, got {self.teacher!r}"
+                "teacher must be `rules` or a URL that begins with http:// or https://, or vllm:MODEL_DIR, "
+                f"got {self.teacher!r}"
             )
         return self

@@ -68,7 +68,7 @@ def _box(f: Facts) -> tuple[Both, ...] | None:
     if w0 is None or h0 is None or abs(h1 - h0) < max(2.0, 0.08 * h0):
         return (
             (f"the bounding box measures about {w1} x {h1} px", f"边界框约为 {w1} × {h1} 像素"),
-            (f"its bounding box is about {w1} x {h1} px", f"其边界框大小约 {w1} × {h1} 像素"),
+            (f"its bounding box is about {w1} x {h1} px", f"边界框大小约 {w1} × {h1} 像素"),
         )
     en, zh = ("grows", "增大") if h1 > h0 else ("shrinks", "缩小")
     return (
@@ -85,14 +85,14 @@ def _position(f: Facts) -> tuple[Both, ...] | None:
         return None
     if abs(dx) < max(2.0, CENTERED_SHARE * f.width_px):
         return (
-            ("it stays close to the image centre", "其位置接近画面中心"),
-            ("it lies near the image centre", "其位于画面中心附近"),
+            ("it stays close to the image centre", "目标位置接近画面中心"),
+            ("it lies near the image centre", "目标位于画面中心附近"),
         )
     en, zh = ("right", "右") if dx > 0 else ("left", "左")
     n = abs(dx)
     return (
-        (f"it lies {n} px to the {en} of the image centre", f"其位于画面中心{zh}侧 {n} 像素处"),
-        (f"it sits {n} px {en} of the image centre", f"其处在画面中心偏{zh} {n} 像素处"),
+        (f"it lies {n} px to the {en} of the image centre", f"目标位于画面中心{zh}侧 {n} 像素处"),
+        (f"it sits {n} px {en} of the image centre", f"目标在画面中心偏{zh} {n} 像素处"),
     )
 
 
@@ -151,7 +151,7 @@ def _altitude(f: Facts) -> tuple[Both, ...]:
 def _yaw(f: Facts) -> tuple[Both, ...]:
     total = f.yaw_deg[-1]
     if abs(total) < 1.0 and max(f.yaw_deg) - min(f.yaw_deg) >= 2.0:
-        return (("the yaw wavers round its first value", "偏航角在初始值附近摆动"),)
+        return (("the yaw wavers around its first value", "偏航角在初始值附近摆动"),)
     if abs(total) < 1.0:
         return (("the yaw is steady", "偏航角平稳"), ("the yaw hardly changes", "偏航角几乎不变"))
     en, zh = ("left", "左") if total > 0 else ("right", "右")

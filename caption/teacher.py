@@ -1,48 +1,36 @@
 """Teachers: who answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `EndpointTeacher` speaks chat completions with any OpenAI-compatible server; it
-retries what may pass, names what cannot, and journals every answer before it hands it on. The key comes from the environment
-variable COSFLY_API_KEY and goes into the request header only.
+`RuleTeacher` is embedded and deterministic. `EndpointTeacher` asks a chat-completions server, `VllmTeacher` (vllm_teacher.py)
+an engine in this process; both journal every answer before they hand it on, through `KeptAnswers`.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
-import random
-import re
 import time
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import urlsplit, urlunsplit
-
-import httpx
 
 from caption.answers import AnswerBook
+from caption.budget import Budget
+from caption.client import KEY_VARIABLE, ChatClient, NoAnswer
 from caption.images import FrameEncoder
 from caption.prompts import Question, answer_schema, mirror_messages, mirror_schema, question_messages
+from caption.protocol import answer_key, base_url, shown_url, with_image_ids
 from caption.rules import write_answers
-from caption.schema import EndpointConfig, ImageConfig, Reply
-from caption.throttle import Throttle
+from caption.schema import BudgetConfig, EndpointConfig, ImageConfig, Modality, Reply
 from cosfly.coc import Coc
-from cosfly.errors import TeacherError
 from cosfly.runner import rng_for
-from cosfly.store import dump_json, parse_json, sha256_bytes
+from cosfly.store import dump_json
 
-log = logging.getLogger(__name__)
+__all__ = ["KEY_VARIABLE", "EndpointTeacher", "NoAnswer", "RuleTeacher", "Teacher", "base_url", "shown_url"]
 
-KEY_VARIABLE = "COSFLY_API_KEY"
-BUSY_STATUS = frozenset({429, 503, 529})
-RETRIED_STATUS = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
-
-
-class NoAnswer(Exception):
-    """A window got no answer; `cause` is a word for the tally. `is_final`: asking again later would not help."""
-
-    def __init__(self, cause: str, detail: str, *, is_final: bool = False) -> None:
-        super().__init__(f"{cause}: {detail}")
-        self.cause, self.detail, self.is_final = cause, detail, is_final
+ENCODING_THREADS = 4
+CHARACTERS_PER_TOKEN = 3  # a low guess: it only bounds the first requests of a limited budget
+PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders; the same
 
 
 class Teacher(Protocol):
@@ -84,45 +72,119 @@ def _native(answer: Coc) -> Reply:
     return Reply(dump_json(answer.model_dump()), {}, "native", "stop")
 
 
+# --- answers that are kept --------------------------------------------------------------------------------------------
+
+
+class KeptAnswers:
+    """Gives an answer from the journal, or has it made, within the budget, and journals it.
+
+    only: sample ids that may be asked about; None: all. Of the others only what the journal holds is given.
+    """
+
+    def __init__(self, book: AnswerBook, budget: Budget, where: str) -> None:
+        self.book, self.budget, self.where = book, budget, where
+        self.only: frozenset[str] | None = None
+
+    async def give(
+        self,
+        identity: dict[str, str],
+        body: dict,
+        digests: list[str],
+        schema: dict,
+        make: Callable[[], Awaitable[dict]],
+    ) -> Reply:
+        """
+        Args:
+            identity: sample_id and purpose, for the journal.
+            make: gives text, usage, structured and finish_reason.
+        Raises:
+            NoAnswer: there is none. BudgetSpent: one more request might pass a limit.
+        """
+        key = answer_key(body, digests, schema)
+        known = self.book.get(key)
+        if known is None:
+            if self.only is not None and identity["sample_id"] not in self.only:
+                raise NoAnswer("not_asked", "this run asks about other windows only")
+            with self.budget.request():
+                start_s = time.monotonic()
+                known = {"key": key, **identity, "model": body["model"], **await make()}
+                known |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
+                await self.book.put(known)  # on the disk before anything is derived from it
+            self.budget.note(known["usage"], self.where)
+        return Reply(known["text"], known["usage"], known["structured"], known["finish_reason"])
+
+
+class SharedFrames:
+    """Encodes frames on threads, each once however many windows wait for it."""
+
+    def __init__(self, cfg: ImageConfig) -> None:
+        self.encoder = FrameEncoder(cfg)
+        self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
+        self._underway: dict[tuple[Path, tuple[Modality, ...]], asyncio.Future] = {}
+
+    async def messages(self, question: Question) -> tuple[list[dict], list[str]]:
+        """Give the chat messages of a question and the digests of its pictures.
+
+        Raises:
+            InputError, RenderError: a picture cannot be read or encoded.
+        """
+        if question.modalities:
+            frames = [(folder, question.modalities) for folder in question.window.frame_folders]
+            missing = [frame for frame in frames if not self.encoder.holds(*frame)]
+            if missing:
+                await asyncio.gather(*(self._encode(frame) for frame in missing))
+        return question_messages(question, self.encoder)
+
+    async def _encode(self, frame: tuple[Path, tuple[Modality, ...]]) -> None:
+        underway = self._underway.get(frame)
+        if underway is None:
+            loop = asyncio.get_running_loop()
+            underway = self._underway[frame] = loop.run_in_executor(self._threads, self.encoder.encode, *frame)
+            underway.add_done_callback(lambda _: self._underway.pop(frame, None))
+        await asyncio.shield(underway)  # a window that is cancelled does not take the frame from the others
+
+    def close(self) -> None:
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+def sampling_seed(seed: int, sample_id: str, purpose: str) -> int:
+    """Give the seed of one ask: the same in every run, another for every ask of a window."""
+    return int(rng_for(seed, "teacher", f"{sample_id}/{purpose}").integers(1 << 31))
+
+
+def first_budget(cfg: BudgetConfig, endpoint: EndpointConfig, image: ImageConfig, book: AnswerBook) -> Budget:
+    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much text."""
+    pictures = 16 * image.max_side_px * image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
+    return Budget(
+        cfg, book.totals, first_prompt=pictures + 6000 // CHARACTERS_PER_TOKEN, first_completion=endpoint.max_tokens
+    )
+
+
 # --- endpoint ---------------------------------------------------------------------------------------------------------
-
-
-def base_url(url: str) -> str:
-    """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
-    root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
-    return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
-
-
-def shown_url(url: str) -> str:
-    """Give a URL without user, password and query, for messages and records."""
-    parts = urlsplit(url)
-    host = parts.hostname or ""
-    return urlunsplit((parts.scheme, f"{host}:{parts.port}" if parts.port else host, parts.path, "", ""))
 
 
 class EndpointTeacher:
     """Asks a chat-completions server. Use as an async context manager."""
 
-    def __init__(self, url: str, cfg: EndpointConfig, image: ImageConfig, answers: AnswerBook, seed: int) -> None:
-        self.url, self.shown = base_url(url), shown_url(base_url(url))
-        self.cfg, self.answers, self.seed = cfg, answers, seed
+    def __init__(
+        self,
+        url: str,
+        cfg: EndpointConfig,
+        image: ImageConfig,
+        answers: AnswerBook,
+        seed: int,
+        budget: Budget | None = None,
+    ) -> None:
+        self.cfg, self.seed = cfg, seed
         self.record: dict[str, Any] = {}
-        self.encoder = FrameEncoder(image)
-        self._encoding = ThreadPoolExecutor(1, "encode")  # one thread: windows that share a frame find it encoded
-        self.throttle = Throttle(cfg.concurrency)
-        self._is_schema_refused = not cfg.json_schema
-        self._key = os.environ.get(KEY_VARIABLE, "")
-        self._jitter = random.Random()  # times of retries only: no product depends on it
-        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx.Limits(max_connections=cfg.concurrency, max_keepalive_connections=cfg.concurrency)
-        try:
-            self._client = httpx.AsyncClient(headers=headers, timeout=cfg.timeout_s, limits=limits)
-        except (httpx.InvalidURL, ValueError, UnicodeError) as error:
-            raise TeacherError("the key cannot be sent", where=KEY_VARIABLE, got=type(error).__name__) from None
+        self.client = ChatClient(url, cfg)
+        self.frames = SharedFrames(image)
+        budget = budget or first_budget(BudgetConfig(), cfg, image, answers)
+        self.kept = KeptAnswers(answers, budget, self.client.shown)
 
     async def __aenter__(self) -> EndpointTeacher:
         try:
-            model = await self._find_model()
+            model = await self.client.find_model()
         except BaseException:
             await self.__aexit__()
             raise
@@ -132,212 +194,29 @@ class EndpointTeacher:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        self._encoding.shutdown(wait=False, cancel_futures=True)
-        await self._client.aclose()
+        self.frames.close()
+        await self.client.aclose()
 
     async def ask(self, question: Question) -> Reply:
-        loop = asyncio.get_running_loop()
-        messages, digests = await loop.run_in_executor(self._encoding, question_messages, question, self.encoder)
+        messages, digests = await self.frames.messages(question)
         schema = answer_schema(question.decision)
-        return await self._answer(question.window.sample_id, question.purpose, messages, digests, schema)
+        return await self.complete(question.window.sample_id, question.purpose, messages, digests, schema)
 
     async def mirror(self, question: Question, english: Coc, ask: int) -> Reply:
         schema = mirror_schema(english.flight_decision)
-        return await self._answer(question.window.sample_id, f"mirror/{ask}", mirror_messages(english), [], schema)
+        return await self.complete(question.window.sample_id, f"mirror/{ask}", mirror_messages(english), [], schema)
 
-    # --- one answer, from the journal or the server ---
+    async def complete(
+        self, sample_id: str, purpose: str, messages: list[dict], digests: list[str], schema: dict
+    ) -> Reply:
+        """Give the answer to any chat messages, from the journal or the server."""
+        body = self.body(sample_id, purpose, messages)
+        sent = body | {"messages": with_image_ids(messages, digests)} if self.cfg.image_uuid else body
+        identity = {"sample_id": sample_id, "purpose": purpose}
+        return await self.kept.give(identity, body, digests, schema, lambda: self.client.complete(sent, schema))
 
-    async def _answer(self, sample_id: str, purpose: str, messages: list, digests: list[str], schema: dict) -> Reply:
-        body = self._body(sample_id, purpose, messages)
-        key = answer_key(body, digests, schema)
-        known = self.answers.get(key)
-        if known is None:
-            start_s = time.monotonic()
-            known = await self._post(body, schema)
-            known |= {"key": key, "sample_id": sample_id, "purpose": purpose, "model": body["model"]}
-            known |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
-            self.answers.put(known)  # on the disk before anything is derived from it
-        return Reply(known["text"], known["usage"], known["structured"], known["finish_reason"])
-
-    def _body(self, sample_id: str, purpose: str, messages: list) -> dict[str, Any]:
+    def body(self, sample_id: str, purpose: str, messages: list[dict]) -> dict[str, Any]:
+        """Give a request without its response format."""
         c = self.cfg
-        sampling_seed = int(rng_for(self.seed, "teacher", f"{sample_id}/{purpose}").integers(1 << 31))
         body = {"model": self.record["model"], "messages": messages, "temperature": c.temperature, "top_p": c.top_p}
-        return body | {"max_tokens": c.max_tokens, "seed": sampling_seed} | c.extra_body
-
-    async def _post(self, body: dict, schema: dict) -> dict:
-        """Send one request until it is answered; gives text, usage, structured and finish_reason."""
-        cause, detail = "no_answer", ""
-        for attempt in range(self.cfg.max_tries):
-            is_structured = not self._is_schema_refused
-            payload = body | ({"response_format": _response_format(schema)} if is_structured else {})
-            wait_s: float | None = None
-            try:
-                async with self.throttle.slot() as given_s:
-                    response = await self._client.post(f"{self.url}/chat/completions", json=payload)
-            except httpx.TimeoutException:
-                cause, detail = "timeout", f"no answer within {self.cfg.timeout_s} s"
-            except httpx.TransportError as error:
-                cause, detail = "connection", self._clean(f"{type(error).__name__} {error}")
-            except httpx.InvalidURL:
-                raise self._error("not a URL that can be asked", fix="check --teacher") from None
-            else:
-                status = response.status_code
-                if status == 200:
-                    found = _read_completion(response)
-                    if isinstance(found, dict):
-                        self.throttle.succeeded()
-                        return found | {"structured": "json_schema" if is_structured else "plain"}
-                    cause, detail = "bad_reply", found
-                elif status in RETRIED_STATUS:
-                    cause, detail = f"http_{status}", self._detail(response)
-                    wait_s = _retry_after_s(response)
-                    if status in BUSY_STATUS:
-                        self.throttle.was_busy(given_s, wait_s)
-                elif status in (400, 422) and is_structured:
-                    log.warning(
-                        "%s: refuses a JSON schema (%s); asking without one", self.shown, self._detail(response)
-                    )
-                    self._is_schema_refused = True
-                    wait_s = 0.0
-                else:
-                    self._stop_if_fatal(response)
-                    raise NoAnswer(f"refused_{status}", self._detail(response), is_final=True)
-            if attempt + 1 < self.cfg.max_tries:
-                await asyncio.sleep(self._wait_s(attempt) if wait_s is None else wait_s)
-        raise NoAnswer(cause, detail)
-
-    def _wait_s(self, attempt: int) -> float:
-        longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0**attempt)
-        return self._jitter.uniform(0.5, 1.0) * longest
-
-    # --- errors ---
-
-    async def _find_model(self) -> str:
-        """Ask which models there are and check ours.
-
-        Raises:
-            TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
-        """
-        try:
-            response = await self._client.get(f"{self.url}/models")
-        except httpx.InvalidURL:
-            raise self._error("not a URL that can be asked", fix="check --teacher") from None
-        except httpx.HTTPError as error:
-            reason = self._clean(f"{type(error).__name__} {error}")
-            raise self._error(
-                "cannot reach the teacher", got=reason, fix="start the server or check --teacher"
-            ) from None
-        wanted = self.cfg.model
-        if response.status_code in (401, 403):
-            self._stop_if_fatal(response)
-        names = _model_names(response)
-        if names is None:
-            if wanted:
-                return wanted  # some hosts list no models; the first request will tell
-            what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=f"HTTP {response.status_code}", fix="check the URL, or give --model")
-        if wanted is None and len(names) == 1:
-            return names[0]
-        if wanted in names:
-            return str(wanted)
-        listed = ", ".join(names[:8]) or "none"
-        raise self._error(
-            "the endpoint does not have this model" if wanted else "the endpoint has several models",
-            got=wanted or f"{len(names)} models",
-            expected=f"one of {listed}",
-            fix="give --model",
-        )
-
-    def _stop_if_fatal(self, response: httpx.Response) -> None:
-        """Raise for what would fail for every window."""
-        status, detail = response.status_code, self._detail(response)
-        if status in (401, 403):
-            raise self._error("the teacher refuses the key", got=f"HTTP {status} {detail}", fix=f"set {KEY_VARIABLE}")
-        if status == 404:
-            raise self._error(
-                "no such model or not a chat endpoint", got=f"HTTP 404 {detail}", fix="check URL and model"
-            )
-        if 300 <= status < 400 or status == 405:
-            raise self._error("not a chat endpoint", got=f"HTTP {status} {detail}", fix="check the URL")
-
-    def _error(self, what: str, **parts: Any) -> TeacherError:
-        return TeacherError(what, where=self.shown, **parts)
-
-    def _detail(self, response: httpx.Response) -> str:
-        try:
-            value = parse_json(response.content)
-            error = value.get("error", value) if isinstance(value, dict) else value
-            text = str(error.get("message", error) if isinstance(error, dict) else error)
-        except ValueError:
-            text = response.text
-        return self._clean(text)
-
-    def _clean(self, text: str) -> str:
-        """Cut a server's text short and take out the key, should the server echo it."""
-        text = " ".join(text.split())
-        secrets = [self._key, urlsplit(self.url).password or ""]
-        for secret in filter(None, secrets):
-            text = text.replace(secret, "***")
-        return text[:200]
-
-
-def answer_key(body: dict, digests: list[str], schema: dict) -> str:
-    """Hash image bytes, prompt, model and sampling: what an answer depends on."""
-    texts = [
-        {
-            "role": message["role"],
-            "content": message["content"]
-            if isinstance(message["content"], str)
-            else [part.get("text", "image") for part in message["content"]],
-        }
-        for message in body["messages"]
-    ]
-    sampling = {name: value for name, value in body.items() if name != "messages"}
-    return sha256_bytes(dump_json([texts, digests, sampling, schema]).encode())
-
-
-def _response_format(schema: dict) -> dict:
-    return {"type": "json_schema", "json_schema": {"name": "chain_of_cause", "strict": True, "schema": schema}}
-
-
-def _read_completion(response: httpx.Response) -> dict | str:
-    """Give text, usage and finish_reason of a completion, or a word on what is wrong with it."""
-    try:
-        value = parse_json(response.content)
-    except ValueError:
-        return "the body is not JSON"
-    choices = value.get("choices") if isinstance(value, dict) else None
-    if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
-        return "no choices"
-    message = choices[0].get("message")
-    text = message.get("content") if isinstance(message, dict) else None
-    if isinstance(text, list):  # content parts
-        text = "".join(str(part.get("text", "")) for part in text if isinstance(part, dict))
-    if not isinstance(text, str):
-        return "no text in the message"
-    usage = value.get("usage") if isinstance(value.get("usage"), dict) else {}
-    counts = {name: usage[name] for name in ("prompt_tokens", "completion_tokens") if type(usage.get(name)) is int}
-    return {"text": text, "usage": counts, "finish_reason": choices[0].get("finish_reason")}
-
-
-def _model_names(response: httpx.Response) -> list[str] | None:
-    """Read the list of models; None where there is none."""
-    if response.status_code != 200:
-        return None
-    try:
-        value = parse_json(response.content)
-    except ValueError:
-        return None
-    listed = value.get("data") if isinstance(value, dict) else None
-    if not isinstance(listed, list):
-        return None
-    return [str(entry["id"]) for entry in listed if isinstance(entry, dict) and "id" in entry]
-
-
-def _retry_after_s(response: httpx.Response) -> float | None:
-    """Read Retry-After in seconds, bounded; None where absent or a date."""
-    try:
-        return min(600.0, max(0.0, float(response.headers.get("retry-after", ""))))
-    except ValueError:
-        return None
+        return body | {"max_tokens": c.max_tokens, "seed": sampling_seed(self.seed, sample_id, purpose)} | c.extra_body

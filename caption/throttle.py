@@ -1,7 +1,8 @@
 """How many requests may be in flight: additive increase, multiplicative decrease, below a ceiling.
 
-A run starts with a few and doubles per round of answers until the server first says "busy" (429, 503); from then on it adds one
-per round and halves at every "busy". A Retry-After holds all requests back, not only the one that was told.
+A run starts with a few and triples per round of answers (8, 24, 72) until the server first says "busy" (429, 503); from then
+on it adds one per round and halves at every "busy". A server that is overloaded at once thus sees at most 8 requests before it
+can say so. A Retry-After holds all requests back, not only the one that was told.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 
 FIRST_LIMIT = 8
+RAMP_PER_ANSWER = 2.0  # triples the limit per round
 
 
 class Throttle:
@@ -45,7 +47,7 @@ class Throttle:
 
     def succeeded(self) -> None:
         """Note an answer."""
-        self.limit = min(float(self.ceiling), self.limit + (1.0 if self._is_ramping else 1.0 / self.limit))
+        self.limit = min(float(self.ceiling), self.limit + (RAMP_PER_ANSWER if self._is_ramping else 1.0 / self.limit))
 
     def was_busy(self, given_s: float, retry_after_s: float | None) -> None:
         """Note that the server is overloaded.

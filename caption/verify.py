@@ -9,10 +9,10 @@ Mirror: same decision, compatible numbers, no opposite swapped.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 from caption.facts import Facts
 from caption.glossary import Number, load_glossary
@@ -73,36 +73,92 @@ _FROM_TO: dict[Language, re.Pattern[str]] = {
 _PAIR = re.compile(r"(\d+)\s*[x×]\s*(\d+)")
 
 
-@dataclass(frozen=True)
-class _Clause:
-    """One clause with its numbers, opposites and keywords."""
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """What a clause says, its digits aside: most clauses of a data set differ from others in their numbers only.
 
-    text: str
-    numbers: tuple[Number, ...]
-    poles: tuple[tuple[str, int, int], ...]
+    numbers: with the digit runs they are made of instead of a value. sign: +1 or -1 where the clause takes one side of an
+    opposite; an opposite of which it takes none or both is not in it. sources: unit -> series that a number may come from.
+    """
+
+    numbers: tuple[_NumberForm, ...]
+    poles: tuple[tuple[str, int], ...]
     words: frozenset[str]
-
-    def has(self, name: str) -> bool:
-        return name in self.words
-
-    def sign(self, name: str) -> int:
-        """+1 or -1 where the clause takes one side of an opposite, 0 where none or both."""
-        signs = {sign for pair, sign, _ in self.poles if pair == name}
-        return signs.pop() if len(signs) == 1 else 0
+    sign: dict[str, int]
+    sources: dict[str, tuple[str, ...]]
+    trend_of: str | None
+    may_trend: bool
+    is_silent: bool  # nothing in it can be compared with a measurement
 
 
-def _clauses(text: str, language: Language) -> list[_Clause]:
-    return [_parse_clause(part, language) for part in _CLAUSES.split(text) if part and not part.isspace()]
+@dataclass(frozen=True, slots=True)
+class _NumberForm:
+    unit: str
+    is_negative: bool
+    whole: int  # index of the run of digits before the point
+    fraction: int | None  # and of the one after it
 
 
-@lru_cache(maxsize=8192)  # neighbouring windows and both checks share most clauses
-def _parse_clause(text: str, language: Language) -> _Clause:
+class _Clause(NamedTuple):
+    text: str
+    form: _Form
+    numbers: list[Number]
+
+
+_DIGITS = re.compile(r"\d+")
+
+
+@lru_cache(maxsize=64)  # both checks read a text
+def _clauses(text: str, language: Language) -> tuple[_Clause, ...]:
+    return tuple([_read_clause(part, language) for part in _CLAUSES.split(text) if part and not part.isspace()])
+
+
+@lru_cache(maxsize=4096)  # neighbouring windows share most clauses
+def _read_clause(text: str, language: Language) -> _Clause:
+    runs = _DIGITS.findall(text)
+    if not runs:
+        return _Clause(text, _read_form(text, language), [])
+    form = _read_form(_DIGITS.sub("0", text), language)
+    return _Clause(text, form, [_number(number, runs) for number in form.numbers])
+
+
+def _number(form: _NumberForm, runs: list[str]) -> Number:
+    digits = runs[form.whole]
+    places = 0
+    if form.fraction is not None:
+        places = len(runs[form.fraction])
+        digits = f"{digits}.{runs[form.fraction]}"
+    return Number(-float(digits) if form.is_negative else float(digits), form.unit, places, form.whole)
+
+
+@lru_cache(maxsize=65536)
+def _read_form(text: str, language: Language) -> _Form:
+    """Read a clause in which every run of digits is written as one "0"."""
     glossary = load_glossary()
-    numbers = glossary.numbers(text, language) if any(c.isdigit() for c in text) else []
+    found = glossary.numbers(text, language) if "0" in text else []
+    numbers = []
+    for number in found:
+        whole = text.count("0", 0, number.start)
+        is_negative = text[number.start] in "-−"
+        numbers.append(_NumberForm(number.unit, is_negative, whole, whole + 1 if number.digits else None))
     words = {str(match.lastgroup) for match in _WORDS[language].finditer(text)}
     if len(numbers) > 1 and _FROM_TO[language].search(text):
         words.add("from_to")
-    return _Clause(text.strip(), tuple(numbers), tuple(glossary.poles(text, language)), frozenset(words))
+    poles = tuple((name, sign) for name, sign, _ in glossary.poles(text, language))
+    sides: dict[str, set[int]] = {}
+    for name, sign in poles:
+        sides.setdefault(name, set()).add(sign)
+    taken = {name: min(signs) for name, signs in sides.items() if len(signs) == 1}
+    return _Form(
+        numbers=tuple(numbers),
+        poles=poles,
+        words=frozenset(words),
+        sign=taken,
+        sources=_sources(words),
+        trend_of=_trend_subject(words, {number.unit for number in numbers}),
+        may_trend="stable" in words or not taken.keys().isdisjoint(("comparison", "trend", "vertical")),
+        is_silent=not numbers and not poles and "stable" not in words,
+    )
 
 
 # --- evidence ---------------------------------------------------------------------------------------------------------
@@ -113,27 +169,35 @@ def check_evidence(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langua
     found = []
     for text in (coc.critical_components, coc.reasoning_trace):
         for clause in _clauses(text, language):
-            kinds = _clause_problems(clause, facts, cfg, coc.flight_decision)
-            found += [f"{kind}: {clause.text[:120]}" for kind in kinds]
+            if not clause.form.is_silent:
+                kinds = _clause_problems(clause, facts, cfg, coc.flight_decision)
+                found += [f"{kind}: {clause.text.strip()[:120]}" for kind in kinds]
     return found
 
 
 def _clause_problems(clause: _Clause, facts: Facts, cfg: EvidenceConfig, decision: str) -> list[str]:
-    if not clause.numbers and not clause.poles and not clause.has("stable"):
-        return []
-    if clause.has("decision"):
-        return ["decision"] if _decision_differs(clause, decision) else []
-    series = _quantities(clause, facts)
+    form = clause.form
+    if "decision" in form.words:
+        return ["decision"] if _decision_differs(form, decision) else []
     problems = []
-    if any(not _number_holds(number, series, cfg) for number in clause.numbers):
-        problems.append("number")
-    if _pair_differs(clause, facts, cfg):
+    sizes = facts.sizes
+    for number in clause.numbers:
+        sources = form.sources.get(number.unit, ())
+        claimed = abs(number.value)
+        for name in sources:  # most numbers are copied: look before computing
+            if claimed in sizes[name]:
+                break
+        else:
+            if sources and not _number_holds(number, sources, facts, cfg):
+                problems.append("number")
+                break
+    if "box" in form.words and clause.numbers and _pair_differs(clause, facts, cfg):
         problems.append("box")
-    if _trend_differs(clause, series, facts):
+    if form.may_trend and _trend_differs(clause, facts):
         problems.append("trend")
-    if _side_differs(clause, facts):
+    if "side" in form.sign and _side_differs(clause, facts):
         problems.append("side")
-    if _visibility_differs(clause, facts):
+    if "visibility" in form.sign and _visibility_differs(form, facts):
         problems.append("visibility")
     return problems
 
@@ -144,65 +208,57 @@ _DECISION_POLES = {
 }  # fmt: skip
 
 
-def _decision_differs(clause: _Clause, decision: str) -> bool:
+def _decision_differs(form: _Form, decision: str) -> bool:
     """Tell whether a clause that states the decision names the opposite of it."""
     for word, (pair, sign) in _DECISION_POLES.items():
         if word in decision:
-            return clause.sign(pair) == -sign
+            return form.sign.get(pair) == -sign
     return False
 
 
-def _quantities(clause: _Clause, f: Facts) -> dict[str, list[Series]]:
-    """Give, per unit, the measured series that a number of this clause may come from."""
-    target = clause.has("target")
-    speed: list[Series] = [(f.target_speed_mps,)] if target else []
-    if clause.has("drone") or not target:
-        speed.append(f.speed_mps)
-    length: list[Series] = []
-    if clause.has("distance"):
-        length += [f.distance_m] if clause.has("horizontal") else [f.distance_m, f.slant_m]
-    if clause.has("altitude"):
-        length.append(f.altitude_m)
-    pixels: list[Series] = []
-    if clause.has("box"):
-        pixels += [f.box_width_px, f.box_height_px]
-    if clause.has("center"):
-        pixels += [f.offset_x_px, f.offset_y_px]
-    angle: list[Series] = []
-    if clause.has("yaw"):
-        angle.append(f.yaw_deg)
-    if clause.has("pitch"):
-        angle.append(f.pitch_deg)
+def _sources(words: set[str]) -> dict[str, tuple[str, ...]]:
+    """Give, per unit, the measured series that a number of a clause with these keywords may come from."""
+    speed = ["target_speed_mps"] if "target" in words else []
+    if "drone" in words or "target" not in words:
+        speed.append("speed_mps")
+    length: list[str] = []
+    if "distance" in words:
+        length += ["distance_m"] if "horizontal" in words else ["distance_m", "slant_m"]
+    if "altitude" in words:
+        length.append("altitude_m")
+    pixels: list[str] = []
+    if "box" in words:
+        pixels += ["box_width_px", "box_height_px"]
+    if "center" in words:
+        pixels += ["offset_x_px", "offset_y_px"]
+    angle = [f"{name}_deg" for name in ("yaw", "pitch") if name in words]
     return {
-        "mps": speed,
-        "m": length or [f.distance_m, f.slant_m, f.altitude_m],
-        "px": pixels or [f.box_width_px, f.box_height_px, f.offset_x_px, f.offset_y_px],
-        "deg": angle or [f.yaw_deg, f.pitch_deg, (f.target_turn_deg,)],
+        "mps": tuple(speed),
+        "m": tuple(length or ["distance_m", "slant_m", "altitude_m"]),
+        "px": tuple(pixels or ["box_width_px", "box_height_px", "offset_x_px", "offset_y_px"]),
+        "deg": tuple(angle or ["yaw_deg", "pitch_deg", "target_turn_deg"]),
     }
 
 
-def _number_holds(number: Number, series: dict[str, list[Series]], cfg: EvidenceConfig) -> bool:
+def _number_holds(number: Number, sources: tuple[str, ...], facts: Facts, cfg: EvidenceConfig) -> bool:
     """Tell whether a number is a measured value or the difference of two of one series; without such a series it holds."""
-    if number.unit not in series:
-        return True
-    tolerance = {"m": cfg.tolerance_m, "mps": cfg.tolerance_mps, "deg": cfg.tolerance_deg, "px": cfg.tolerance_px}
-    slack = tolerance[number.unit] + 0.5 * 10.0**-number.digits
     claimed = abs(number.value)
+    tolerance = {"m": cfg.tolerance_m, "mps": cfg.tolerance_mps, "deg": cfg.tolerance_deg, "px": cfg.tolerance_px}
+    step = 0.5 * 10.0**-number.digits
+    slack = tolerance[number.unit] + step
     any_known = False
-    for values in series[number.unit]:
-        known = [value for value in values if value is not None]
+    for name in sources:
+        known = [value for value in facts.series(name) if value is not None]
         any_known = any_known or bool(known)
         if any(abs(claimed - abs(v)) <= max(slack, cfg.relative * abs(v)) for v in known):
             return True
-        if any(abs(claimed - abs(a - b)) <= 0.5 * 10.0**-number.digits + 1e-9 for a in known for b in known):
+        if any(abs(claimed - abs(a - b)) <= step + 1e-9 for a in known for b in known):
             return claimed > 0
     return not any_known
 
 
 def _pair_differs(clause: _Clause, f: Facts, cfg: EvidenceConfig) -> bool:
     """Check "w x h px" as width and height of one and the same frame's box."""
-    if not clause.has("box"):
-        return False
     sizes = [(w, h) for w, h in zip(f.box_width_px, f.box_height_px, strict=True) if w is not None and h is not None]
     slack = cfg.tolerance_px
     return bool(sizes) and not all(
@@ -211,19 +267,21 @@ def _pair_differs(clause: _Clause, f: Facts, cfg: EvidenceConfig) -> bool:
     )
 
 
-def _trend_differs(clause: _Clause, series: dict[str, list[Series]], f: Facts) -> bool:
+def _trend_differs(clause: _Clause, f: Facts) -> bool:
+    form = clause.form
     numbers = [n for n in clause.numbers if n.unit]
-    comparison = clause.sign("comparison")
+    comparison = form.sign.get("comparison")
     if comparison and len(numbers) == 2 and numbers[0].unit == numbers[1].unit:
         return comparison * (numbers[0].value - numbers[1].value) < 0
-    subject = _trend_subject(clause, series, f)
-    if subject is None:
+    if form.trend_of is None:
         return False
-    known = [v for v in subject if v is not None]
+    known = [v for v in f.series(form.trend_of) if v is not None]
     if len(known) < 2:
         return False
-    sign = clause.sign("vertical") if subject is f.altitude_m and clause.sign("vertical") else clause.sign("trend")
-    if clause.has("from_to") and len(numbers) in (2, 4) and len({n.unit for n in numbers}) == 1:
+    sign = form.sign.get("trend", 0)
+    if form.trend_of == "altitude_m":
+        sign = form.sign.get("vertical", sign)
+    if "from_to" in form.words and len(numbers) in (2, 4) and len({n.unit for n in numbers}) == 1:
         first, last = numbers[len(numbers) // 2 - 1].value, numbers[-1].value
         if sign:
             return sign * (last - first) < 0 or (last == first and known[-1] != known[0])
@@ -231,60 +289,50 @@ def _trend_differs(clause: _Clause, series: dict[str, list[Series]], f: Facts) -
     if sign:
         # A trend may be the window's or the last step's; it is wrong where neither goes its way.
         return sign * (known[-1] - known[0]) <= 0 and sign * (known[-1] - known[-2]) <= 0
-    if clause.has("stable") and not clause.has("past"):
+    if "stable" in form.words and "past" not in form.words:
         recent = known[-3:]
-        allowed = {"speed": 0.5, "yaw": 3.0}.get(_subject_name(subject, f), max(1.0, 0.1 * abs(recent[-1])))
+        allowed = _STABLE.get(form.trend_of, max(1.0, 0.1 * abs(recent[-1])))
         return max(recent) - min(recent) > allowed
     return False
 
 
-def _subject_name(subject: Series, f: Facts) -> str:
-    return "speed" if subject is f.speed_mps else "yaw" if subject is f.yaw_deg else "length"
+_STABLE = {"speed_mps": 0.5, "yaw_deg": 3.0}  # widest spread of "stable"; other series: a tenth of the value
 
 
-def _trend_subject(clause: _Clause, series: dict[str, list[Series]], f: Facts) -> Series | None:
-    """Give the one series that a trend word of this clause speaks of, None where that is not plain."""
-    candidates: list[Series] = []
-    if clause.has("distance"):
-        candidates.append(f.distance_m)
-    if clause.has("altitude"):
-        candidates.append(f.altitude_m)
-    if clause.has("box"):
-        candidates.append(f.box_height_px)
-    if clause.has("yaw"):
-        candidates.append(f.yaw_deg)
-    if any(number.unit == "mps" for number in clause.numbers) and not clause.has("target"):
-        candidates.append(f.speed_mps)
+def _trend_subject(words: set[str], units: set[str]) -> str | None:
+    """Give the one series that a trend word of a clause speaks of, None where that is not plain."""
+    pairs = {"distance": "distance_m", "altitude": "altitude_m", "box": "box_height_px", "yaw": "yaw_deg"}
+    candidates = [series for word, series in pairs.items() if word in words]
+    if "mps" in units and "target" not in words:
+        candidates.append("speed_mps")
     return candidates[0] if len(candidates) == 1 else None
 
 
 def _side_differs(clause: _Clause, f: Facts) -> bool:
-    sign = clause.sign("side")  # +1 left
-    if not sign or clause.has("past"):
+    sign, words = clause.form.sign["side"], clause.form.words  # +1 left
+    if "past" in words:
         return False
-    if clause.has("center"):
+    if "center" in words:
         dx = f.offset_x_px[-1]
         return dx is not None and abs(dx) >= 2 and sign * dx > 0
-    if clause.has("yaw"):
+    if "yaw" in words:
         turned = [n.value for n in clause.numbers if n.unit == "deg"]
         if len(turned) == 1:  # "12.9 deg to the left": the yaw of that size must lie on that side
             sized = [v for v in f.yaw_deg if abs(abs(v) - abs(turned[0])) < 0.1]
             return bool(sized) and not any(sign * v >= 0 for v in sized)
         recent = f.yaw_deg[-1] - f.yaw_deg[-2]
         return sign * f.yaw_deg[-1] < 0 and sign * recent <= 0
-    if clause.has("bend") and not clause.has("drone"):
+    if "bend" in words and "drone" not in words:
         return f.target_turn_deg is not None and sign * f.target_turn_deg < 0
     return False
 
 
-def _visibility_differs(clause: _Clause, f: Facts) -> bool:
-    if clause.has("past") or not clause.has("target"):
+def _visibility_differs(form: _Form, f: Facts) -> bool:
+    if "past" in form.words or "target" not in form.words:
         return False
-    sign = clause.sign("visibility")
-    now = f.visibility[-1]
-    if sign > 0:
+    if form.sign["visibility"] > 0:
         return not f.is_visible_now
-    return sign < 0 and now == "visible"
+    return f.visibility[-1] == "visible"
 
 
 # --- the two languages ------------------------------------------------------------------------------------------------
@@ -308,25 +356,32 @@ def check_mirror(english: Coc, chinese: Coc, flight: dict[str, list[Series]]) ->
     """
     if english.flight_decision != chinese.flight_decision:
         return "decision"
-    en = _clauses(f"{english.critical_components}\n{english.reasoning_trace}", "en")
-    zh = _clauses(f"{chinese.critical_components}\n{chinese.reasoning_trace}", "zh")
+    en = (*_clauses(english.critical_components, "en"), *_clauses(english.reasoning_trace, "en"))
+    zh = (*_clauses(chinese.critical_components, "zh"), *_clauses(chinese.reasoning_trace, "zh"))
     numbers_en, numbers_zh = [n for c in en for n in c.numbers], [n for c in zh for n in c.numbers]
     for ours, theirs in ((numbers_en, numbers_zh), (numbers_zh, numbers_en)):
+        sizes = {(number.unit, abs(number.value)) for number in theirs}
         for number in ours:
-            if not _is_shared(number, theirs, flight):
+            if (number.unit, abs(number.value)) not in sizes and not _is_shared(number, theirs, flight):
                 return "number"
     counts_en, counts_zh = _pole_counts(en), _pole_counts(zh)
+    if counts_en == counts_zh:
+        return None
     for pair in sorted({name for name, _ in counts_en.keys() | counts_zh.keys()}):
         for sign in (1, -1):
-            lost = counts_zh[pair, sign] < counts_en[pair, sign]
-            gained = counts_zh[pair, -sign] > counts_en[pair, -sign]
+            lost = counts_zh.get((pair, sign), 0) < counts_en.get((pair, sign), 0)
+            gained = counts_zh.get((pair, -sign), 0) > counts_en.get((pair, -sign), 0)
             if lost and gained:
                 return f"polarity_{pair}"
     return None
 
 
-def _pole_counts(clauses: list[_Clause]) -> Counter[tuple[str, int]]:
-    return Counter((name, sign) for clause in clauses for name, sign, _ in clause.poles)
+def _pole_counts(clauses: tuple[_Clause, ...]) -> dict[tuple[str, int], int]:
+    counts: dict[tuple[str, int], int] = {}
+    for clause in clauses:
+        for pole in clause.form.poles:
+            counts[pole] = counts.get(pole, 0) + 1
+    return counts
 
 
 def _is_shared(number: Number, theirs: list[Number], flight: dict[str, list[Series]]) -> bool:

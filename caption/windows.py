@@ -5,12 +5,19 @@ The observed frames and the future leave this module as two types, so that a pro
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from caption.schema import FutureMotion, ObservedWindow, Sample, WindowConfig
+from caption.actions import label_of, measure
+from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Sample, WindowConfig
 from cosfly.playback import Flight, sample_id
+
+DEFAULT_LABEL = LabelConfig()
 
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:
@@ -18,22 +25,66 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
     return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
 
 
-def iterate_samples(flight: Flight, cfg: WindowConfig) -> Iterator[Sample]:
-    """Yield a flight's samples in order of time. A flight shorter than a window gives none."""
-    missing = set(flight.missing_frames(("rgb.png",))) if cfg.require_images else set()
+def iterate_samples(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFAULT_LABEL) -> Iterator[Sample]:
+    """Yield a flight's samples in order of time. A flight shorter than a window gives none.
+
+    Args:
+        label: thresholds by which keyframes are chosen; the choice takes windows, it shows a teacher nothing.
+    """
     clean_positions, clean_yaw_deg = flight.positions_m, flight.rotations_deg[:, 1]
     if cfg.label_without_perturbation:
         clean_positions = clean_positions - flight.drone_offsets_m
         clean_yaw_deg = clean_yaw_deg - flight.rotation_offsets_deg[:, 1]
     folders = [flight.frame_folder(i) for i in range(len(flight))]
-    for current in current_frames(len(flight), cfg):
-        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders)
+    files = [_files_in(folder) for folder in folders]
+    missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
+    currents = list(current_frames(len(flight), cfg))
+    keyframes: list[dict[str, Any] | None] = [None] * len(currents)
+    if cfg.keyframes:
+        futures = (cut_future(flight, clean_positions, clean_yaw_deg, i, cfg.future_frames) for i in currents)
+        chosen = choose_keyframes([label_of(measure(future), label) for future in futures], cfg.keyframe_stride)
+        currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
+    for current, keyframe in zip(currents, keyframes, strict=True):
+        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders, files)
         problem = "missing_frame" if missing.intersection(observed.indices) else None
         future = cut_future(flight, clean_positions, clean_yaw_deg, current, cfg.future_frames)
-        yield Sample(observed, future, problem)
+        yield Sample(observed, future, problem, keyframe)
 
 
-def _observe(flight: Flight, span: slice, folders: list) -> ObservedWindow:
+def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, dict[str, Any]]:
+    """Choose the windows at which the label changes, the first one, and each `stride`-th after a chosen one.
+
+    Returns:
+        index -> {reason: start | change | stride, skipped: windows left out up to the next chosen one, missed: changes of
+        the label among them, counted anew from the labels}.
+    """
+    chosen: dict[int, dict[str, Any]] = {}
+    last = -1
+    for i, label in enumerate(labels):
+        reason = "start" if i == 0 else "change" if label != labels[i - 1] else "stride" if i - last == stride else None
+        if reason is None:
+            chosen[last]["skipped"] += 1
+        else:
+            chosen[i] = {"reason": reason, "skipped": 0, "missed": 0}
+            last = i
+    for i in missed_changes(labels, set(chosen)):
+        chosen[max(k for k in chosen if k < i)]["missed"] += 1
+    return chosen
+
+
+def missed_changes(labels: list[str | None], chosen: set[int]) -> list[int]:
+    """Give the windows at which the label changes and that were not chosen."""
+    return [i for i in range(1, len(labels)) if labels[i] != labels[i - 1] and i not in chosen]
+
+
+def _files_in(folder: Path) -> frozenset[str]:
+    try:
+        return frozenset(os.listdir(folder))
+    except OSError:  # no such frame: the window says so
+        return frozenset()
+
+
+def _observe(flight: Flight, span: slice, folders: list[Path], files: list[frozenset[str]]) -> ObservedWindow:
     """Copy the observed frames out of a flight: nothing of what follows stays reachable."""
     return ObservedWindow(
         sample_id=sample_id(flight.flight_id, span.stop - 1),
@@ -54,6 +105,7 @@ def _observe(flight: Flight, span: slice, folders: list) -> ObservedWindow:
         visible=flight.target_visible[span].copy(),
         visibility=flight.visibility[span].copy(),
         frame_folders=tuple(folders[span]),
+        frame_files=tuple(files[span]),
     )
 
 
@@ -74,5 +126,5 @@ def cut_future(
         yaw_deg=yaw_deg[span],
         targets_m=flight.targets_m[span],
         visible=flight.target_visible[span],
-        speed_before_mps=float(np.linalg.norm(positions_m[current] - positions_m[current - 1]) / step_s),
+        speed_before_mps=math.dist(positions_m[current].tolist(), positions_m[current - 1].tolist()) / float(step_s),
     )

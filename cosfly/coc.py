@@ -29,6 +29,7 @@ ACTION_GROUPS: dict[str, tuple[str, ...]] = {
     "recovery": ("search_to_reacquire_target", "hover", "break_off", "return_to_home"),
 }
 ACTIONS: tuple[str, ...] = tuple(token for tokens in ACTION_GROUPS.values() for token in tokens)
+_TOKENS = frozenset(ACTIONS)
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
@@ -42,8 +43,10 @@ CAPTION_VERSION: Literal["1.0"] = "1.0"
 
 def normalize_action(text: str) -> str | None:
     """Give the token for any spelling (spaces, hyphens, case, surrounding quotes), None if it is not in the closed set."""
+    if text in _TOKENS:
+        return text
     token = re.sub(r"[\s\-_]+", "_", text.strip().strip("\"'`*.。 ").lower())
-    return token if token in ACTIONS else None
+    return token if token in _TOKENS else None
 
 
 class Coc(BaseModel):
@@ -67,6 +70,8 @@ class Parsed:
 
 _FENCE = re.compile(r"```(?:json)?\s*(.*?)```", re.DOTALL | re.IGNORECASE)
 _THINKING = re.compile(r"<think(?:ing)?>.*?</think(?:ing)?>", re.DOTALL | re.IGNORECASE)
+_TRAILING_COMMA = re.compile(r",(\s*[}\]])")
+_DECODER = json.JSONDecoder(strict=False)  # servers return raw control characters inside strings
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
@@ -77,10 +82,10 @@ def parse_answer(text: str, language: Language = "en") -> Parsed:
     commas, raw control characters inside strings. Anything else is a failure with a reason word.
     """
     recovered: list[str] = []
-    if _THINKING.search(text):
+    if "<" in text and _THINKING.search(text):
         text = _THINKING.sub("", text)
         recovered.append("thinking_tags")
-    fenced = _FENCE.search(text)
+    fenced = _FENCE.search(text) if "```" in text else None
     if fenced:
         text = fenced.group(1)
         recovered.append("code_fence")
@@ -92,9 +97,10 @@ def parse_answer(text: str, language: Language = "en") -> Parsed:
         return Parsed(None, "missing_field" if set(FIELDS) - set(value) else "extra_field", tuple(recovered))
     if not all(isinstance(value[name], str) for name in FIELDS):
         return Parsed(None, "field_not_text", tuple(recovered))
-    cleaned = {name: _CONTROL.sub("", value[name]).strip() for name in FIELDS}
     if any(_CONTROL.search(value[name]) for name in FIELDS):
+        value = {name: _CONTROL.sub("", value[name]) for name in FIELDS}
         recovered.append("control_characters")
+    cleaned = {name: value[name].strip() for name in FIELDS}
     minimum = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
     for name, characters in minimum.items():
         if len(cleaned[name]) < characters:
@@ -110,11 +116,11 @@ def _load_object(text: str, recovered: list[str]) -> tuple[dict | None, str | No
     start = text.find("{")
     if start < 0:
         return None, "empty" if not text.strip() else "no_json_object"
-    decoder = json.JSONDecoder(strict=False)  # servers return raw control characters inside strings
-    for candidate, word in ((text, None), (re.sub(r",(\s*[}\]])", r"\1", text), "trailing_comma")):
+    for word in (None, "trailing_comma"):
+        candidate = _TRAILING_COMMA.sub(r"\1", text) if word else text
         try:
             start = candidate.find("{")
-            value, end = decoder.raw_decode(candidate, start)
+            value, end = _DECODER.raw_decode(candidate, start)
         except (ValueError, RecursionError):
             continue
         if word:

@@ -74,10 +74,14 @@ def write_bytes(path: Path, data: bytes) -> None:
             raise
 
 
+_COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+
+
 def dump_json(value: Any, *, indent: int | None = None) -> str:
     """Give JSON text; NaN and infinity are an error, never a value."""
-    separators = (",", ":") if indent is None else None
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
+    if indent is None:
+        return _COMPACT.encode(value)
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=indent)
 
 
 def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
@@ -207,11 +211,25 @@ class Journal:
 
     def read(self) -> Iterator[dict]:
         """Yield the records in order, damaged lines left out."""
+        for _, _, record in self.lines():
+            yield record
+
+    def lines(self, start: int = 0, end: int | None = None) -> Iterator[tuple[int, int, dict]]:
+        """Yield (first byte, byte after the last, record) of the lines that begin in a range of bytes, damaged ones left out.
+
+        Args:
+            start: where a line begins.
+        """
         self.num_damaged = 0
         if not self.path.exists():
             return
         with open(self.path, "rb") as file:
+            file.seek(start)
+            position = start
             for line in file:
+                first, position = position, position + len(line)
+                if end is not None and first >= end:
+                    return
                 try:
                     digest, body = line.rstrip(b"\n").split(b" ", 1)
                     if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
@@ -220,21 +238,31 @@ class Journal:
                 except (ValueError, UnicodeDecodeError):
                     self.num_damaged += 1
                     continue
-                yield record
+                yield first, position, record
 
-    def append(self, record: dict, *, sync: bool = True) -> None:
-        """Add a record and, unless told otherwise, wait until it is on the disk."""
+    def append(self, record: dict, *, sync: bool = True) -> int:
+        """Add a record and, unless told otherwise, wait until it is on the disk. Gives the length of the file, bytes."""
         body = dump_json(record).encode()
         line = sha256_bytes(body)[:16].encode() + b" " + body + b"\n"
         with self._lock, storage_errors(self.path):
-            if self._file is None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                _cut_torn_line(self.path)
-                self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
+            self._open()
             self._file.write(line)
             self._file.flush()
             if sync:
                 os.fsync(self._file.fileno())
+            return int(self._file.tell())
+
+    def start(self) -> int:
+        """Open the file for appending, without a line that a kill cut short. Gives its length, bytes."""
+        with self._lock, storage_errors(self.path):
+            self._open()
+            return int(self._file.tell())
+
+    def _open(self) -> None:
+        if self._file is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            _cut_torn_line(self.path)
+            self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
 
     def close(self) -> None:
         if self._file is not None:

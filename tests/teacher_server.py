@@ -42,7 +42,7 @@ TEXT_FAULTS: dict[str, Callable[[dict], str]] = {
     "empty_text": lambda answer: "",
 }
 FAULTS = (
-    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "empty_choices", "null_content", "slow",
+    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "empty_choices", "null_content", "slow", "drip",
     "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "echo_key",
 )  # fmt: skip
 
@@ -59,9 +59,18 @@ class TeacherServer:
         models: tuple[str, ...] = (MODEL,),
         delay_s: float = 0.0,
         decision: Callable[[dict], str] | None = None,
+        respond: Callable[[dict], tuple[int, dict]] | None = None,
+        model_facts: dict | None = None,
     ) -> None:
+        """
+        Args:
+            respond: gives status and body of every answer instead of ours.
+            model_facts: what the list of models says about each, beside its name.
+        """
         self.fault, self.models, self.delay_s = fault or (lambda number, body: None), models, delay_s
         self.decision = decision or _decision_by_seed
+        self.respond, self.model_facts = respond, model_facts or {}
+        self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
         self.bodies: list[bytes] = []
         self.headers: list[dict[str, str]] = []
         self.most_at_once = 0
@@ -130,7 +139,8 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             if self.path == "/v1/models":
-                self._send(200, {"object": "list", "data": [{"id": name, "object": "model"} for name in server.models]})
+                entries = [{"id": name, "object": "model", **server.model_facts} for name in server.models]
+                self._send(200, {"object": "list", "data": entries})
             else:
                 self._send(404, {"error": {"message": f"no such path {self.path}"}})
 
@@ -146,7 +156,9 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             fault = server.fault(number, body)
             assert fault is None or fault in FAULTS, fault
             time.sleep(server.delay_s)
-            if fault in STATUS_FAULTS:
+            if server.respond is not None:
+                self._send(*server.respond(body))
+            elif fault in STATUS_FAULTS:
                 extra = {"Retry-After": "0.05"} if fault == "429" else {}
                 self._send(STATUS_FAULTS[fault], {"error": {"message": f"planted {fault}"}}, extra)
             elif fault == "echo_key":
@@ -170,9 +182,12 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
                 self._send_answer(body, fault)
 
         def _send_answer(self, body: dict, fault: str | None) -> None:
-            answer = _answer(server, body, fault)
+            answer = {} if server.text else _answer(server, body, fault)
             write = TEXT_FAULTS.get(fault or "", lambda value: json.dumps(value, ensure_ascii=False))
-            choice = {"index": 0, "message": {"role": "assistant", "content": write(answer)}}
+            choice = {
+                "index": 0,
+                "message": {"role": "assistant", "content": server.text(body) if server.text else write(answer)},
+            }
             choice["finish_reason"] = "length" if fault == "cut" else "stop"
             usage = {"prompt_tokens": 1000, "completion_tokens": 100}
             reply = {
@@ -185,8 +200,22 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             data = json.dumps(reply, ensure_ascii=False).encode()
             if fault == "truncated_body":
                 self._send_bytes(200, data[: len(data) // 2])
+            elif fault == "drip":
+                self._drip(data)
             else:
                 self._send_bytes(200, data)
+
+        def _drip(self, data: bytes) -> None:
+            """Send a byte now and then: a limit on the silence between two bytes never ends it."""
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            try:
+                for at in range(len(data)):
+                    self.wfile.write(data[at : at + 1])
+                    time.sleep(0.05)
+            except OSError:
+                self.close_connection = True
 
         def _send(self, status: int, value: dict, headers: dict[str, str] | None = None) -> None:
             self._send_bytes(status, json.dumps(value).encode(), headers)

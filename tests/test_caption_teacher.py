@@ -51,7 +51,7 @@ def first(fault: str, count: int = 1):
 # under which the mended wrapper is counted.
 PASSING_FAULTS = [
     ("429", 1, None), ("500", 1, None), ("503", 1, None), ("reset", 1, None), ("truncated_body", 1, None),
-    ("not_json", 1, None), ("empty_choices", 1, None), ("null_content", 1, None), ("slow", 1, None),
+    ("not_json", 1, None), ("empty_choices", 1, None), ("null_content", 1, None), ("slow", 1, None), ("drip", 1, None),
     ("wrong_shape", 1, None), ("wrong_decision", 1, None), ("short", 1, None), ("cut", 1, None), ("empty_text", 1, None),
     ("prose", 0, "prose_around"), ("fence", 0, "code_fence"), ("thinking", 0, "thinking_tags"),
     ("control", 0, "control_characters"), ("comma", 0, "trailing_comma"),
@@ -291,14 +291,14 @@ def test_the_throttle_ramps_halves_and_recovers():
     assert throttle.limit == 8
     for _ in range(8):
         throttle.succeeded()
-    assert throttle.limit == 16  # doubled by one round of answers
+    assert throttle.limit == 24  # tripled by one round of answers
     clock.now_s = 1.0
     throttle.was_busy(given_s=0.5, retry_after_s=None)
     throttle.was_busy(given_s=0.5, retry_after_s=None)  # sent before the decrease: says nothing new
-    assert throttle.limit == 8
-    for _ in range(8):
+    assert throttle.limit == 12
+    for _ in range(12):
         throttle.succeeded()
-    assert 8.9 < throttle.limit <= 9.0  # one more per round from now on
+    assert 12.9 < throttle.limit <= 13.0  # one more per round from now on
     for _ in range(20):
         clock.now_s += 1.0
         throttle.was_busy(given_s=clock.now_s, retry_after_s=None)

@@ -177,16 +177,20 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
     return captions
 
 
-SIDES = (("left", "right"), ("increases", "decreases"), ("climbs", "descends"), ("grows", "shrinks"))
+SIDES = {
+    "en": (("left", "right"), ("increases", "decreases"), ("climbs", "descends"), ("grows", "shrinks")),
+    "zh": (("左", "右"), ("增加", "减小"), ("爬升", "下降"), ("增大", "缩小")),
+}
 
 
-def corruptions(coc: Coc, rng: np.random.Generator) -> list[Coc]:
+def corruptions(coc: Coc, rng: np.random.Generator, language: str = "en") -> list[Coc]:
     """Give the text with one side swapped and with one number changed (by a third, or its sign of change swapped)."""
     text = coc.critical_components
     made = []
-    for one, two in SIDES:
+    edge = r"\b" if language == "en" else ""
+    for one, two in SIDES[language]:
         for old, new in ((one, two), (two, one)):
-            spots = [m.start() for m in re.finditer(rf"\b{old}\b", text)]
+            spots = [m.start() for m in re.finditer(f"{edge}{old}{edge}", text)]
             if spots:
                 at = int(rng.choice(spots))
                 made.append(text[:at] + new + text[at + len(old) :])
@@ -202,12 +206,14 @@ def test_corruptions_are_caught_and_clean_captions_raise_no_alarm():
     captions = clean_captions(20)
     rng = np.random.default_rng(5)
     alarms = sum(bool(check_evidence(en, f, CFG, "en") or check_evidence(zh, f, CFG, "zh")) for f, en, zh in captions)
-    planted = [(facts, bad) for facts, en, _ in captions for bad in corruptions(en, rng)]
-    caught = sum(bool(check_evidence(bad, facts, CFG, "en")) for facts, bad in planted)
     assert len(captions) >= 400
-    assert len(planted) >= 1000
     assert alarms <= 0.01 * len(captions)
-    assert caught >= 0.98 * len(planted), f"{caught} of {len(planted)}"
+    for language in ("en", "zh"):
+        texts = [(facts, en if language == "en" else zh) for facts, en, zh in captions]
+        planted = [(facts, bad) for facts, coc in texts for bad in corruptions(coc, rng, language)]
+        caught = sum(bool(check_evidence(bad, facts, CFG, language)) for facts, bad in planted)
+        assert len(planted) >= 1000
+        assert caught >= 0.98 * len(planted), f"{language}: {caught} of {len(planted)}"
 
 
 def test_rule_captions_are_one_record_in_two_languages():

@@ -1,0 +1,197 @@
+"""How much of a bare load loop's throughput the caption client reaches: `python tests/benchmarks/bench_client.py`.
+
+A local server in its own process answers every request after a fixed 200 ms. The client captions windows of 15 pictures of
+640x360; the requests it sent are then sent again by a bare httpx loop with the same concurrency, from bytes made beforehand.
+Reported: requests per second of both and their ratio, once with pictures encoded beforehand and once encoded on the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from caption.asking import Asking
+from caption.flights import allot, named_flights
+from caption.images import MODALITY_FILES, FrameEncoder
+from caption.protocol import encode_body
+from caption.schema import CaptionConfig
+from caption.stage import open_stage
+from caption.teacher import SharedFrames
+from cosfly.playback import SKY_DEPTH_M
+from specimens import make_playback_tree
+
+WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2
+ENGLISH = {
+    "critical_components": "The target pedestrian is visible and walks on the road ahead of the drone.",
+    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in frame.",
+    "flight_decision": "hover",
+}
+CHINESE = {
+    "critical_components": "目标行人可见，正在无人机前方的道路上行走。",
+    "reasoning_trace": "视线通畅且运动规律，因此该动作可将目标保持在画面内。",
+    "flight_decision": "hover",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--windows", type=int, default=600)
+    parser.add_argument("--concurrency", type=int, default=64)
+    args = parser.parse_args()
+    context = multiprocessing.get_context("spawn")
+    port = context.Queue()
+    server = context.Process(target=_serve, args=(port,), daemon=True)
+    server.start()
+    url = f"http://127.0.0.1:{port.get(timeout=30)}/v1"
+    folder = Path(tempfile.mkdtemp(prefix="bench_client_"))
+    try:
+        tree = _make_tree(folder / "tree", args.windows)
+        cfg = _settings(url, args.concurrency)
+        # First run: pictures on the way, cold. Second: another folder, the same pictures already encoded.
+        cold_s, bodies, encoder = _client(cfg, tree, folder / "cold", None)
+        warm_s, again, _ = _client(cfg, tree, folder / "warm", encoder)
+        assert sorted(bodies) == sorted(again)
+        bare_s = asyncio.run(_bare(url, bodies, args.concurrency))
+    finally:
+        server.terminate()
+        shutil.rmtree(folder)
+    count = len(bodies)
+    size = sum(map(len, bodies)) / count / 1e6
+    print(f"{count} requests of {size:.2f} MB on average, {args.concurrency} in flight, answers after {DELAY_S} s")
+    print(f"bare httpx loop       {count / bare_s:7.1f} requests/s   {bare_s:.2f} s")
+    for name, seconds in (("pre-encoded pictures", warm_s), ("encoded on the way", cold_s)):
+        print(f"{name:<20}  {count / seconds:7.1f} requests/s   {seconds:.2f} s   ratio {bare_s / seconds:.3f}")
+
+
+def _settings(url: str, concurrency: int) -> CaptionConfig:
+    image = {"cache_frames": 100_000}
+    endpoint = {"concurrency": concurrency, "model": "bench"}
+    return CaptionConfig.model_validate(
+        {"teacher": url, "endpoint": endpoint, "image": image, "repair": {"verdicts": ()}}
+    )
+
+
+def _client(
+    cfg: CaptionConfig, tree: Path, out: Path, encoder: FrameEncoder | None
+) -> tuple[float, list[bytes], FrameEncoder]:
+    """Caption the tree; gives seconds, the bodies sent, and the pictures. The product is not merged: only asking counts."""
+    stage = open_stage(cfg, tree, out, 0, "never")
+    allotted, _ = allot(named_flights(tree), cfg)
+    bodies: list[bytes] = []
+    frames: list[SharedFrames] = []
+    plain_init, plain_encode = SharedFrames.__init__, encode_body
+
+    def init(self: SharedFrames, image) -> None:
+        plain_init(self, image)
+        if encoder is not None:
+            self.encoder = encoder
+        frames.append(self)
+
+    def recording(payload: dict) -> bytes:
+        bodies.append(plain_encode(payload))
+        return bodies[-1]
+
+    import caption.client
+
+    SharedFrames.__init__, caption.client.encode_body = init, recording  # type: ignore[method-assign, assignment]
+    try:
+        start_s = time.monotonic()
+        asked = asyncio.run(Asking(stage, cfg, 0).run(allotted))
+        seconds = time.monotonic() - start_s
+    finally:
+        SharedFrames.__init__, caption.client.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
+    assert not asked.unanswered, asked.unanswered[:3]
+    return seconds, bodies, frames[0].encoder
+
+
+async def _bare(url: str, bodies: list[bytes], concurrency: int) -> float:
+    left = iter(bodies)
+    limits = httpx.Limits(max_connections=concurrency, max_keepalive_connections=concurrency)
+    async with httpx.AsyncClient(limits=limits, timeout=120.0) as client:
+
+        async def worker() -> None:
+            for body in left:
+                headers = {"Content-Type": "application/json"}
+                response = await client.post(f"{url}/chat/completions", content=body, headers=headers)
+                assert response.status_code == 200
+
+        start_s = time.monotonic()
+        await asyncio.gather(*(worker() for _ in range(concurrency)))
+        return time.monotonic() - start_s
+
+
+def _make_tree(root: Path, num_windows: int) -> Path:
+    """Flights of 40 windows with textured pictures, as large once encoded as rendered ones are."""
+    num_flights = max(1, num_windows // 40)
+    make_playback_tree(root, num_flights, 49, with_images=False, with_augmented=False, width_px=WIDTH, height_px=HEIGHT)
+    rng = np.random.default_rng(0)
+    rows = np.linspace(3.0, 90.0, HEIGHT, dtype=np.float32)[:, None]
+    for folder in root.rglob("trajectory.json"):
+        for index in range(49):
+            frame = folder.parent / "frames_playback" / f"frame_{index:05d}"
+            frame.mkdir(parents=True, exist_ok=True)
+            coarse = rng.integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+            rgb = cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+            cv2.imwrite(str(frame / MODALITY_FILES["rgb"]), rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            depth_m = np.broadcast_to(rows, (HEIGHT, WIDTH)) + rng.integers(0, 5)
+            np.save(frame / MODALITY_FILES["depth"], np.where(rows < 5.0, SKY_DEPTH_M, depth_m).astype(np.float32))
+            tags = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+            tags[..., 2] = np.repeat(np.repeat(rng.integers(1, 25, (9, 16)), 40, axis=0), 40, axis=1)
+            cv2.imwrite(str(frame / MODALITY_FILES["segmentation"]), tags, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return root
+
+
+def _serve(port) -> None:
+    """Answer chat completions after the fixed delay, with as little work as can be."""
+    replies = [_reply(answer) for answer in (ENGLISH, CHINESE)]
+
+    async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while True:
+                head = await reader.readuntil(b"\r\n\r\n")
+                if head.startswith(b"GET"):
+                    writer.write(_http(json.dumps({"data": [{"id": "bench"}]}).encode()))
+                    continue
+                length = int(head.lower().split(b"content-length:")[1].split(b"\r\n")[0])
+                body = await reader.readexactly(length)
+                start_s = time.monotonic()
+                reply = replies[0] if b'"image_url"' in body else replies[1]
+                await asyncio.sleep(DELAY_S - (time.monotonic() - start_s))
+                writer.write(reply)
+                await writer.drain()
+        except (asyncio.IncompleteReadError, ConnectionError):
+            writer.close()
+
+    async def run() -> None:
+        server = await asyncio.start_server(handle, "127.0.0.1", 0, limit=4 * 2**20, backlog=256)
+        port.put(server.sockets[0].getsockname()[1])
+        await server.serve_forever()
+
+    asyncio.run(run())
+
+
+def _reply(answer: dict) -> bytes:
+    message = {"role": "assistant", "content": json.dumps(answer, ensure_ascii=False)}
+    usage = {"prompt_tokens": 3500, "completion_tokens": 100}
+    return _http(json.dumps({"choices": [{"message": message, "finish_reason": "stop"}], "usage": usage}).encode())
+
+
+def _http(body: bytes) -> bytes:
+    return b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n" % len(body) + body
+
+
+if __name__ == "__main__":
+    main()

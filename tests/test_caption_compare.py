@@ -1,0 +1,93 @@
+"""The four strategies on the same conflicts, by the rule teacher and by a server."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from teacher_server import TeacherServer
+from typer.testing import CliRunner
+
+from caption.compare import STRATEGIES, compare, run, text_distance
+from caption.regenerate import Trial
+from caption.schema import CaptionConfig
+from cosfly.cli import app
+from cosfly.coc import Coc
+from cosfly.errors import InputError
+from specimens import make_playback_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 3, 30, with_images=False)
+
+
+def coc(text: str) -> Coc:
+    return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
+
+
+def test_text_distance():
+    assert text_distance(coc("a b c"), coc("a b c")) == 0.0
+    assert text_distance(coc("a b c"), coc("x y z")) == pytest.approx(
+        0.75
+    )  # the reasoning, one word of four, is shared
+    assert 0.0 < text_distance(coc("a b c d"), coc("a b x d")) < 0.5
+
+
+def test_a_comparison_by_hand():
+    trials = [
+        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", "hint", 1, 100),
+        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", "hint", 2, 200),
+        Trial(coc("a b c"), None, "HARD_CONFLICT", None, 3, 300),
+    ]
+    found = compare("hint", trials)
+    assert (found.num_conflicts, found.repaired, found.consistent) == (3, 2, 1)
+    assert (found.asks_per_conflict, found.tokens_per_conflict, found.text_distance) == (2.0, 200.0, 0.375)
+
+
+SETTINGS = {"window": {"require_images": False}}
+
+
+def test_the_rule_teacher_repeats_itself_unless_it_is_anchored(tree, tmp_path):
+    found = {c.strategy: c for c in run(CaptionConfig.model_validate(SETTINGS), tree, tmp_path / "out")}
+    assert set(found) == set(STRATEGIES)
+    counts = {c.num_conflicts for c in found.values()}
+    assert len(counts) == 1
+    count = counts.pop()
+    assert count >= 3
+    assert found["anchored"].consistent == found["cascade"].consistent == count
+    assert (found["anchored"].asks_per_conflict, found["cascade"].asks_per_conflict) == (1.0, 3.0)
+    # Its decision depends on the facts alone, so asking again changes nothing.
+    assert found["hint"].repaired == found["multi_sample"].repaired == 0
+    value = json.loads((tmp_path / "out" / "compare_strategies.json").read_text())
+    assert [row["strategy"] for row in value["strategies"]] == list(STRATEGIES)
+
+
+def test_a_server_is_asked_once_for_the_first_answers(tree, tmp_path):
+    with TeacherServer() as server:
+        cfg = CaptionConfig.model_validate(SETTINGS | {"teacher": server.url})
+        found = {c.strategy: c for c in run(cfg, tree, tmp_path / "out", conflicts=6)}
+        assert {c.num_conflicts for c in found.values()} == {6}
+        assert found["anchored"].consistent == 6
+        assert found["anchored"].tokens_per_conflict == 1100.0
+        assert found["cascade"].asks_per_conflict <= 3.0
+        assert len(set(server.digests())) == len(server.digests()), "an answer that is kept was asked again"
+        num_asked = len(server.bodies)
+        again = run(cfg, tree, tmp_path / "out", conflicts=6)
+        assert {c.strategy: c for c in again} == found
+        assert len(server.bodies) == num_asked
+
+
+def test_no_conflict_is_an_error_not_a_table_of_zeros(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_images=False)
+    cfg = CaptionConfig.model_validate(SETTINGS | {"repair": {"verdicts": []}})
+    with pytest.raises(InputError, match="no conflict to repair"):
+        run(cfg, tree, tmp_path / "out")
+
+
+def test_the_command_prints_the_table(tree, tmp_path):
+    words = ["caption", "compare-strategies", "--data", str(tree), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, [*words, "--set", "caption.window.require_images=false"])
+    assert result.exit_code == 0, result.output
+    assert all(strategy in result.output for strategy in STRATEGIES)
+    assert "100.0 %" in result.output

@@ -1,0 +1,197 @@
+"""The endpoint's doctor against servers with one defect each, and the plan against a server whose tokens are known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from teacher_server import ENGLISH, TeacherServer
+from typer.testing import CliRunner
+
+from caption.doctor import ODD_WORD, Finding, examine_endpoint
+from caption.plan import estimate, make_plan
+from caption.schema import CaptionConfig
+from caption.stage import run
+from cosfly.cli import app
+from cosfly.errors import ConfigError
+from specimens import make_playback_tree
+
+TOKENS_PER_IMAGE, CONTEXT = 220, 8192
+
+
+def images_of(body: dict) -> int:
+    contents = [message["content"] for message in body["messages"]]
+    return sum(part["type"] == "image_url" for content in contents if isinstance(content, list) for part in content)
+
+
+def prompt_tokens(body: dict, seen_images: int) -> int:
+    """Words of the text, and a fixed number for each image that the model sees."""
+    contents = [message["content"] for message in body["messages"]]
+    texts = [part.get("text", "") for content in contents if isinstance(content, list) for part in content]
+    texts += [content for content in contents if isinstance(content, str)]
+    return sum(len(text.split()) for text in texts) + TOKENS_PER_IMAGE * seen_images
+
+
+def patient(
+    *,
+    obeys_schema: bool = True,
+    refuses_schema: bool = False,
+    max_images: int = 15,
+    sees_images: int = 99,
+    thinks: bool = False,
+    counts: bool = True,
+    context: int = CONTEXT,
+    admits_cut: bool = True,
+) -> Callable[[dict], tuple[int, dict]]:
+    """A server's behaviour: what it answers to any request."""
+
+    def respond(body: dict) -> tuple[int, dict]:
+        num_images = images_of(body)
+        tokens = prompt_tokens(body, min(num_images, sees_images))
+        if num_images > max_images:
+            return 400, {"error": {"message": f"At most {max_images} image(s) may be provided in one prompt."}}
+        if tokens + body["max_tokens"] > context:
+            return 400, {"error": {"message": f"maximum context length is {context} tokens"}}
+        wanted = body.get("response_format", {}).get("json_schema", {}).get("schema")
+        if wanted and refuses_schema:
+            return 400, {"error": {"message": "response_format is not supported"}}
+        text = "I am fine, thank you."
+        if wanted and obeys_schema:
+            names = wanted["properties"]
+            odd = {"animal": ODD_WORD, "legs": 7}
+            text = json.dumps(odd if "animal" in names else {**ENGLISH, "flight_decision": "hover"})
+        is_cut = body["max_tokens"] == 8 and admits_cut
+        message: dict[str, Any] = {"role": "assistant", "content": text}
+        if thinks:
+            message["reasoning_content"] = "Let me think about that."
+        reply = {"choices": [{"message": message, "finish_reason": "length" if is_cut else "stop"}]}
+        if counts:
+            reply["usage"] = {"prompt_tokens": tokens, "completion_tokens": 5}  # type: ignore[assignment]
+        return 200, reply
+
+    return respond
+
+
+def examine(behaviour: Callable, **changes) -> dict[str, Finding]:
+    with TeacherServer(respond=behaviour, model_facts={"max_model_len": CONTEXT}) as server:
+        cfg = CaptionConfig.model_validate({"endpoint": {"backoff_s": 0.01, **changes.pop("endpoint", {})}, **changes})
+        return {finding.name: finding for finding in examine_endpoint(server.url, cfg)}
+
+
+def test_a_sound_endpoint_passes_every_check():
+    findings = examine(patient())
+    assert {finding.state for finding in findings.values()} == {"ok"}
+    assert list(findings) == [
+        "model", "answers", "token usage", "thinking", "finish reason", "JSON schema", "image input", "images per prompt",
+        "largest prompt", "answer to it",
+    ]  # fmt: skip
+    assert f"{TOKENS_PER_IMAGE} tokens" in findings["image input"].detail
+    assert "15" in findings["images per prompt"].detail
+
+
+# defect, the finding it must show in, its state, words of the detail
+DEFECTS = [
+    ({"obeys_schema": False}, "JSON schema", "warning", "accepted and ignored"),
+    ({"refuses_schema": True}, "JSON schema", "warning", "refused"),
+    ({"max_images": 5}, "images per prompt", "unusable", "5, our prompts hold 15"),
+    ({"max_images": 0}, "image input", "unusable", "refused"),
+    ({"sees_images": 0}, "image input", "unusable", "accepted and ignored"),
+    ({"sees_images": 4}, "images per prompt", "warning", "some were dropped"),
+    ({"thinks": True}, "thinking", "warning", "switch it off"),
+    ({"counts": False}, "token usage", "warning", "not reported"),
+    ({"context": 3800}, "largest prompt", "unusable", "context length is 3800"),
+    ({"admits_cut": False}, "finish reason", "warning", "not 'length'"),
+]
+
+
+@pytest.mark.parametrize(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
+def test_a_defect_is_found(defect, name, state, words):
+    findings = examine(patient(**defect))
+    assert findings[name].state == state
+    assert words in findings[name].detail
+
+
+def test_five_tiled_images_pass_where_fifteen_do_not():
+    findings = examine(patient(max_images=5), image={"layout": "tiled"})
+    assert findings["images per prompt"].state == "ok"
+
+
+def test_an_endpoint_that_is_none_and_a_missing_model(tmp_path):
+    with TeacherServer() as server:
+        found = examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": {"model": "other"}}))
+    assert [(finding.name, finding.state) for finding in found] == [("model", "unusable")]
+    assert "does not have this model" in found[0].detail
+
+
+def test_the_command_exits_with_1_when_unusable():
+    with TeacherServer(respond=patient()) as server:
+        assert CliRunner().invoke(app, ["caption", "doctor", server.url]).exit_code == 0
+    with TeacherServer(respond=patient(max_images=0)) as server:
+        assert CliRunner().invoke(app, ["caption", "doctor", server.url]).exit_code == 1
+
+
+# --- the plan ---------------------------------------------------------------------------------------------------------
+
+
+def test_estimate_is_students_interval():
+    found = estimate([8.0, 10.0, 12.0])
+    assert found.expected == 10.0
+    half = 2.919986 * 2.0 / np.sqrt(3)  # t(0.95, 2 degrees of freedom), standard deviation 2
+    assert (found.low, found.high) == pytest.approx((10 - half, 10 + half), rel=1e-5)
+    assert estimate([5.0]).low == 0.0
+    assert estimate([4.0, 4.0]).low == estimate([4.0, 4.0]).high == 4.0
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 20, with_augmented=False)
+
+
+def settings(url: str, **changes) -> CaptionConfig:
+    endpoint = {"backoff_s": 0.01, "concurrency": 4, **changes.pop("endpoint", {})}
+    base = {"teacher": url, "endpoint": endpoint, "repair": {"verdicts": ()}, "image": {"max_side_px": 32}}
+    return CaptionConfig.model_validate(base | changes)
+
+
+def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
+    budget = {"price_prompt": 2.0, "price_completion": 10.0}
+    with TeacherServer(decision=lambda body: "hover") as server:
+        cfg = settings(server.url, budget=budget)
+        planned = make_plan(cfg, tree, tmp_path / "out")
+        num_trial_requests = len(server.bodies)
+        run(cfg, tree, tmp_path / "out")
+        asked = len(server.bodies) - 2  # two requests measured the pictures' tokens
+    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
+    assert planned.num_windows == report["windows"]["input"] == 22
+    assert planned.calls.expected == asked == 44
+    assert planned.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 44_000
+    assert planned.completion_tokens.low == report["tokens"]["completion_tokens"] == 4_400
+    assert planned.cost.expected == pytest.approx((44_000 * 2.0 + 4_400 * 10.0) / 1e6)
+    assert num_trial_requests == 2 * planned.num_trials + 2  # and the run did not ask about these windows again
+    assert 0 < planned.seconds.low <= planned.seconds.expected <= planned.seconds.high
+    assert ("cost", "0.13 (0.13 to 0.13)") in planned.rows()
+
+
+def test_the_plan_knows_the_images_share(tree, tmp_path):
+    with TeacherServer(respond=patient(max_images=99)) as server:
+        planned = make_plan(settings(server.url, repair={"verdicts": ()}), tree, tmp_path / "out")
+    assert planned.image_tokens is not None
+    asks = planned.image_tokens.expected / (15 * TOKENS_PER_IMAGE * planned.num_windows)
+    assert asks == round(asks)  # whole asks of 15 pictures
+
+
+def test_a_plan_needs_an_endpoint(tree, tmp_path):
+    with pytest.raises(ConfigError, match="needs an endpoint"):
+        make_plan(CaptionConfig(), tree, tmp_path / "out")
+
+
+def test_plan_on_the_command_line_asks_a_few_and_stops(tree, tmp_path):
+    with TeacherServer(decision=lambda body: "hover") as server:
+        words = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(tmp_path / "out"), "--plan"]
+        result = CliRunner().invoke(app, [*words, "--no-check", "--set", "caption.image.max_side_px=32"])
+        assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "answers.jsonl").exists()
+    assert not (tmp_path / "out" / "captions.jsonl").exists()

@@ -1,0 +1,190 @@
+"""The judge: lenient reading, never an acceptance by accident, never over geometry; its check finds what is planted."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+
+import pytest
+from teacher_server import TeacherServer
+from typer.testing import CliRunner
+
+from caption.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement
+from caption.judge_gold import read_gold
+from caption.schema import CaptionConfig, JudgeConfig
+from caption.stage import run
+from cosfly.cli import app
+from cosfly.coc import read_captions
+from cosfly.errors import InputError
+from specimens import make_playback_tree
+
+
+def judging_server(answer):
+    """A chat server whose text is `answer(body)`."""
+
+    server = TeacherServer()
+    server.text = answer
+    return server
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 18)
+
+
+@pytest.mark.parametrize(
+    ("text", "verdict"),
+    [
+        ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
+        ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
+        ("ACCEPT_ALTERNATIVE", UNJUDGED),
+        ("", UNJUDGED),
+        ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
+        ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', UNJUDGED),
+        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": ', UNJUDGED),
+        ('["ACCEPT_ALTERNATIVE"]', UNJUDGED),
+    ],
+)
+def test_reading_a_judgement(text, verdict):
+    assert parse_judgement(text)[0] == verdict
+
+
+def judged(tree, out, answer, **settings):
+    with judging_server(answer) as server:
+        cfg = CaptionConfig.model_validate({"judge": {"url": server.url, **settings}})
+        path = run(cfg, tree, out)
+        return list(read_captions(path)), json.loads((out / "caption_report.json").read_text()), server
+
+
+def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
+    accept = '{"verdict": "ACCEPT_ALTERNATIVE", "reason": "looks fine"}'
+    captions, report, server = judged(tree, tmp_path / "out", lambda body: accept)
+    hard = [c for c in captions if c.repair]
+    soft = [c for c in captions if c.judge and not c.repair]
+    assert hard, "the specimens must hold a hard conflict"
+    assert soft, "the specimens must hold a soft conflict"
+    assert all(c.judge["overruled_by"] == "geometry" and c.verdict != "HARD_CONFLICT" for c in hard)
+    assert all(c.verdict == "SOFT_CONFLICT" and "overruled_by" not in c.judge for c in soft)
+    assert report["judgements"] == {"ACCEPT_ALTERNATIVE": len(hard) + len(soft), "overruled_by_geometry": len(hard)}
+    assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
+
+
+@pytest.mark.parametrize("text", ["I cannot say.", '{"verdict": "ACCEPT_ALTERNATIVE"}'])
+def test_what_cannot_be_read_is_never_an_acceptance(tree, tmp_path, text):
+    captions, report, _ = judged(tree, tmp_path / "out", lambda body: text)
+    asked = [c for c in captions if c.judge]
+    assert {c.judge["verdict"] for c in asked} == {UNJUDGED}
+    assert all(c.repair and c.repair["rung"] == "anchored" and c.verdict == "CONSISTENT" for c in asked)
+    assert report["judgements"] == {UNJUDGED: len(asked)}
+
+
+def test_a_judge_that_does_not_answer_leaves_conflicts_unjudged(tree, tmp_path):
+    with TeacherServer(lambda number, body: "500") as server:
+        cfg = CaptionConfig.model_validate({"judge": {"url": server.url, "max_tries": 1}, "limit": 9})
+        captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
+    asked = [c for c in captions if c.judge]
+    assert asked
+    assert all(c.judge["verdict"] == UNJUDGED and "http_500" in c.judge["reason"] for c in asked)
+    assert all(c.verdict == "CONSISTENT" for c in asked)
+
+
+def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_path):
+    fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
+    captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
+    asked = [c for c in captions if c.judge]
+    # The rule teacher names its decision in the text, so replacing the token alone would make a lie.
+    assert all(c.judge["overruled_by"] == "text" and c.repair["rung"] == "anchored" for c in asked)
+
+
+def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
+    fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
+    with TeacherServer(decision=lambda body: "hover") as teacher, judging_server(lambda body: fix) as judge:
+        cfg = CaptionConfig.model_validate({"teacher": teacher.url, "judge": {"url": judge.url}})
+        captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
+    fixed = [c for c in captions if c.repair]
+    assert fixed
+    for caption in fixed:
+        assert caption.repair["rung"] == caption.repair["strategy"] == "fix_label"
+        assert caption.repair["asks"] == 0
+        assert caption.repair["first_decision"] == "hover"
+        assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
+
+
+def test_judgements_are_kept_and_not_asked_again(tree, tmp_path):
+    reject = '{"verdict": "REJECT_REGEN", "reason": "no"}'
+    with judging_server(lambda body: reject) as server:
+        cfg = CaptionConfig.model_validate({"judge": {"url": server.url}})
+        first = run(cfg, tree, tmp_path / "out").read_bytes()
+        asked = len(server.bodies)
+        assert asked > 0
+        (tmp_path / "out" / "manifest.json").unlink()
+        (tmp_path / "out" / "items.jsonl").unlink()
+        assert run(cfg, tree, tmp_path / "out").read_bytes() == first
+        assert len(server.bodies) == asked
+
+
+# --- the check --------------------------------------------------------------------------------------------------------
+
+
+def test_the_gold_set_is_balanced_and_of_conflicts_only():
+    gold = read_gold()
+    assert Counter(right for _, right in gold) == dict.fromkeys(JUDGEMENTS, 6)
+    assert all(case.answer.flight_decision != case.label for case, _ in gold)
+    assert len({case.sample_id for case, _ in gold}) == len(gold)
+
+
+def gold_answers():
+    """A judge that knows the gold set by heart, from the user's message."""
+    return {judge_messages(case)[1]["content"]: right for case, right in read_gold()}
+
+
+def options(body):
+    """The options in the order in which this request names them."""
+    system = body["messages"][0]["content"]
+    return sorted(JUDGEMENTS, key=lambda name: system.index(f"- {name}"))
+
+
+def say(verdict):
+    return json.dumps({"verdict": verdict, "reason": "because"})
+
+
+def checked(answer):
+    with judging_server(answer) as server:
+        return asyncio.run(check_judge(JudgeConfig(url=server.url), read_gold()))
+
+
+def test_a_perfect_judge():
+    known = gold_answers()
+    found = checked(lambda body: say(known[body["messages"][1]["content"]]))
+    assert (found.agreement, found.num_unjudged, found.num_moved) == (1.0, 0, 0)
+    assert found.first_share == pytest.approx(1 / 3)
+
+
+def test_a_judge_that_takes_the_first_option_is_found_out():
+    found = checked(lambda body: say(options(body)[0]))
+    assert found.first_share == 1.0
+    assert found.num_moved == found.num_cases == 18
+    assert found.agreement == pytest.approx(1 / 3)
+
+
+def test_a_judge_that_cannot_be_read_is_counted_and_agrees_with_nothing():
+    found = checked(lambda body: "yes, fine")
+    assert (found.agreement, found.num_unjudged) == (0.0, 54)
+
+
+def test_a_check_needs_a_judge():
+    with pytest.raises(InputError, match="no judge to check"):
+        asyncio.run(check_judge(JudgeConfig(), read_gold()))
+
+
+def test_the_command_prints_the_figures():
+    known = gold_answers()
+    with judging_server(lambda body: say(known[body["messages"][1]["content"]])) as server:
+        result = CliRunner().invoke(app, ["caption", "judge-check", server.url])
+    assert result.exit_code == 0, result.output
+    for words in ("agreement", "100.0 %", "position bias", "unparsable"):
+        assert words in result.output

@@ -1,0 +1,77 @@
+"""A real model behind a real server: random weights, so noise, but decoded under our schema. Every answer must parse, and every
+window must end somewhere."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import pytest
+
+from caption.doctor import examine_endpoint
+from caption.schema import CaptionConfig
+from caption.stage import run
+from cosfly.coc import parse_answer, read_captions
+from cosfly.store import Journal
+from distill.student import make_tiny_student
+from specimens import make_playback_tree
+
+if TYPE_CHECKING:
+    from model_server import ModelServer
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    for package in ("torch", "transformers", "fastapi", "uvicorn", "llguidance"):
+        pytest.importorskip(package, reason=f"{package} is not installed; it comes with cosfly[dev]")
+    from model_server import ModelServer
+
+    with ModelServer(make_tiny_student(tmp_path_factory.mktemp("model") / "student")) as running:
+        yield running
+
+
+def settings(server: ModelServer, **changes) -> CaptionConfig:
+    # Noise seldom ends a string by itself: a bias on the quote does it after a few words, within the protocol.
+    endpoint = {"concurrency": 2, "max_tokens": 700, "extra_body": {"logit_bias": {str(server.quote_id): 4.0}}}
+    base = {"teacher": server.url, "endpoint": endpoint, "image": {"max_side_px": 64}}
+    return CaptionConfig.model_validate(base | changes)
+
+
+@pytest.mark.slow
+def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 13, with_augmented=False)
+    path = run(settings(server), tree, tmp_path / "out")
+    answers = list(Journal(tmp_path / "out" / "answers.jsonl").read())
+    assert len(answers) == server.num_answers > 0
+    assert server.num_images >= 4 * 15
+    for answer in answers:
+        assert answer["structured"] == "json_schema"
+        parsed = parse_answer(answer["text"], "zh" if answer["purpose"].startswith("mirror") else "en")
+        assert parsed.coc is not None or answer["finish_reason"] == "length", (parsed.reason, answer["text"])
+        if answer["purpose"].split("/")[0] not in (
+            "free",
+            "mirror",
+        ):  # anchored: the schema's enum enforced the decision
+            assert parsed.coc is None or parsed.coc.flight_decision == answer["purpose"].split("/")[0]
+    captions = list(read_captions(path))
+    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
+    windows = report["windows"]
+    assert windows["input"] == len(captions) == 4
+    assert windows["kept"] + sum(windows["dropped"].values()) == 4
+    assert windows["dropped"] == dict(Counter(c.drop_reason for c in captions if c.status == "dropped"))
+    assert sum(caption.attempts for caption in captions) == len(answers)
+    assert report["repair"]["rejected"] == sum(caption.repair is not None for caption in captions)
+    used = Counter({"prompt_tokens": 0, "completion_tokens": 0})
+    for answer in answers:
+        used.update(answer["usage"])
+    assert dict(used) == report["tokens"]
+
+
+@pytest.mark.slow
+def test_the_doctor_sees_that_this_server_applies_the_schema(server):
+    findings = {finding.name: finding for finding in examine_endpoint(server.url, settings(server))}
+    assert findings["JSON schema"].state == "ok"
+    assert findings["images per prompt"].state == "ok"
+    assert findings["finish reason"].state == "ok"
+    assert findings["largest prompt"].state == "ok", findings["largest prompt"].detail
