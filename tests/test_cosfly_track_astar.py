@@ -53,7 +53,7 @@ def cost_of(places, targets, obstacles, cfg, start):
     s, total = cfg.track_astar, 0.0
     for k, (p, x) in enumerate(zip(places, targets, strict=True)):
         aside, climb = np.hypot(*(p - x)[:2]) - cfg.behind_distance_m, p[2] - cfg.altitude_preferred_m
-        total += s.weight_tracking * (aside**2 + climb**2) / cfg.behind_distance_m**2
+        total += s.weight_tracking * np.hypot(aside, climb) / s.voxel_m
         total += s.weight_visibility * (1 - kernels.visibility(obstacles, p[None], x[None])[0])
         gap = kernels.signed_distances(obstacles, p[None])[0][0]
         total += s.weight_safety * max(0, 1 - gap / s.influence_m) ** 2

@@ -110,7 +110,7 @@ class TrackAStarConfig(Config):
     voxel_height_m: float = Field(4.0, gt=0, description="voxel height, m")
     corridor_m: float = Field(45.0, gt=0, description="horizontal margin of the grid round the walk, m")
     beam: int = Field(2048, ge=1, description="places kept per time layer")
-    weight_tracking: float = Field(2.0, ge=0, description="weight of the squared deviation from the preferred place")
+    weight_tracking: float = Field(2.0, ge=0, description="weight of the distance to the preferred ring, in voxels")
     weight_visibility: float = Field(18.0, ge=0, description="weight of the blocked part of the five rays")
     weight_path: float = Field(1.0, ge=0, description="weight of the way, in voxels")
     weight_safety: float = Field(8.0, ge=0, description="weight of the squared intrusion into influence_m")

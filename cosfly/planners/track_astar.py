@@ -5,7 +5,7 @@ voxel (two, with the paper's settings), so that no direction is dearer than anot
 states of a layer have the same way to go in time, so a best-first order by cost alone with a beam per layer is the whole search:
 there is no heuristic to add. The paper names the five weights but not the terms; the terms are these, per layer:
 
-    tracking    ((horizontal distance - behind distance)^2 + (altitude - preferred)^2) / (behind distance)^2
+    tracking    distance to the ring round the target at the behind distance and the preferred altitude, in voxels
     visibility  1 - five-ray visibility
     path        length of the move, in voxels
     safety      (1 - clearance / influence)^2 below the influence distance; below the safety distance a voxel is closed
@@ -318,7 +318,7 @@ def _choose(touched, best, target, voxels, costs, index, beam):
         near = max(0.0, 1.0 - gap / costs.influence_m)
         bounds[k] = (
             best[cell]
-            + costs.weights[0] * (aside * aside + climb * climb) / costs.behind_m**2
+            + costs.weights[0] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
             + costs.weights[3] * near * near
         )
     horizon = make_horizon(index, target, reach_m)
