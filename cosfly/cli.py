@@ -121,8 +121,8 @@ def _spread(cfg: RunConfig) -> int:
     return num_workers(cfg.workers)
 
 
-def _made(product: Path, out: Path) -> None:
-    """Name a stage's product. That nothing was kept is an error: whoever calls the next stage must not go on."""
+def _made(product: Path, out: Path, cfg: RunConfig) -> None:
+    """Name a stage's product. Nothing kept, or too much failed, is an error: whoever calls the next stage must know."""
     from cosfly.store import read_json
 
     typer.echo(product)
@@ -130,6 +130,20 @@ def _made(product: Path, out: Path) -> None:
     if counts["kept"] == 0:
         got = {word: counts[word] for word in ("dropped", "failed") if counts[word]}
         raise InputError("nothing was kept", where=out, got=str(got), fix="see the records in that folder")
+    _check_failures({out.name: counts}, out / "failures.jsonl", cfg)
+
+
+def _check_failures(counts_by_stage: dict[str, dict], where: Path, cfg: RunConfig) -> None:
+    """Exit 1, after everything was done, where more items failed than the settings accept."""
+    failed = {stage: counts["failed"] for stage, counts in counts_by_stage.items() if counts["failed"]}
+    if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
+        raise InputError(
+            "some items failed; the others are done",
+            where=where,
+            got=str(failed),
+            expected=f"at most {cfg.max_failed} (max_failed)",
+            fix="mend what the records name and run the same command again: only the failed ones are done again",
+        )
 
 
 def _data(data: Path | None) -> Path:
@@ -165,6 +179,7 @@ def run(
     out = out or Path("runs") / cfg.name
     results = pipeline.run(cfg, out, resume=resume.value)
     _closing_table(results, out)
+    _check_failures({r.stage: r.manifest["counts"] for r in results}, out, cfg)
 
 
 def _closing_table(results: list[StageResult], out: Path) -> None:
@@ -175,21 +190,15 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
     table = Table(title=f"What was made in {out}", title_justify="left")
     for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
         table.add_column(column, justify="right" if column in ("kept", "seconds") else "left")
-    num_failed = 0
     for result in results:
         counts = result.manifest["counts"]
         dropped, failed = (
             ", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed")
         )
-        num_failed += sum(counts["failed"].values())
         seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
         product = os.path.relpath(result.product, out)
         table.add_row(result.stage, f"{counts['kept']} of {counts['input']}", dropped, failed, seconds, product)
     console.print(table)
-    if num_failed:
-        console.print(
-            f"  {num_failed} items failed; why stands in <stage>/failures.jsonl", style="yellow", highlight=False
-        )
     for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
         console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)
 
@@ -246,7 +255,7 @@ def pedestrians(
 
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    typer.echo(cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **spread))
+    _made(cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **spread), out, cfg)
 
 
 plan_app = typer.Typer(invoke_without_command=True, help="Step 4: drone flights.")
@@ -273,7 +282,7 @@ def plan(
     box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    _made(cosfly.planners.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **spread), folder)
+    _made(cosfly.planners.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **spread), folder, cfg)
 
 
 def _needed(name: str, value: Path | None) -> Path:
@@ -343,7 +352,7 @@ def render(
 
     cfg = _settings(config, overrides, seed, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    _made(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **spread), out)
+    _made(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **spread), out, cfg)
 
 
 @app.command()
@@ -375,7 +384,7 @@ def inspect(
 
     cfg = _settings(config, overrides, None, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    _made(cosfly.qc.run(cfg.inspect, traces, _data(data), out, **spread), out)
+    _made(cosfly.qc.run(cfg.inspect, traces, _data(data), out, **spread), out, cfg)
 
 
 caption_app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
@@ -439,7 +448,7 @@ def caption(
         planned = make_plan(cfg.caption, tree, target, seed=cfg.seed, resume=resume.value)
         _print_rows("What this run will take", planned.rows())
         return
-    _made(caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, retry_failed=retry_failed, **spread), target)
+    _made(caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, retry_failed=retry_failed, **spread), target, cfg)
 
 
 @caption_app.command("doctor")
@@ -545,7 +554,7 @@ def release_build(
 
     cfg = _settings(config, overrides, None, workers)
     spread: Any = {"workers": _spread(cfg), "resume": resume.value}
-    typer.echo(release.package.run(cfg.release, _data(data), captions, inspected, out, **spread))
+    _made(release.package.run(cfg.release, _data(data), captions, inspected, out, **spread), out, cfg)
 
 
 @release_app.command("verify")

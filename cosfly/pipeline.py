@@ -56,9 +56,14 @@ class DistillConfig(Config):
 class RunConfig(Config):
     """Everything that `cosfly run` needs; each stage's settings stand with the stage."""
 
-    name: str = Field("run", description="name of the run, for people")
+    name: str = Field(
+        "run", pattern=r"^[\w-][\w. -]*$", description="name of the run; `cosfly run` writes to runs/<name>"
+    )
     seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
     workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
+    max_failed: int = Field(
+        0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
+    )
     roi: Path | None = Field(
         None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
     )

@@ -342,7 +342,7 @@ class StageFolder:
     """One stage's output folder, opened for one set of settings and inputs.
 
     `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings and
-    inputs, `is_complete` is true and the stage has nothing to do.
+    inputs, and no item failed, `is_complete` is true and the stage has nothing to do.
     """
 
     def __init__(self, path: Path, stage: str, is_complete: bool) -> None:
@@ -387,8 +387,13 @@ class StageFolder:
             )
         is_complete = manifest_file.exists()
         if is_complete:
-            _check_outputs_exist(out, check_schema(read_json(manifest_file), MANIFEST_SCHEMA, VERSION, manifest_file))
-        else:
+            manifest = check_schema(read_json(manifest_file), MANIFEST_SCHEMA, VERSION, manifest_file)
+            if manifest["counts"]["failed"]:
+                manifest_file.unlink()  # failed items are tried again; the others stand in the journal
+                is_complete = False
+            else:
+                _check_outputs_exist(out, manifest)
+        if not is_complete:
             write_json(stage_file, record)
             remove_partials(out)
         return cls(out, stage, is_complete)

@@ -10,6 +10,7 @@ import pytest
 
 from cosfly import cli, doctor
 from cosfly.doctor import Check
+from cosfly.pipeline import RunConfig
 from cosfly.store import write_json
 
 
@@ -53,9 +54,9 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, par
 def test_a_stage_that_kept_nothing_is_an_error(capfd, tmp_path):
     write_json(tmp_path / "manifest.json", {"counts": {"kept": 0, "dropped": {"short": 4}, "failed": {}}})
     with pytest.raises(cli.InputError, match=r"nothing was kept; got .*short.: 4"):
-        cli._made(tmp_path / "product", tmp_path)
+        cli._made(tmp_path / "product", tmp_path, RunConfig())
     write_json(tmp_path / "manifest.json", {"counts": {"kept": 1, "dropped": {"short": 3}, "failed": {}}})
-    cli._made(tmp_path / "product", tmp_path)
+    cli._made(tmp_path / "product", tmp_path, RunConfig())
 
 
 def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
@@ -93,3 +94,11 @@ def test_ctrl_c_is_one_line():
     assert process.returncode == 130
     assert text.startswith("error: interrupted")
     assert text.count("\n") == 1
+
+
+def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(capfd, tmp_path):
+    write_json(tmp_path / "manifest.json", {"counts": {"kept": 3, "dropped": {}, "failed": {"no_path": 1}}})
+    with pytest.raises(cli.InputError, match=r"some items failed.*no_path.: 1.*at most 0"):
+        cli._made(tmp_path / "product", tmp_path, RunConfig())
+    cli._made(tmp_path / "product", tmp_path, RunConfig(max_failed=1))
+    assert capfd.readouterr().out.count("product") == 2

@@ -104,6 +104,15 @@ def test_stage_life(tmp_path):
     assert again.manifest()["counts"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
 
 
+def test_a_stage_with_failed_items_is_open_again(tmp_path):
+    stage = _open(tmp_path / "out")
+    write_json(stage.path / "product.json", 1)
+    stage.finish([stage.path / "product.json"], Tally(2, 1, {}, {"input": 1}))
+    again = _open(tmp_path / "out")
+    assert not again.is_complete
+    assert not (again.path / "manifest.json").exists()
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -157,11 +157,16 @@ def test_kill_in_the_middle_and_resume(base, tmp_path, stage, countdown):
 def test_a_half_written_tree_is_a_counted_failure(base, tmp_path):
     """A flight whose frames were damaged is named; the others are inspected."""
     out = begin(base, tmp_path / "run", "inspect")
-    flight = find_flights(out / "render")[0]
-    (flight / "frames_playback/frame_00003/depth.npy").write_bytes(b"half")
+    depth = find_flights(out / "render")[0] / "frames_playback/frame_00003/depth.npy"
+    whole = depth.read_bytes()
+    depth.write_bytes(b"half")
     work(tiny(), out, "inspect")
     text = json.dumps(read_json(out / "inspect/inspect.json")) + (out / "inspect/failures.jsonl").read_text()
     assert "frame_00003" in text
     counts = read_json(out / "inspect/manifest.json")["counts"]
     assert counts["input"] == 4
     assert counts["kept"] == 3
+    depth.write_bytes(whole)  # mended: the same command does the failed flight again, and only that
+    work(tiny(), out, "inspect")
+    assert read_json(out / "inspect/manifest.json")["counts"]["kept"] == 4
+    assert products(out / "inspect") == products(base / "inspect")
