@@ -154,19 +154,27 @@ def test_kill_in_the_middle_and_resume(base, tmp_path, stage, countdown):
 
 
 @pytest.mark.slow
-def test_a_half_written_tree_is_a_counted_failure(base, tmp_path):
-    """A flight whose frames were damaged is named; the others are inspected."""
+def test_a_damaged_frame_is_named_and_rejects_its_flight(base, tmp_path):
     out = begin(base, tmp_path / "run", "inspect")
     depth = find_flights(out / "render")[0] / "frames_playback/frame_00003/depth.npy"
-    whole = depth.read_bytes()
     depth.write_bytes(b"half")
     work(tiny(), out, "inspect")
-    text = json.dumps(read_json(out / "inspect/inspect.json")) + (out / "inspect/failures.jsonl").read_text()
-    assert "frame_00003" in text
+    assert "frame_00003" in json.dumps(read_json(out / "inspect/inspect.json"))
     counts = read_json(out / "inspect/manifest.json")["counts"]
-    assert counts["input"] == 4
     assert counts["kept"] == 3
-    depth.write_bytes(whole)  # mended: the same command does the failed flight again, and only that
+    assert sum(counts["dropped"].values()) == 1
+
+
+@pytest.mark.slow
+def test_a_half_written_flight_is_a_counted_failure_that_can_be_mended(base, tmp_path):
+    out = begin(base, tmp_path / "run", "inspect")
+    trajectory = find_flights(out / "render")[0] / "trajectory.json"
+    whole = trajectory.read_bytes()
+    trajectory.write_bytes(whole[: len(whole) // 2])
+    work(tiny(), out, "inspect")
+    assert "trajectory.json" in (out / "inspect/failures.jsonl").read_text()
+    assert sum(read_json(out / "inspect/manifest.json")["counts"]["failed"].values()) == 1
+    trajectory.write_bytes(whole)  # mended: the same command does the failed flight again
     work(tiny(), out, "inspect")
     assert read_json(out / "inspect/manifest.json")["counts"]["kept"] == 4
     assert products(out / "inspect") == products(base / "inspect")
