@@ -189,7 +189,7 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
 
     table = Table(title=f"What was made in {out}", title_justify="left")
     for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
-        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left")
+        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
     for result in results:
         counts = result.manifest["counts"]
         dropped, failed = (
