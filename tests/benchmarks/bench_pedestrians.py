@@ -84,7 +84,7 @@ steps_names: list[str] = []
 
 
 def main() -> None:
-    scenes.print_machine()
+    scenes.one_thread_and_machine()
     town, city = scenes.simplified(scenes.town()), scenes.city()
     warm_up_ms, _ = scenes.cpu_ms(lambda: stage_a(town))
     rows: list = []

@@ -36,7 +36,7 @@ def measure(name: str, raw: BoxMap) -> list:
 
 
 def main() -> None:
-    scenes.print_machine()
+    scenes.one_thread_and_machine()
     raw = scenes.town()
     warm_up_ms, result = scenes.cpu_ms(lambda: simplify(raw, SimplifyConfig()))
     rows = [measure("(a) town", raw)]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from cosfly.config import build
 from cosfly.maps import MapsConfig, load_map
@@ -87,7 +88,9 @@ def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:
     return 1e3 * (time.process_time() - begin), result
 
 
-def print_machine() -> None:
+def one_thread_and_machine() -> None:
+    """Say what is measured on; hold BLAS to one thread: its others spin on after a call, and count for what is timed next."""
+    threadpool_limits(1)
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     print(

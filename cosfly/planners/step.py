@@ -1,0 +1,349 @@
+"""MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
+
+The curvature that `loss.evaluate` leaves in `State.band` is solved as a band; the step is capped, projected and evaluated, all in
+one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an evaluation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from cosfly.kernels import collect_hits, nearest_box, normal_of_box
+from cosfly.planners.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
+from cosfly.planners.nearby import known, nearest_among, nearest_of, nothing_nearby
+
+TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
+REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere
+DAMPING_LEAST = 1e-3  # keeps the band system positive definite where no term has curvature
+DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5  # of a waypoint whose rough terms rise
+
+STOP_REASONS = ("converged", "iteration_limit", "no_step")
+CONVERGED, ITERATION_LIMIT, NO_STEP = range(3)
+
+
+@njit(cache=True)
+def hold_bounds(points, problem, contacts, band, gradient):
+    """Take out of gradient and curvature, in place, what would lead straight out of the feasible region.
+
+    A waypoint at the least or greatest altitude that is drawn beyond it keeps its z; one that touches an obstacle and is
+    drawn into it may only slide along it. Ends of the trajectory are for the caller to leave out.
+    """
+    for i in range(len(points)):
+        normal = contacts[i]
+        into = gradient[i, 0] * normal[0] + gradient[i, 1] * normal[1] + gradient[i, 2] * normal[2]
+        if into > 0.0:  # the step is against the gradient
+            for a in range(3):
+                gradient[i, a] -= into * normal[a]
+                for b in range(a + 1):
+                    band[a - b, 3 * i + b] += 1e5 * normal[a] * normal[b]
+        at_floor = points[i, 2] <= problem.altitudes[0] + 1e-9 and gradient[i, 2] > 0.0
+        at_ceiling = points[i, 2] >= problem.altitudes[2] - 1e-9 and gradient[i, 2] < 0.0
+        if at_floor or at_ceiling:
+            gradient[i, 2] = 0.0
+            band[0, 3 * i + 2] += 1e7
+
+
+@njit(cache=True)
+def solve_band(band, damping, gradient):
+    """Give the step -(H + damping)^-1 g of the interior waypoints, (n - 2, 3), by Cholesky's factors of a band.
+
+    Args:
+        band: (BAND_ROWS, 3 n) lower band of H. damping: (n,) per waypoint. gradient: (n, 3).
+    Returns:
+        each waypoint's step by its own curvature alone, should rounding have made the model indefinite.
+    """
+    size, rows = 3 * len(gradient) - 6, BAND_ROWS
+    factor, step = np.empty((size + rows, rows)), np.empty(size)  # factor[j, k]: row j + k, column j
+    factor[size:] = 0.0
+    for j in range(size):
+        for k in range(rows):
+            factor[j, k] = band[k, j + 3] if j + k < size else 0.0
+        factor[j, 0] += damping[j // 3 + 1]
+        step[j] = -gradient[j // 3 + 1, j % 3]
+    for j in range(size):
+        if factor[j, 0] <= 0.0:
+            for m in range(size):
+                step[m] = -gradient[m // 3 + 1, m % 3] / (band[0, m + 3] + damping[m // 3 + 1])
+            return step.reshape(-1, 3)
+        pivot = 1.0 / np.sqrt(factor[j, 0])
+        for k in range(rows):
+            factor[j, k] *= pivot
+        for k in range(1, rows):
+            share = factor[j, k]
+            for m in range(k, rows):
+                factor[j + k, m - k] -= share * factor[j, m]
+        step[j] /= factor[j, 0]
+        for k in range(1, min(rows, size - j)):
+            step[j + k] -= factor[j, k] * step[j]
+    for j in range(size - 1, -1, -1):
+        for k in range(1, min(rows, size - j)):
+            step[j] -= factor[j, k] * step[j + k]
+        step[j] /= factor[j, 0]
+    return step.reshape(-1, 3)
+
+
+@njit(cache=True)
+def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, state, trial):
+    """Cap, project and evaluate one trial step of the interior waypoints.
+
+    Args:
+        points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a waypoint; longer ones
+            are shortened each on its own, or all by the same factor (as_a_whole).
+        state, trial: written, what `evaluate` fills and the projected trajectory.
+    Returns:
+        the trial's loss, infinity if it is not feasible, and whether the step was capped.
+    """
+    lengths = np.empty(len(steps))
+    for i in range(len(steps)):
+        lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
+    longest = lengths.max()
+    trial[:] = points
+    for i in range(len(steps)):
+        share = scale * min(1.0, cap_m / max(longest if as_a_whole else lengths[i], 1e-12))
+        for axis in range(3):
+            trial[i + 1, axis] += share * steps[i, axis]
+    loss = np.inf
+    if project(trial, problem, index, 1, len(trial) - 1, state.nearby):
+        loss = evaluate(trial, problem, index, masked, state)
+    return loss, longest > cap_m
+
+
+class Rules(NamedTuple):
+    """How to step and when to stop: the fields of MucoConfig of the same names, `is_paper` and `is_analytic` for step and gradient."""
+
+    is_paper: bool
+    is_analytic: bool
+    learning_rate: float
+    step_cap_m: float
+    tolerance: float
+    low_visibility: float
+    low_visibility_frames: int
+
+
+@njit(cache=True)
+def descend(points, problem, index, rules, states, history):
+    """Improve a feasible trajectory in place; its ends stay.
+
+    The visibility term is a staircase that the model does not see: where its slope leads nowhere, the step is tried without it,
+    and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
+
+    Args:
+        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before each
+            iteration and after the last, written.
+    Returns:
+        the state of the trajectory, which waypoints are masked (n,), how many iterations and evaluations it took, and a
+        number in STOP_REASONS.
+    """
+    now, spare = states
+    damping, masked, trial = np.zeros(len(points)), np.zeros(len(points), dtype=np.bool_), np.empty_like(points)
+    remember_boxes(points, problem, index, now.nearby)
+    loss = evaluate(points, problem, index, masked, now)
+    mask(points, problem, index, rules, masked, now)
+    history[0] = loss
+    rest, next_rest, small_changes, num_tried = 0, 1, 0, 0
+    for iteration in range(1, len(history)):
+        smooth = now.gradient.copy()
+        if not rules.is_analytic:
+            difference_gradient(points, problem, index, masked, spare, smooth)
+        if rules.is_paper:
+            steps = -rules.learning_rate * (smooth + now.visibility_gradient)[1:-1]
+            found, _ = try_step(points, steps, 1.0, rules.step_cap_m, False, problem, index, masked, spare, trial)
+            num_tried += 1
+        else:
+            found = np.inf
+            if rest == 0 and np.any(now.visibility_gradient):
+                slope = smooth + now.visibility_gradient
+                found, tried = newton_step(
+                    points,
+                    loss,
+                    slope,
+                    damping,
+                    TRIES_WITH_VISIBILITY,
+                    rules,
+                    problem,
+                    index,
+                    masked,
+                    now,
+                    spare,
+                    trial,
+                )
+                num_tried += tried
+                rest, next_rest = (next_rest, min(2 * next_rest, REST_MAX)) if found == np.inf else (0, 1)
+            rest = max(rest - 1, 0)
+            if found == np.inf:
+                found, tried = newton_step(
+                    points, loss, smooth, damping, TRIES, rules, problem, index, masked, now, spare, trial
+                )
+                num_tried += tried
+        if found == np.inf:
+            return now, masked, iteration - 1, num_tried, NO_STEP
+        change, loss, history[iteration] = abs(found - loss), found, found
+        points[:] = trial
+        now, spare = spare, now
+        remember_boxes(points, problem, index, now.nearby)
+        mask(points, problem, index, rules, masked, now)
+        small_changes = small_changes + 1 if change < rules.tolerance * max(abs(loss), 1.0) else 0
+        if small_changes == 2:  # one small change may be a graze of the staircase that visibility is
+            return now, masked, iteration, num_tried, CONVERGED
+    return now, masked, len(history) - 1, num_tried, ITERATION_LIMIT
+
+
+@njit(cache=True)
+def mask(points, problem, index, rules, masked, state):
+    """Find the low-visibility runs; the loss does not change with them, gradient and model do."""
+    found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
+    if np.any(found != masked):
+        masked[:] = found
+        evaluate(points, problem, index, masked, state)
+
+
+@njit(cache=True)
+def low_visibility_runs(fractions, threshold, frames):
+    """Mark the waypoints in runs of at least `frames` neighbours that all see less than `threshold`, (n,) bool."""
+    marked, begin = np.zeros(len(fractions), dtype=np.bool_), 0
+    for i in range(len(fractions) + 1):
+        if i == len(fractions) or fractions[i] >= threshold:
+            marked[begin:i] = i - begin >= frames
+            begin = i + 1
+    return marked
+
+
+@njit(cache=True)
+def newton_step(points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial):
+    """Look for a step against `gradient` that lowers the loss.
+
+    A trial that fails only for what the rough terms of some waypoints rose by is solved again with these damped; any other failure
+    shortens the step, first as a whole where single waypoints were capped: a capped step may be no descent, because neighbours
+    move apart.
+
+    Args:
+        points: (n, 3) m, kept. loss, now: its loss and state. gradient: (n, 3), changed. damping: (n,) of single waypoints,
+            Levenberg's way, changed if a step is found.
+        spare, trial: written, state and (n, 3) places of the last trial.
+    Returns:
+        the loss of the trial, infinity if none lowers it, and how many were tried.
+    """
+    band = now.band.copy()
+    hold_bounds(points, problem, now.contacts, band, gradient)
+    raised = damping.copy()
+    steps, scale, as_a_whole = solve_band(band, raised + DAMPING_LEAST, gradient), 1.0, False
+    for tried in range(1, num_tries + 1):
+        found, is_capped = try_step(
+            points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
+        )
+        if found < loss:
+            for i in range(len(damping)):
+                damping[i] = raised[i] * DAMPING_FALL if raised[i] > DAMPING_FIRST / 10 else 0.0
+            return found, tried
+        rise = np.maximum(spare.rough - now.rough, 0.0)
+        if np.isfinite(found) and rise.sum() > found - loss:
+            for i in range(len(raised)):
+                if rise[i] > 0.0:
+                    raised[i] = max(DAMPING_RISE * raised[i], DAMPING_FIRST)
+            steps = solve_band(band, raised + DAMPING_LEAST, gradient)
+        elif not as_a_whole and is_capped:
+            as_a_whole = True
+        else:
+            scale *= 0.25
+    return np.inf, num_tries
+
+
+# --- the feasible region ---
+
+
+@njit(cache=True)
+def push_out(point, problem, index, nearby, i):
+    """Move waypoint i in place out of obstacles, within the altitude bounds; give its clearance, at most safety_m.
+
+    Up to pushes_max times along the outward normal of the nearest box. If the nominal distance is not reached, the best
+    place seen remains (the relaxed floor is for the caller to judge).
+    """
+    best, bx, by, bz = -np.inf, point[0], point[1], point[2]
+    last_x, last_y, last_z, share = 0.0, 0.0, 0.0, 1.0
+    for push in range(problem.pushes_max + 1):
+        point[2] = min(max(point[2], problem.altitudes[0]), problem.altitudes[2])
+        gap, box = nearest_of(nearby, i, index, point[0], point[1], point[2], problem.safety_m)
+        if gap > best:
+            best, bx, by, bz = gap, point[0], point[1], point[2]
+        if box < 0 or push == problem.pushes_max:
+            break
+        nx, ny, nz = normal_of_box(index.rows, box, point[0], point[1], point[2])
+        if nx * last_x + ny * last_y + nz * last_z < 0.0:
+            share *= 0.5  # pushed to and fro between two obstacles: settle in the middle
+        last_x, last_y, last_z = nx, ny, nz
+        shift = share * (problem.safety_m - gap + 1e-6)
+        point[0] += shift * nx
+        point[1] += shift * ny
+        point[2] += shift * nz
+    point[0], point[1], point[2] = bx, by, bz
+    return best
+
+
+@njit(cache=True)
+def project(points, problem, index, begin, end, nearby):
+    """Bring waypoints [begin, end) into the feasible region in place and tell whether the whole trajectory is feasible.
+
+    Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
+    longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a box.
+    """
+    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
+    for i in range(begin, end):
+        points[i, 2] = min(max(points[i, 2], low), high)
+        if i > 0:
+            dx, dy, dz = (
+                points[i, 0] - points[i - 1, 0],
+                points[i, 1] - points[i - 1, 1],
+                points[i, 2] - points[i - 1, 2],
+            )
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            if length > step_max:
+                share = step_max / length
+                points[i, 0] = points[i - 1, 0] + share * dx
+                points[i, 1] = points[i - 1, 1] + share * dy
+                points[i, 2] = points[i - 1, 2] + share * dz
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        count = known(anchors, num_around, i, x, y, z)
+        if count > 0:
+            _, box = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
+            count = count if box >= 0 else 0  # nothing too near
+        if count != 0:
+            push_out(points[i], problem, index, nearby, i)
+    return _is_feasible(points, problem, index, nearby)
+
+
+@njit(cache=True)
+def is_feasible(points, problem, index):
+    """Tell whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between waypoints."""
+    return _is_feasible(points, problem, index, nothing_nearby(len(points)))
+
+
+@njit(cache=True)
+def _is_feasible(points, problem, index, nearby):
+    one, before = np.empty(1, dtype=np.int64), 0.0
+    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if z < low - 1e-6 or z > high + 1e-6:
+            return False
+        count = known(anchors, num_around, i, x, y, z)
+        if count >= 0:
+            gap, _ = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
+        else:
+            gap, _ = nearest_box(index, x, y, z, problem.safety_m)
+        if gap < problem.floor_m:
+            return False
+        if i > 0:
+            u, v, w = points[i - 1, 0], points[i - 1, 1], points[i - 1, 2]
+            length = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
+            if length > step_max * (1.0 + 1e-9):
+                return False
+            # A segment shorter than the clearances at its ends together reaches no box.
+            if length >= gap + before and collect_hits(index, u, v, w, x, y, z, 0.0, one) > 0:
+                return False
+        before = gap
+    return True
