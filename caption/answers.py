@@ -1,7 +1,7 @@
 """`answers.jsonl`: every answer of a teacher, kept before anything is derived from it; nothing answered is asked twice.
 
-One process writes it, on a thread of its own: answers that arrive together share one wait for the disk, and the event loop
-never waits. In memory are only the answers of flights that are not finished. `answers.index.jsonl` tells, for each flight that
+One process writes it. An answer is handed to the system as it arrives, so a killed process loses none; a thread waits for the disk,
+once for all answers that arrived meanwhile. In memory are only the answers of flights that are not finished. `answers.index.jsonl` tells, for each flight that
 was worked on, which bytes of the journal hold its answers, so that a later start reads the tail and the unfinished flights
 instead of a week of answers. The index is a help, not a truth: without it the whole journal is read.
 """
@@ -47,9 +47,9 @@ class AnswerBook:
         self.num_damaged = 0
         self._read_earlier()
         self.num_found = len(self._flights)
-        self._waiting: list[tuple[dict, asyncio.Future]] = []
+        self._waiting: list[asyncio.Future] = []  # for the disk
         self._disk = ThreadPoolExecutor(1, "journal")
-        self._writing: asyncio.Task | None = None
+        self._syncing: asyncio.Task | None = None
 
     # --- what is known ---
 
@@ -129,39 +129,33 @@ class AnswerBook:
         Raises:
             StorageError: the disk is full or not writable.
         """
-        written = asyncio.get_running_loop().create_future()
-        self._waiting.append((record, written))
-        if self._writing is None or self._writing.done():
-            self._writing = asyncio.create_task(self._write())
-        await written
+        first, self._size = self._size, self._journal.append(record, sync=False)
+        flight = flight_of(record["sample_id"])
+        self._remember(flight, record)
+        self._extend(flight, first, self._size)
+        self._count(record)
+        on_disk = asyncio.get_running_loop().create_future()
+        self._waiting.append(on_disk)
+        if self._syncing is None or self._syncing.done():
+            self._syncing = asyncio.create_task(self._sync())
+        await on_disk
 
-    async def _write(self) -> None:
+    async def _sync(self) -> None:
         loop = asyncio.get_running_loop()
         while self._waiting:
             batch, self._waiting = self._waiting, []
+            error: CosflyError | None = None
             try:
-                ends = await loop.run_in_executor(self._disk, self._append, [record for record, _ in batch])
-            except CosflyError as error:  # a full disk: every window that waits for it is told
-                for _, written in batch:
-                    if not written.done():
-                        written.set_exception(error)
-                continue
-            for (record, written), (first, after) in zip(batch, ends, strict=True):
-                flight = flight_of(record["sample_id"])
-                self._remember(flight, record)
-                self._extend(flight, first, after)
-                self._count(record)
-                self._size = after
-                if not written.done():
-                    written.set_result(None)
-
-    def _append(self, records: list[dict]) -> list[tuple[int, int]]:
-        """Append records, with one wait for the disk, and give their bytes in the journal. Runs on the journal's thread."""
-        ends: list[tuple[int, int]] = []
-        for number, record in enumerate(records):
-            after = self._journal.append(record, sync=number == len(records) - 1)
-            ends.append((ends[-1][1] if ends else self._size, after))
-        return ends
+                await loop.run_in_executor(self._disk, self._journal.sync)
+            except CosflyError as found:  # a full disk: every window that waits for it is told
+                error = found
+            for on_disk in batch:
+                if on_disk.done():
+                    continue
+                if error is None:
+                    on_disk.set_result(None)
+                else:
+                    on_disk.set_exception(error)
 
     def __enter__(self) -> AnswerBook:
         return self

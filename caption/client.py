@@ -57,15 +57,27 @@ class ChatClient:
         self._is_schema_refused = not cfg.json_schema
         self._key = os.environ.get(KEY_VARIABLE, "")
         self._jitter = random.Random()  # times of retries only: no product depends on it
-        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx.Limits(max_connections=cfg.concurrency, max_keepalive_connections=cfg.concurrency)
-        try:
-            self._http = httpx.AsyncClient(headers=headers, timeout=cfg.timeout_s, limits=limits)
-        except (httpx.InvalidURL, ValueError, UnicodeError) as error:
-            raise TeacherError("the key cannot be sent", where=KEY_VARIABLE, got=type(error).__name__) from None
+        # A connection to each request in flight, each in a client of its own: one pool of 64 connections looks through all of them at
+        # every request, and all at each of those, which takes longer than to send fifteen pictures.
+        self._free: list[httpx.AsyncClient] = []
+        self._tls = httpx.create_ssl_context()
+        self._free.append(self._connection())
 
     async def aclose(self) -> None:
-        await self._http.aclose()
+        """Close all connections; none may be in use."""
+        for connection in self._free:
+            await connection.aclose()
+
+    def _connection(self) -> httpx.AsyncClient:
+        """Give the connection that was used last, or a new one where all are in use."""
+        if self._free:
+            return self._free.pop()
+        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
+        try:
+            return httpx.AsyncClient(headers=headers, timeout=self.cfg.timeout_s, limits=limits, verify=self._tls)
+        except (httpx.InvalidURL, ValueError, UnicodeError) as error:
+            raise TeacherError("the key cannot be sent", where=KEY_VARIABLE, got=type(error).__name__) from None
 
     # --- one answer ---
 
@@ -76,8 +88,14 @@ class ChatClient:
             TimeoutError: the whole answer was not there within `timeout_s`, however steadily it dripped.
             httpx.TransportError: no connection, or it broke.
         """
-        async with asyncio.timeout(self.cfg.timeout_s):
-            return await self._http.post(f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS)
+        connection = self._connection()
+        try:
+            async with asyncio.timeout(self.cfg.timeout_s):
+                return await connection.post(
+                    f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS
+                )
+        finally:
+            self._free.append(connection)
 
     async def complete(self, body: dict, schema: dict) -> dict:
         """Send a request until it is answered; gives text, usage, structured and finish_reason.
@@ -148,7 +166,7 @@ class ChatClient:
             TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
         """
         try:
-            response = await self._http.get(f"{self.url}/models")
+            response = await self._free[-1].get(f"{self.url}/models")
         except httpx.InvalidURL:
             raise self.error("not a URL that can be asked", fix="check --teacher") from None
         except httpx.HTTPError as error:

@@ -23,6 +23,7 @@ from cosfly.schema import KINDS
 
 MODALITY_FILES: dict[Modality, str] = {"rgb": "rgb.png", "depth": "depth.npy", "segmentation": "instance.png"}
 HIGHLIGHT_RGB = (255, 40, 40)
+NUM_SHADES = 24
 
 
 @dataclass(frozen=True)
@@ -111,19 +112,23 @@ def depth_colors(depth_m: np.ndarray, range_m: float) -> np.ndarray:
 
 def segmentation_colors(kinds: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """Colour classes in muted, fixed tones and pedestrians in red; kinds (h, w), ids (h, w) -> (h, w, 3) RGB."""
-    colors = _PALETTE[np.minimum(kinds, len(_PALETTE) - 1)]
     # Neighbouring instances of one class differ a little, so that single buildings can be told apart.
-    shade = ((ids.astype(np.int32) * 37) % 24 - 12)[..., None]
-    colors = np.clip(colors.astype(np.int32) + shade, 0, 255).astype(np.uint8)
-    colors[kinds == KINDS["Pedestrians"]] = HIGHLIGHT_RGB
-    return colors
+    shades = (ids % NUM_SHADES) * 37 % NUM_SHADES
+    rows = np.minimum(kinds, len(KINDS) - 1) * np.uint16(NUM_SHADES) + shades
+    return np.take(_PALETTE, rows, axis=0)
 
 
 def _palette() -> np.ndarray:
-    """Muted tones (29, 3): hues by golden-angle steps, low saturation, so that only the highlight is vivid."""
+    """Muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3): hues by golden-angle steps, low saturation, so that only the
+    pedestrians are vivid.
+    """
     hues = (np.arange(len(KINDS)) * 111) % 180
     hsv = np.stack([hues, np.full(len(KINDS), 70), np.full(len(KINDS), 150)], axis=-1).astype(np.uint8)
-    return cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
+    tones = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0].astype(np.int64)
+    shades = np.arange(NUM_SHADES) - NUM_SHADES // 2
+    colors = np.clip(tones[:, None] + shades[:, None], 0, 255).astype(np.uint8)
+    colors[KINDS["Pedestrians"]] = HIGHLIGHT_RGB
+    return colors.reshape(-1, 3)
 
 
 _PALETTE = _palette()

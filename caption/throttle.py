@@ -43,7 +43,7 @@ class Throttle:
         finally:
             async with self._changed:
                 self.num_active -= 1
-                self._changed.notify_all()
+                self._changed.notify(max(int(self.limit) - self.num_active, 0))
 
     def succeeded(self) -> None:
         """Note an answer."""

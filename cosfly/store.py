@@ -199,7 +199,8 @@ def fingerprint(path: Path) -> str:
 class Journal:
     """An append-only JSON-lines file whose every line carries its own checksum.
 
-    A line is on disk before `append` returns. A line that a kill cut short, or that was damaged, is skipped by `read` and
+    A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this process does
+    not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by `read` and
     counted in `num_damaged`; what stood in it is done again.
     """
 
@@ -251,6 +252,12 @@ class Journal:
             if sync:
                 os.fsync(self._file.fileno())
             return int(self._file.tell())
+
+    def sync(self) -> None:
+        """Wait until all that was appended is on the disk."""
+        with storage_errors(self.path):
+            if self._file is not None:
+                os.fsync(self._file.fileno())
 
     def start(self) -> int:
         """Open the file for appending, without a line that a kill cut short. Gives its length, bytes."""
