@@ -20,7 +20,7 @@ from caption.regenerate import caption_window
 from caption.report import write_page
 from caption.schema import CaptionConfig
 from caption.teacher import RuleTeacher, Teacher, shown_url
-from cosfly.coc import Caption, read_captions, write_captions
+from cosfly.coc import caption_lines, write_caption_lines, write_captions
 from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.store import Resume, StageFolder, Tally, write_json
@@ -192,11 +192,11 @@ def _merge(stage: StageFolder, allotted: list[Allotted], *, with_gaps: bool) -> 
     ledger = Ledger()
     parts = parts_of(stage.path, allotted, with_gaps)
 
-    def stream() -> Iterator[Caption]:
+    def lines() -> Iterator[str]:
         for part in parts:
-            for caption in read_captions(part):
+            for line, caption in caption_lines(part):
                 ledger.add(caption)
-                yield caption
+                yield line
 
-    write_captions(stage.path / PRODUCT, stream())
+    write_caption_lines(stage.path / PRODUCT, lines())
     return ledger

@@ -181,13 +181,18 @@ def write_captions(path: Path, captions: Iterable[Caption]) -> int:
 
     Streams, so memory stays flat. Returns the number of lines.
     """
+    return write_caption_lines(path, (dump_json(caption.model_dump(mode="json")) + "\n" for caption in captions))
+
+
+def write_caption_lines(path: Path, lines: Iterable[str]) -> int:
+    """The same for captions that are text already, as `caption_lines` gives them."""
     partial = path.with_name(f".{path.name}.partial")
     count = 0
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(partial, "w", encoding="utf-8") as file:
-            for caption in captions:
-                file.write(dump_json(caption.model_dump(mode="json")) + "\n")
+            for line in lines:
+                file.write(line)
                 count += 1
             file.flush()
             os.fsync(file.fileno())
@@ -201,6 +206,11 @@ def read_captions(path: Path) -> Iterator[Caption]:
     Raises:
         InputError: names the file, the line and the field.
     """
+    return (caption for _, caption in caption_lines(path))
+
+
+def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
+    """Yield each line of `captions.jsonl` as it stands there, its end included, and what it says; raises as `read_captions`."""
     try:
         file = open(path, encoding="utf-8")  # noqa: SIM115 (closed below)
     except OSError as error:
@@ -210,7 +220,7 @@ def read_captions(path: Path) -> Iterator[Caption]:
     with file:
         for number, line in enumerate(file, 1):
             try:
-                yield Caption.model_validate(parse_json(line))
+                yield line, Caption.model_validate(parse_json(line))
             except ValidationError as error:
                 detail = error.errors()[0]
                 field = ".".join(str(part) for part in detail["loc"])
