@@ -6,7 +6,7 @@ facts. Wording varies with the sample's generator. Its records say `kind: rules`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,7 @@ from caption.glossary import load_glossary
 from caption.statements import CENTERED_SHARE, Both, describe
 from cosfly.coc import Coc
 
-# A trend of one 0.5 s step is taken to hold for most of the next 2.5 s.
-STEPS_AHEAD = 4.0
+STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
 DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
 MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3
 
@@ -29,6 +28,8 @@ class Cues:
     offset_share: float  # of the image width, positive to the right
     last_turn_deg: float
     last_climb_m: float
+    turn_deg: float  # expected of the next steps, positive to the left
+    climb_m: float
     gap_m: float  # change of the horizontal distance over the window
     pace_mps: float  # drone speed less target speed
     speed_now_mps: float
@@ -37,22 +38,37 @@ class Cues:
 def find_cues(facts: Facts) -> Cues:
     dx = facts.offset_x_px[-1] if facts.is_visible_now else None
     first, last = facts.distance_m[0], facts.distance_m[-1]
+    # The camera follows the line of sight, which is the heading less the target's place in the picture: one shaky frame
+    # moves both and leaves their difference as it is.
+    offsets = (
+        [offset or 0 for offset in facts.offset_x_px] if None not in facts.offset_x_px else [0] * len(facts.yaw_deg)
+    )
+    degrees = DEGREES_PER_IMAGE_WIDTH / facts.width_px
+    sight_deg = [yaw_deg - degrees * offset for yaw_deg, offset in zip(facts.yaw_deg, offsets, strict=True)]
     speed = facts.speed_mps[-1] or 0.0
     return Cues(
         offset_share=0.0 if dx is None else dx / facts.width_px,
         last_turn_deg=facts.yaw_deg[-1] - facts.yaw_deg[-2],
         last_climb_m=facts.altitude_m[-1] - facts.altitude_m[-2],
+        turn_deg=STEPS_AHEAD * _slope(sight_deg) - degrees * (dx or 0),
+        climb_m=STEPS_AHEAD * _slope(facts.altitude_m),
         gap_m=0.0 if first is None or last is None else last - first,
         pace_mps=0.0 if facts.target_speed_mps is None else speed - facts.target_speed_mps,
         speed_now_mps=speed,
     )
 
 
+def _slope(values: Sequence[float]) -> float:
+    """Give the change per step of the straight line nearest to a series."""
+    middle = (len(values) - 1) / 2.0
+    weights = [i - middle for i in range(len(values))]
+    return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(w * w for w in weights)
+
+
 def decide(facts: Facts) -> str:
     """Choose an action from the observed frames alone."""
     cues = find_cues(facts)
-    turn_deg = STEPS_AHEAD * cues.last_turn_deg - DEGREES_PER_IMAGE_WIDTH * cues.offset_share
-    climb_m = STEPS_AHEAD * cues.last_climb_m
+    turn_deg, climb_m = cues.turn_deg, cues.climb_m
     if not facts.is_visible_now:
         return "search_to_reacquire_target"
     if cues.speed_now_mps < STILL_MPS and abs(turn_deg) < MIN_TURN_DEG and abs(climb_m) < MIN_CLIMB_M:

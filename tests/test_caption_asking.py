@@ -357,6 +357,37 @@ def test_a_torn_line_does_not_shift_the_index(tmp_path):
 
 # --- kills ------------------------------------------------------------------------------------------------------------
 
+@pytest.mark.parametrize("most_bytes", [1_000, 9_000, 30_000])
+def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole, most_bytes):
+    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk does."""
+    out = tmp_path / "out"
+    with hovering() as server:
+        config = settings(server.url)
+        filled = subprocess.run(
+            [sys.executable, "-c", LIMITED, str(most_bytes), str(tree), str(out), config.model_dump_json()],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert "cannot write" in filled.stderr, filled.stderr
+        assert "finished work is kept" in filled.stderr
+        assert not (out / "manifest.json").exists()
+        kept = keys_of(out)
+        assert run(config, tree, out).read_bytes() == whole
+    assert keys_of(out)[: len(kept)] == kept
+    assert len(keys_of(out)) == len(set(keys_of(out)))
+
+
+LIMITED = """
+import json, resource, sys
+from pathlib import Path
+from caption.schema import CaptionConfig
+from caption.stage import run
+from cosfly.errors import StorageError
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+try:
+    run(CaptionConfig.model_validate(json.loads(sys.argv[4])), Path(sys.argv[2]), Path(sys.argv[3]))
+except StorageError as error:
+    print(error, file=sys.stderr)
+"""
 SCRIPT = """
 import json, sys
 from pathlib import Path
