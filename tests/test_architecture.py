@@ -27,7 +27,15 @@ FOUNDATIONS = {
         "inspection",
     )
 } | {"cosfly"}
-ASSEMBLY = {"cosfly.cli", "cosfly.pipeline", "cosfly.doctor", "cosfly.__main__"}
+ASSEMBLY = {
+    "cosfly.cli",
+    "cosfly.cli_caption",
+    "cosfly.cli_distill",
+    "cosfly.cli_options",
+    "cosfly.pipeline",
+    "cosfly.doctor",
+    "cosfly.__main__",
+}
 HEAVY = {
     "torch",
     "transformers",

@@ -357,6 +357,7 @@ def test_a_torn_line_does_not_shift_the_index(tmp_path):
 
 # --- kills ------------------------------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("most_bytes", [1_000, 9_000, 30_000])
 def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole, most_bytes):
     """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk does."""

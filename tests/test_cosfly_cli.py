@@ -9,7 +9,9 @@ import time
 import pytest
 
 from cosfly import cli, doctor
+from cosfly.cli_options import tell_product
 from cosfly.doctor import Check
+from cosfly.errors import InputError
 from cosfly.pipeline import RunConfig
 from cosfly.store import write_json
 
@@ -53,10 +55,10 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, par
 
 def test_a_stage_that_kept_nothing_is_an_error(capfd, tmp_path):
     write_json(tmp_path / "manifest.json", {"counts": {"kept": 0, "dropped": {"short": 4}, "failed": {}}})
-    with pytest.raises(cli.InputError, match=r"nothing was kept; got .*short.: 4"):
-        cli._made(tmp_path / "product", tmp_path, RunConfig())
+    with pytest.raises(InputError, match=r"nothing was kept; got .*short.: 4"):
+        tell_product(tmp_path / "product", tmp_path, RunConfig())
     write_json(tmp_path / "manifest.json", {"counts": {"kept": 1, "dropped": {"short": 3}, "failed": {}}})
-    cli._made(tmp_path / "product", tmp_path, RunConfig())
+    tell_product(tmp_path / "product", tmp_path, RunConfig())
 
 
 def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
@@ -98,7 +100,7 @@ def test_ctrl_c_is_one_line():
 
 def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(capfd, tmp_path):
     write_json(tmp_path / "manifest.json", {"counts": {"kept": 3, "dropped": {}, "failed": {"no_path": 1}}})
-    with pytest.raises(cli.InputError, match=r"some items failed.*no_path.: 1.*at most 0"):
-        cli._made(tmp_path / "product", tmp_path, RunConfig())
-    cli._made(tmp_path / "product", tmp_path, RunConfig(max_failed=1))
+    with pytest.raises(InputError, match=r"some items failed.*no_path.: 1.*at most 0"):
+        tell_product(tmp_path / "product", tmp_path, RunConfig())
+    tell_product(tmp_path / "product", tmp_path, RunConfig(max_failed=1))
     assert capfd.readouterr().out.count("product") == 2
