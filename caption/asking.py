@@ -25,7 +25,8 @@ from caption.teacher import EndpointTeacher, Teacher, first_budget, shown_url
 from caption.vllm_teacher import PREFIX, VllmTeacher
 from cosfly.coc import Caption, write_captions
 from cosfly.errors import CosflyError, InputError, TeacherError
-from cosfly.store import StageFolder, Tally, dump_json, parse_json, write_bytes
+from cosfly.stage_folder import StageFolder, Tally
+from cosfly.store import dump_json, parse_json, write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,8 @@ from collections import Counter
 from typing import Any
 
 from cosfly.coc import ACTIONS, Caption
-from cosfly.store import Tally, sha256_bytes
+from cosfly.stage_folder import Tally
+from cosfly.store import sha256_bytes
 
 TEXT_FIELDS = ("critical_components", "reasoning_trace")
 BIN_CHARACTERS = {"en": 25, "zh": 10}  # a Chinese character carries about as much as two or three Latin letters

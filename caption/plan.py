@@ -28,7 +28,7 @@ from caption.stage import open_stage
 from caption.teacher import EndpointTeacher, first_budget
 from cosfly.coc import Caption
 from cosfly.errors import ConfigError, InputError, TeacherError
-from cosfly.store import Resume
+from cosfly.stage_folder import Resume
 
 TRIAL_WINDOWS = 6
 CONFIDENCE = 0.9

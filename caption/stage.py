@@ -23,7 +23,8 @@ from caption.teacher import RuleTeacher, Teacher, shown_url
 from cosfly.coc import caption_lines, write_caption_lines, write_captions
 from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.store import Resume, StageFolder, Tally, write_json
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_json
 
 log = logging.getLogger(__name__)
 

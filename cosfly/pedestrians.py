@@ -27,7 +27,8 @@ from cosfly.errors import NoPathError
 from cosfly.pedestrians_overview import draw_overview
 from cosfly.runner import Item, Outcome, Work, rng_for, run_items
 from cosfly.schema import BoxMap, PedestrianPath, Roi, read_boxes, read_roi, write_paths
-from cosfly.store import Resume, StageFolder, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import write_bytes, write_json
 from cosfly.walkable import GROUND_Z_M, Clock, Ground, find_ground, sample_goal, sample_start
 from cosfly.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
 

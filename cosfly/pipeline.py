@@ -34,7 +34,8 @@ from cosfly.planners import PlanConfig
 from cosfly.qc import InspectConfig
 from cosfly.render import RenderConfig
 from cosfly.simplify import SimplifyConfig
-from cosfly.store import Resume, StageFolder, read_json, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import read_json, write_bytes, write_json
 from distill.dataset import PrepareConfig
 from distill.evaluate import EvaluateConfig
 from distill.infer import InferConfig

@@ -26,7 +26,7 @@ from cosfly.qc_frames import FrameNumbers, check_checksums, check_files, check_p
 from cosfly.qc_report import draw_flight, write_report
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
 from cosfly.schema import DT_S, TARGET_HEIGHT_M, DroneTrace, read_traces
-from cosfly.store import Resume, StageFolder
+from cosfly.stage_folder import Resume, StageFolder
 
 TIME_TOLERANCE_S = 1e-3
 

@@ -25,7 +25,8 @@ import numpy as np
 
 from cosfly.console import progress_bar
 from cosfly.errors import CosflyError, EnvironmentMissing
-from cosfly.store import StageFolder, Tally, dump_json, write_bytes
+from cosfly.stage_folder import StageFolder, Tally
+from cosfly.store import dump_json, write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -29,7 +29,8 @@ from cosfly.grid import blocks_walking, compare, connected_parts, empty_grid, in
 from cosfly.maps.overview import add_caption, draw_overview, png_bytes
 from cosfly.merge import MergeRule, merge
 from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, read_boxes, write_boxes
-from cosfly.store import Resume, StageFolder, Tally, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_bytes, write_json
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,8 @@ from cosfly.coc import Caption, Language, Prompt, parse_answer, read_captions
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.playback import frame_name
-from cosfly.store import Resume, StageFolder, Tally, dump_json, parse_json, storage_errors
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import dump_json, parse_json, storage_errors
 
 log = logging.getLogger(__name__)
 

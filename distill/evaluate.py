@@ -23,7 +23,8 @@ from cosfly.coc import ACTIONS, FIELDS, Coc, Language
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.runner import rng_for
-from cosfly.store import Resume, StageFolder, Tally, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_bytes, write_json
 from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts
 from distill.dataset import Sample, read_split
 from distill.infer import Prediction, read_predictions

@@ -12,7 +12,8 @@ from cosfly.coc import Coc, Language, parse_answer
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.store import Resume, StageFolder, Tally, dump_json, parse_json, write_bytes
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import dump_json, parse_json, write_bytes
 from distill.checkpoint import read_adapter_facts
 from distill.dataset import Sample, read_split, split_path
 from distill.encoding import encode, prompt_batch

@@ -20,17 +20,8 @@ from cosfly.config import Config
 from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
 from cosfly.runner import rng_for
-from cosfly.store import (
-    Resume,
-    StageFolder,
-    Tally,
-    atomic_folder,
-    dump_json,
-    inside,
-    parse_json,
-    storage_errors,
-    write_json,
-)
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import atomic_folder, dump_json, inside, parse_json, storage_errors, write_json
 from distill.checkpoint import (
     ADAPTER_FACTS,
     adapter_facts,

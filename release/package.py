@@ -23,10 +23,9 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.inspection import FlightInspection, Inspection, read_inspection
 from cosfly.playback import read_flight
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
+from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import (
     CHECKSUMS,
-    Resume,
-    StageFolder,
     atomic_folder,
     inside,
     sha256_file,

@@ -18,6 +18,7 @@ FOUNDATIONS = {
         "issues",
         "geometry",
         "schema",
+        "stage_folder",
         "store",
         "config",
         "console",

@@ -12,7 +12,8 @@ import pytest
 
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runner import Item, Outcome, rng_for, run_items
-from cosfly.store import Journal, StageFolder, dump_json
+from cosfly.stage_folder import StageFolder
+from cosfly.store import Journal, dump_json
 
 
 def make_worker(log: Path):
@@ -156,7 +157,7 @@ import sys, time
 from pathlib import Path
 from cosfly import cli
 from cosfly.runner import Item, run_items
-from cosfly.store import StageFolder
+from cosfly.stage_folder import StageFolder
 
 def slow(folder):
     def work(item):

@@ -110,7 +110,7 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import test_pipeline_tiny as tiny
-from cosfly.store import StageFolder
+from cosfly.stage_folder import StageFolder
 
 left = {countdown}
 def deadly(function):

@@ -16,7 +16,8 @@ from cosfly.maps.overview import draw_overview, png_bytes
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.schema import BoxMap, write_boxes
-from cosfly.store import Resume, StageFolder, Tally, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_bytes, write_json
 
 log = logging.getLogger(__name__)
 

@@ -35,7 +35,8 @@ from cosfly.schema import (
     read_paths,
     write_traces,
 )
-from cosfly.store import Resume, StageFolder, write_bytes
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import write_bytes
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex

@@ -17,7 +17,8 @@ from cosfly.errors import NoPathError
 from cosfly.planners import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.schema import DroneTrace, PedestrianPath, read_boxes, read_paths, write_traces
-from cosfly.store import Resume, StageFolder, read_json, write_bytes, write_json
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import read_json, write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "1.0"
 FIRST, SECOND = "track_astar", "muco"  # deltas are the first's less the second's, rates the first's wins

@@ -28,7 +28,8 @@ from cosfly.render.perturbation import Ground, PerturbationConfig, Perturbed, Po
 from cosfly.render.scene import PERSON_ID, SHARED_ID, InstanceIds, Scene, build_scene, instance_ids
 from cosfly.runner import Item, Outcome, Work, rng_for, run_items
 from cosfly.schema import BoxMap, DroneTrace, read_boxes, read_traces
-from cosfly.store import CHECKSUMS, Resume, StageFolder, atomic_folder, write_json
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import CHECKSUMS, atomic_folder, write_json
 
 __all__ = ["RENDERERS", "Frame", "Look", "RenderConfig", "Renderer", "open_renderer", "plan_flight", "run"]
 
