@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from cosfly.errors import InputError
-from cosfly.store import dump_json, parse_json, storage_errors
+from cosfly.store import dump_json, model_lines, storage_errors
 
 # tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
 ACTION_GROUPS: dict[str, tuple[str, ...]] = {
@@ -211,21 +210,4 @@ def read_captions(path: Path) -> Iterator[Caption]:
 
 def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
     """Yield each line of `captions.jsonl` as it stands there, its end included, and what it says; raises as `read_captions`."""
-    try:
-        file = open(path, encoding="utf-8")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise InputError(
-            "cannot read the captions", where=path, got=error.strerror, fix="run cosfly caption first"
-        ) from None
-    with file:
-        for number, line in enumerate(file, 1):
-            try:
-                yield line, Caption.model_validate(parse_json(line))
-            except ValidationError as error:
-                detail = error.errors()[0]
-                field = ".".join(str(part) for part in detail["loc"])
-                raise InputError(
-                    detail["msg"], where=f"{path}:{number}: {field}", got=repr(detail["input"])[:80]
-                ) from None
-            except ValueError as error:
-                raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None
+    return model_lines(path, Caption, what="captions", fix="run cosfly caption first")

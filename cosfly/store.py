@@ -12,9 +12,13 @@ import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from cosfly.errors import InputError, StorageError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
@@ -124,6 +128,31 @@ def read_json(path: Path, *, what: str = "file") -> Any:
         raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
+
+
+def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Iterator[tuple[str, Model]]:
+    """Yield each line of a JSON-lines file as it stands there, its end included, and the model it holds.
+
+    Args:
+        what, fix: for the message when there is no such file.
+    Raises:
+        InputError: names the file, the line and the field.
+    """
+    try:
+        file = open(path, encoding="utf-8")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise InputError(f"cannot read the {what}", where=path, got=error.strerror, fix=fix) from None
+    with file:
+        for number, line in enumerate(file, 1):
+            try:
+                yield line, model.model_validate(parse_json(line))
+            except ValidationError as error:
+                detail = error.errors()[0]
+                field = ".".join(str(part) for part in detail["loc"])
+                got = repr(detail["input"])[:80]
+                raise InputError(detail["msg"], where=f"{path}:{number}: {field}", got=got) from None
+            except ValueError as error:
+                raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None
 
 
 def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:

@@ -14,14 +14,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.coc import Caption, Language, Prompt, parse_answer, read_captions
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.playback import frame_name
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import dump_json, parse_json, storage_errors
+from cosfly.store import dump_json, model_lines, storage_errors
 
 log = logging.getLogger(__name__)
 
@@ -306,22 +306,5 @@ def read_split(dataset: Path, split: str) -> Iterator[Sample]:
     Raises:
         InputError: names the file, the line and the field.
     """
-    path = split_path(dataset, split)
-    try:
-        file = open(path, encoding="utf-8")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise InputError(
-            "cannot read the training set", where=path, got=error.strerror, fix="run cosfly distill prepare first"
-        ) from None
-    with file:
-        for number, line in enumerate(file, 1):
-            try:
-                yield Sample.model_validate(parse_json(line))
-            except ValidationError as error:
-                detail = error.errors()[0]
-                field = ".".join(str(part) for part in detail["loc"])
-                raise InputError(
-                    detail["msg"], where=f"{path}:{number}: {field}", got=repr(detail["input"])[:80]
-                ) from None
-            except ValueError as error:
-                raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None
+    lines = model_lines(split_path(dataset, split), Sample, what="training set", fix="run cosfly distill prepare first")
+    return (sample for _, sample in lines)

@@ -6,14 +6,14 @@ import logging
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.coc import Coc, Language, parse_answer
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import dump_json, parse_json, write_bytes
+from cosfly.store import dump_json, model_lines, write_bytes
 from distill.checkpoint import read_adapter_facts
 from distill.dataset import Sample, read_split, split_path
 from distill.encoding import encode, prompt_batch
@@ -186,22 +186,8 @@ def read_predictions(path: Path) -> list[Prediction]:
         InputError: names the file, the line and the field, or a prediction that stands there twice.
     """
     predictions: dict[str, Prediction] = {}
-    try:
-        # Not splitlines(): an answer may hold other line separators, such as U+2028, which JSON leaves as they are.
-        lines = path.read_text(encoding="utf-8").removesuffix("\n").split("\n")
-    except OSError as error:
-        raise InputError(
-            "cannot read the predictions", where=path, got=error.strerror, fix="run cosfly distill infer first"
-        ) from None
-    for number, line in enumerate(lines, 1):
-        try:
-            prediction = Prediction.model_validate(parse_json(line))
-        except ValidationError as error:
-            detail = error.errors()[0]
-            field = ".".join(str(part) for part in detail["loc"])
-            raise InputError(detail["msg"], where=f"{path}:{number}: {field}", got=repr(detail["input"])[:80]) from None
-        except ValueError as error:
-            raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None
+    lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
+    for number, (_, prediction) in enumerate(lines, 1):
         if prediction.key in predictions:
             raise InputError("a sample is answered twice", where=f"{path}:{number}", got=prediction.key)
         predictions[prediction.key] = prediction
