@@ -179,11 +179,6 @@ TABLE: tuple[Action, ...] = (
 BY_TOKEN = {action.token: action for action in TABLE}
 assert set(BY_TOKEN) == set(ACTIONS)
 
-# What a left-right mirror makes of each action.
-MIRRORED = {
-    token: token.replace("left", "right") if "left" in token else token.replace("right", "left") for token in ACTIONS
-}
-
 
 def label_of(motion: Motion, cfg: LabelConfig) -> str | None:
     """Give the ground-truth decision, None where geometry cannot tell."""

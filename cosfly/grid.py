@@ -62,11 +62,6 @@ class OccupancyGrid:
         origin = np.array([self.x_min_m, self.y_min_m])
         return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + origin
 
-    def contains(self, cells: np.ndarray) -> np.ndarray:
-        """Tell which of (..., 2) cells lie on the grid."""
-        cells = np.asarray(cells)
-        return np.all((cells >= 0) & (cells < np.array(self.size)), axis=-1)
-
 
 @dataclass(frozen=True)
 class Agreement:

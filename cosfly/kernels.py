@@ -350,23 +350,6 @@ def _signed_distances(index, points, reach_m):
     return distances, boxes
 
 
-def outward_normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Unit vectors away from the given box at each point.
-
-    Args:
-        points: (n, 3) m. boxes: (n,) box numbers, as `signed_distances` gives them; -1 gives a zero vector.
-    Returns:
-        (n, 3).
-    """
-    points, boxes = _points(points, "points"), np.asarray(boxes, dtype=np.int64)
-    if boxes.shape != (len(points),) or (len(boxes) and not -1 <= boxes.min() <= boxes.max() < len(index.rows)):
-        raise ValueError(f"boxes must be {len(points)} numbers from -1 to {len(index.rows) - 1}")
-    normals = np.zeros_like(points)
-    for i in np.flatnonzero(boxes >= 0):
-        normals[i] = normal_of_box(index.rows, boxes[i], *points[i])
-    return normals
-
-
 def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:
     """Tell which segments touch any box grown by `inflate_m` on every side.
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -111,13 +111,6 @@ class Flight:
         """Indices of the points that lack one of the files."""
         names = tuple(files)
         return [i for i in range(len(self)) if not all((self.frame_folder(i) / name).is_file() for name in names)]
-
-    def truncated(self, keep: np.ndarray) -> Flight:
-        """Give the flight with the points at an index array only."""
-        columns = {name: getattr(self, name)[keep] for name in COLUMNS}
-        raw = copy.copy(self.raw)
-        raw["points"] = [self.raw["points"][i] for i in keep] if self.raw.get("points") else []
-        return replace(self, **columns, raw=raw)
 
 
 COLUMNS = (

@@ -9,11 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caption.actions import BY_TOKEN, MIRRORED, TABLE, label_of, measure, verdict_of
+from caption.actions import BY_TOKEN, TABLE, label_of, measure, verdict_of
 from caption.schema import FutureMotion, LabelConfig
 from cosfly.coc import ACTION_GROUPS, ACTIONS
 
 CFG = LabelConfig()
+
+MIRRORED = {
+    token: token.replace("left", "right") if "left" in token else token.replace("right", "left") for token in ACTIONS
+}
 
 
 def future(

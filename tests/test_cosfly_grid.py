@@ -56,12 +56,6 @@ def test_a_cells_center_lies_in_the_cell(x, y, resolution_m, x_min_m):
     assert tuple(grid.cells_at(grid.centers_of(np.array([x, y])))) == (x, y)
 
 
-def test_contains_knows_the_borders():
-    grid = free_grid(3, 2)
-    cells = np.array([[0, 0], [2, 1], [3, 1], [2, 2], [-1, 0]])
-    assert grid.contains(cells).tolist() == [True, True, False, False, False]
-
-
 def test_empty_grid_covers_the_bounds_and_no_more():
     box_map = make_box_map([[0, 0, 0], [10, 5, 1]], [[2, 1, 0.1], [2, 1, 1]], np.zeros((2, 3)), [ROADS, BUILDINGS])
     grid = empty_grid(box_map)

@@ -1,8 +1,6 @@
 """The playback tree: strict and tolerant reading, axes at the door, unknown keys in a round trip."""
 
-import copy
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -173,16 +171,6 @@ def test_the_known_answer_of_the_public_release(clean, tmp_path):
     flight = read_flight(rewrite(clean, tmp_path, change), strict=False)
     assert_allclose((flight.positions_m[1] - flight.positions_m[0]) / 0.5, [-3.123, 2.072, -1.600])
     assert_allclose(flight.rotations_deg[1, 1] - flight.rotations_deg[0, 1], 3.13)  # a turn to the left
-
-
-def test_truncated_keeps_the_chosen_points(clean, tmp_path):
-    flight = read_flight(clean)
-    short = flight.truncated(np.array([0, 2, 4]))
-    assert short.time_s.tolist() == flight.time_s[[0, 2, 4]].tolist()
-    folder = tmp_path / "Town01" / flight.trajectory / "ORI"
-    folder.mkdir(parents=True)
-    write_flight(folder, replace(short, raw=copy.deepcopy(short.raw)))
-    assert len(read_flight(folder, strict=False)) == 3
 
 
 def test_names():
