@@ -136,7 +136,7 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
     spare = make_state(len(points), obstacles.num_boxes)._replace(nearby=state.nearby)
     # A flight of two points has nothing to move; only its loss is wanted.
     history = history if len(points) > 2 else history[:1]
-    state, masked, num_iterations, num_tried, reason = descend(
+    points, state, masked, num_iterations, num_tried, reason = descend(
         points, problem, obstacles, rules, (state, spare), history
     )
     facts = {

@@ -57,22 +57,21 @@ def remember(nearby, index, points, targets, reach_m, spread_m):
         dx, dy, dz = p[0] - nearby.anchors[i, 0], p[1] - nearby.anchors[i, 1], p[2] - nearby.anchors[i, 2]
         if dx * dx + dy * dy + dz * dz <= MOVED_M * MOVED_M:
             continue
-        nearby.anchors[i] = p
+        nearby.anchors[i, 0], nearby.anchors[i, 1], nearby.anchors[i, 2] = p[0], p[1], p[2]
         # A segment without length, grown: every box nearer than that on each axis of its own frame.
         grown = reach_m + MARGIN_M
         count = collect_hits(index, p[0], p[1], p[2], p[0], p[1], p[2], grown, found)
         nearby.num_around[i] = count if count <= ROOM else -1
-        nearby.around[i] = found[:ROOM]
+        _keep(found, min(count, ROOM), nearby.around, i)
         count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], spread_m + MARGIN_M, found)
         nearby.num_on_view[i] = count if count <= ROOM else -1
-        nearby.on_view[i] = found[:ROOM]
+        _keep(found, min(count, ROOM), nearby.on_view, i)
 
 
-@njit(cache=True, inline="always")
-def _moved(nearby, i, x, y, z):
-    """Squared distance of a place from where waypoint i was looked up."""
-    dx, dy, dz = x - nearby.anchors[i, 0], y - nearby.anchors[i, 1], z - nearby.anchors[i, 2]
-    return dx * dx + dy * dy + dz * dz
+@njit(cache=True)
+def _keep(found, count, boxes, i):
+    for k in range(count):  # assigning a slice would do, but the check of its shape takes the compiler seconds
+        boxes[i, k] = found[k]
 
 
 @njit(cache=True, inline="always")

@@ -1,7 +1,8 @@
 """MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
 
 The curvature that `loss.evaluate` leaves in `State.band` is solved as a band; the step is capped, projected and evaluated, all in
-one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an evaluation.
+one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an evaluation. Loops stand where
+NumPy's whole-array forms would do, because the compiler takes seconds for each form that checks shapes.
 """
 
 from __future__ import annotations
@@ -96,15 +97,16 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
     Returns:
         the trial's loss, infinity if it is not feasible, and whether the step was capped.
     """
-    lengths = np.empty(len(steps))
+    lengths, longest, last = np.empty(len(steps)), 0.0, len(points) - 1
     for i in range(len(steps)):
         lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
-    longest = lengths.max()
-    trial[:] = points
+        longest = max(longest, lengths[i])
+    for axis in range(3):
+        trial[0, axis], trial[last, axis] = points[0, axis], points[last, axis]
     for i in range(len(steps)):
         share = scale * min(1.0, cap_m / max(longest if as_a_whole else lengths[i], 1e-12))
         for axis in range(3):
-            trial[i + 1, axis] += share * steps[i, axis]
+            trial[i + 1, axis] = points[i + 1, axis] + share * steps[i, axis]
     loss = np.inf
     if project(trial, problem, index, 1, len(trial) - 1, state.nearby):
         loss = evaluate(trial, problem, index, masked, state)
@@ -125,7 +127,7 @@ class Rules(NamedTuple):
 
 @njit(cache=True)
 def descend(points, problem, index, rules, states, history):
-    """Improve a feasible trajectory in place; its ends stay.
+    """Improve a feasible trajectory, which is overwritten; its ends stay.
 
     The visibility term is a staircase that the model does not see: where its slope leads nowhere, the step is tried without it,
     and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
@@ -134,14 +136,15 @@ def descend(points, problem, index, rules, states, history):
         points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before each
             iteration and after the last, written.
     Returns:
-        the state of the trajectory, which waypoints are masked (n,), how many iterations and evaluations it took, and a
-        number in STOP_REASONS.
+        the best trajectory (n, 3), its state, which waypoints are masked (n,), how many iterations and evaluations it took, and
+        a number in STOP_REASONS.
     """
     now, spare = states
-    damping, masked, trial = np.zeros(len(points)), np.zeros(len(points), dtype=np.bool_), np.empty_like(points)
+    damping, trial = np.zeros(len(points)), np.empty_like(points)
+    masked = np.zeros(len(points), dtype=np.bool_)
     remember_boxes(points, problem, index, now.nearby)
     loss = evaluate(points, problem, index, masked, now)
-    mask(points, problem, index, rules, masked, now)
+    masked = mask(points, problem, index, rules, masked, now)
     history[0] = loss
     rest, next_rest, small_changes, num_tried = 0, 1, 0, 0
     for iteration in range(1, len(history)):
@@ -149,13 +152,13 @@ def descend(points, problem, index, rules, states, history):
         if not rules.is_analytic:
             difference_gradient(points, problem, index, masked, spare, smooth)
         if rules.is_paper:
-            steps = -rules.learning_rate * (smooth + now.visibility_gradient)[1:-1]
+            steps = _scaled_sum(smooth, now.visibility_gradient, -rules.learning_rate)[1:-1]
             found, _ = try_step(points, steps, 1.0, rules.step_cap_m, False, problem, index, masked, spare, trial)
             num_tried += 1
         else:
             found = np.inf
-            if rest == 0 and np.any(now.visibility_gradient):
-                slope = smooth + now.visibility_gradient
+            if rest == 0 and now.visibility_gradient.any():
+                slope = _scaled_sum(smooth, now.visibility_gradient, 1.0)
                 found, tried = newton_step(
                     points,
                     loss,
@@ -179,25 +182,36 @@ def descend(points, problem, index, rules, states, history):
                 )
                 num_tried += tried
         if found == np.inf:
-            return now, masked, iteration - 1, num_tried, NO_STEP
+            return points, now, masked, iteration - 1, num_tried, NO_STEP
         change, loss, history[iteration] = abs(found - loss), found, found
-        points[:] = trial
-        now, spare = spare, now
+        points, trial, now, spare = trial, points, spare, now
         remember_boxes(points, problem, index, now.nearby)
-        mask(points, problem, index, rules, masked, now)
+        masked = mask(points, problem, index, rules, masked, now)
         small_changes = small_changes + 1 if change < rules.tolerance * max(abs(loss), 1.0) else 0
         if small_changes == 2:  # one small change may be a graze of the staircase that visibility is
-            return now, masked, iteration, num_tried, CONVERGED
-    return now, masked, len(history) - 1, num_tried, ITERATION_LIMIT
+            return points, now, masked, iteration, num_tried, CONVERGED
+    return points, now, masked, len(history) - 1, num_tried, ITERATION_LIMIT
 
 
 @njit(cache=True)
 def mask(points, problem, index, rules, masked, state):
-    """Find the low-visibility runs; the loss does not change with them, gradient and model do."""
+    """Give the waypoints in low-visibility runs, (n,); the loss does not change with them, gradient and model in `state` do."""
     found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
-    if np.any(found != masked):
-        masked[:] = found
-        evaluate(points, problem, index, masked, state)
+    for i in range(len(found)):
+        if found[i] != masked[i]:
+            evaluate(points, problem, index, found, state)
+            break
+    return found
+
+
+@njit(cache=True)
+def _scaled_sum(one, other, factor):
+    """Give factor * (one + other), (n, 3)."""
+    total = np.empty_like(one)
+    for i in range(len(one)):
+        for axis in range(3):
+            total[i, axis] = factor * (one[i, axis] + other[i, axis])
+    return total
 
 
 @njit(cache=True)
@@ -206,7 +220,8 @@ def low_visibility_runs(fractions, threshold, frames):
     marked, begin = np.zeros(len(fractions), dtype=np.bool_), 0
     for i in range(len(fractions) + 1):
         if i == len(fractions) or fractions[i] >= threshold:
-            marked[begin:i] = i - begin >= frames
+            for k in range(begin, i):
+                marked[k] = i - begin >= frames
             begin = i + 1
     return marked
 
@@ -227,9 +242,11 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
         the loss of the trial, infinity if none lowers it, and how many were tried.
     """
     band = now.band.copy()
+    for column in range(band.shape[1]):
+        band[0, column] += DAMPING_LEAST
     hold_bounds(points, problem, now.contacts, band, gradient)
     raised = damping.copy()
-    steps, scale, as_a_whole = solve_band(band, raised + DAMPING_LEAST, gradient), 1.0, False
+    steps, scale, as_a_whole = solve_band(band, raised, gradient), 1.0, False
     for tried in range(1, num_tries + 1):
         found, is_capped = try_step(
             points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
@@ -238,12 +255,14 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
             for i in range(len(damping)):
                 damping[i] = raised[i] * DAMPING_FALL if raised[i] > DAMPING_FIRST / 10 else 0.0
             return found, tried
-        rise = np.maximum(spare.rough - now.rough, 0.0)
-        if np.isfinite(found) and rise.sum() > found - loss:
+        rise = 0.0
+        for i in range(len(raised)):
+            rise += max(spare.rough[i] - now.rough[i], 0.0)
+        if found < np.inf and rise > found - loss:
             for i in range(len(raised)):
-                if rise[i] > 0.0:
+                if spare.rough[i] > now.rough[i]:
                     raised[i] = max(DAMPING_RISE * raised[i], DAMPING_FIRST)
-            steps = solve_band(band, raised + DAMPING_LEAST, gradient)
+            steps = solve_band(band, raised, gradient)
         elif not as_a_whole and is_capped:
             as_a_whole = True
         else:
