@@ -25,6 +25,18 @@ STOP_REASONS = ("converged", "iteration_limit", "no_step")
 CONVERGED, ITERATION_LIMIT, NO_STEP = range(3)
 
 
+class Rules(NamedTuple):
+    """How to step and when to stop: the fields of MucoConfig of the same names, `is_paper` and `is_analytic` for step and gradient."""
+
+    is_paper: bool
+    is_analytic: bool
+    learning_rate: float
+    step_cap_m: float
+    tolerance: float
+    low_visibility: float
+    low_visibility_frames: int
+
+
 @njit(cache=True)
 def hold_bounds(points, problem, contacts, band, gradient):
     """Take out of gradient and curvature, in place, what would lead straight out of the feasible region.
@@ -113,18 +125,6 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
     return loss, longest > cap_m
 
 
-class Rules(NamedTuple):
-    """How to step and when to stop: the fields of MucoConfig of the same names, `is_paper` and `is_analytic` for step and gradient."""
-
-    is_paper: bool
-    is_analytic: bool
-    learning_rate: float
-    step_cap_m: float
-    tolerance: float
-    low_visibility: float
-    low_visibility_frames: int
-
-
 @njit(cache=True)
 def descend(points, problem, index, rules, states, history):
     """Improve a feasible trajectory, which is overwritten; its ends stay.
@@ -160,19 +160,8 @@ def descend(points, problem, index, rules, states, history):
             if rest == 0 and now.visibility_gradient.any():
                 slope = _scaled_sum(smooth, now.visibility_gradient, 1.0)
                 found, tried = newton_step(
-                    points,
-                    loss,
-                    slope,
-                    damping,
-                    TRIES_WITH_VISIBILITY,
-                    rules,
-                    problem,
-                    index,
-                    masked,
-                    now,
-                    spare,
-                    trial,
-                )
+                    points, loss, slope, damping, TRIES_WITH_VISIBILITY, rules, problem, index, masked, now, spare, trial
+                )  # fmt: skip
                 num_tried += tried
                 rest, next_rest = (next_rest, min(2 * next_rest, REST_MAX)) if found == np.inf else (0, 1)
             rest = max(rest - 1, 0)
