@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from cosfly.compiled import njit
 
 SQRT2 = math.sqrt(2.0)
 
@@ -56,7 +57,7 @@ def route_cost(cells: np.ndarray) -> float:
     return len(is_diagonal) - num_diagonal + num_diagonal * SQRT2
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _search(free, origin, target, state, steps, from_direction):  # pragma: no cover (compiled)
     """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2)."""
     num_y, num_x = free.shape
@@ -107,7 +108,7 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
     return False
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (compiled)
     """Add an entry to the heap, growing it when full; gives the arrays and the new size."""
     if size == len(heap_cell):
@@ -126,7 +127,7 @@ def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (c
     return heap_key, heap_cell, size + 1
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
     """Remove the first entry of the heap; gives the new size."""
     size -= 1
@@ -147,18 +148,18 @@ def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
     return size
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _move(heap_key, heap_cell, source, place):  # pragma: no cover (compiled)
     heap_key[place, 0], heap_key[place, 1] = heap_key[source, 0], heap_key[source, 1]
     heap_cell[place] = heap_cell[source]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _is_before(total, to_go, other_total, other_to_go):  # pragma: no cover (compiled)
     return total < other_total or (total == other_total and to_go < other_to_go)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _trace_back(from_direction, num_x, origin, target):  # pragma: no cover (compiled)
     """Follow the directions from the target to the origin; gives the cells in walking order, (k, 2)."""
     count, cell = 1, target

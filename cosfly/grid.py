@@ -12,9 +12,9 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import cv2
-import numba
 import numpy as np
 
+from cosfly.compiled import njit
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
 from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, Roi
@@ -169,7 +169,7 @@ def _mark(boxes: BoxMap, lows: np.ndarray, highs: np.ndarray, grid: OccupancyGri
     _rasterise(corners, lows, highs, is_upright, TOUCH_M / grid.resolution_m, grid.occupied)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _rasterise(corners, lows, highs, is_upright, touch, occupied):  # pragma: no cover (compiled)
     """Mark the cells under the slices of boxes; corners (n, 8, 3) with x and y in cells, z in m."""
     points = np.empty((8 + 2 * len(_EDGES), 2))
@@ -184,7 +184,7 @@ def _rasterise(corners, lows, highs, is_upright, touch, occupied):  # pragma: no
             _fill_hull(points, count, touch, occupied)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _slice_points(corners, box, low, high, points):  # pragma: no cover (compiled)
     """Collect points whose hull is the footprint of a box between two heights: corners inside, and edges cut."""
     count = 0
@@ -205,7 +205,7 @@ def _slice_points(corners, box, low, high, points):  # pragma: no cover (compile
     return count
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
     """Mark the cells that the convex hull of the first `count` points (k, 2), in cells, overlaps.
 
@@ -236,7 +236,7 @@ def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
             _fill_row(occupied, row, np.floor(left + touch), np.ceil(right - touch))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_row(mask, row, start, stop):  # pragma: no cover (compiled)
     """Mark the cells of a row from start up to stop, whole numbers as floats, as far as they lie on the grid."""
     for column in range(int(max(0.0, start)), int(max(0.0, min(float(mask.shape[1]), stop)))):
@@ -302,7 +302,7 @@ def _ring_mask(grid: OccupancyGrid, ring: list[tuple[float, float]]) -> np.ndarr
     return mask
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_ring(points, mask):  # pragma: no cover (compiled)
     """Mark the cells whose centre lies in a ring (k, 2) in cells, by the even-odd rule."""
     crossings = np.empty(len(points))

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.geometry import rotation_matrices
 from cosfly.schema import GROUND_KINDS, KINDS, BoxMap
 

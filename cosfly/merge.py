@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from cosfly.compiled import njit
 from cosfly.schema import KINDS, BoxMap
 
 VEGETATION = KINDS["Vegetation"]
@@ -88,7 +88,7 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
     return _sweep_clusters(mins, maxs, order, axis, gap_m + 1e-9)  # micrometre files: 2.000000 m apart still counts
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _sweep_clusters(mins, maxs, order, axis, gap_m):  # pragma: no cover (compiled)
     """Union-find over the pairs that a sweep along one axis meets; the root is the lowest row."""
     parent = np.arange(len(order))
@@ -138,7 +138,7 @@ def _halve_sparse(
     return _halve(order, starts, rectangles, mins[:, :2].copy(), maxs[:, :2].copy(), min_fill, labels.copy())
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: no cover (compiled)
     """Halve clusters, which are runs of `order`, and give the labels of the parts."""
     stack = np.empty((128, 2), dtype=np.int64)  # halves are at most 64 deep
@@ -168,7 +168,7 @@ def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: 
     return labels
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
     """Share of a rectangle's area that turned rectangles cover, by cell centres."""
     size = high - low

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from pydantic import Field
 
+from cosfly.compiled import njit
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.geometry import axis_aligned_half_extents
@@ -317,7 +317,7 @@ def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     return box_map.select(keep)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _sweep_nested(
     mins, maxs, centers, halves, cos, sin, is_tilted, rank, order, axis, tolerance, keep
 ):  # pragma: no cover (compiled)

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import time
@@ -17,6 +18,7 @@ FOUNDATIONS = {
         "errors",
         "issues",
         "geometry",
+        "compiled",
         "schema",
         "stage_folder",
         "store",
@@ -109,6 +111,11 @@ def test_imports_point_one_way(name):
 def test_heavy_packages_are_imported_where_they_are_used(name):
     top = {n.split(".")[0] for n in imports(name, top_level_only=True)}
     assert not top & HEAVY
+
+
+def test_compiled_functions_share_one_cache():
+    importers = {name for name, path in SOURCES.items() if re.search(r"^(import|from) numba\b", path.read_text(), re.M)}
+    assert importers == {"cosfly.compiled"}
 
 
 def test_the_rule_can_fail(monkeypatch, tmp_path):

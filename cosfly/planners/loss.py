@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box, window_rays
 from cosfly.planners.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box
 
 MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often

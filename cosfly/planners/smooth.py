@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, signed_distances, visibility
 from cosfly.schema import DT_S
 

@@ -8,9 +8,9 @@ reached from each other: dynamic programming over time, places on rings round th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.compiled import njit
 from cosfly.kernels import BoxIndex, collect_hits, free_rays, nearest_box
 from cosfly.schema import DT_S
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.kernels import collect_hits, nearest_box, normal_of_box
 from cosfly.planners.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
 from cosfly.planners.nearby import known, nearest_among, nearest_of, nothing_nearby

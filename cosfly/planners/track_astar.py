@@ -19,8 +19,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from cosfly.compiled import njit
 from cosfly.errors import NoPathError
 from cosfly.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, BoxIndex, _clip, _in_box_frame, collect_hits, nearest_box
 from cosfly.planners import Plan, PlanConfig, Scenario

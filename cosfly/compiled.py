@@ -1,0 +1,57 @@
+"""Numba's `njit` with a cache that never serves stale code.
+
+Numba keeps a compiled function until its own file changes, with everything it calls compiled in: after an update of `kernels.py`
+alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken together, has a cache folder
+of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import time
+from pathlib import Path
+
+import numba
+from numba import njit
+
+__all__ = ["njit"]
+
+PACKAGE = Path(__file__).parent
+UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
+
+
+def sources_digest(package: Path) -> str:
+    """Hash the sources below a folder that hold compiled functions, 16 hex digits."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        text = path.read_bytes()
+        if b"@njit" in text:
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + text)
+    return digest.hexdigest()[:16]
+
+
+def use_own_cache(caches: Path, digest: str, now_s: float) -> None:
+    """Let numba cache in `caches/digest`, and delete what has not been used for long. Without such a folder numba does as it always does."""
+    folder = caches / digest
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder, (now_s, now_s))
+    except OSError:
+        return
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    for other in caches.iterdir():
+        with contextlib.suppress(OSError):  # another process may have deleted it
+            if now_s - other.stat().st_mtime > UNUSED_DAYS * 86400.0:
+                shutil.rmtree(other, ignore_errors=True)
+
+
+def _caches() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(home) / "cosfly"
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    use_own_cache(_caches(), sources_digest(PACKAGE), time.time())

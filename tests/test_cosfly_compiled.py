@@ -1,0 +1,54 @@
+"""The cache of compiled functions: never stale, never in the way."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cosfly
+from cosfly import compiled
+
+DAY_S = 86400.0
+
+
+def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
+    """Its own file stays as it is: numba alone would go on with the old function."""
+    package = tmp_path / "src" / "cosfly"
+    package.mkdir(parents=True)
+    for name in ("__init__.py", "compiled.py"):
+        shutil.copy(Path(cosfly.__file__).parent / name, package)
+    (package / "upper.py").write_text(
+        "from cosfly.compiled import njit\nfrom cosfly.lower import f\n\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+    )
+    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    env |= {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    printed = []
+    for factor in (2, 3, 2):
+        (package / "lower.py").write_text(
+            f"from cosfly.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
+        )
+        code = "from cosfly.upper import g; print(g(7), sum(g.stats.cache_hits.values()))"
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=env, cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        printed.append(done.stdout.split())
+    assert printed == [["14", "0"], ["21", "0"], ["14", "1"]]  # what was compiled for the first sources is still there
+    assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2
+
+
+def test_old_caches_go_and_the_present_one_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", compiled.numba.config.CACHE_DIR)
+    for name in ("old", "young", "own"):
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (0.0, 0.0 if name != "young" else 20 * DAY_S))
+    compiled.use_own_cache(tmp_path, "own", 40 * DAY_S)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["own", "young"]
+    assert str(tmp_path / "own") == compiled.numba.config.CACHE_DIR
+
+
+def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", "as it was")
+    (tmp_path / "file").touch()
+    compiled.use_own_cache(tmp_path / "file", "own", 0.0)
+    assert compiled.numba.config.CACHE_DIR == "as it was"
