@@ -233,11 +233,12 @@ def mean_loss(student: Student, samples: Sequence[Sample], data: Path, batch_siz
 
     student.model.eval()
     total, weight = 0.0, 0.0
-    with torch.inference_mode():
+    with torch.inference_mode(), progress_bar(f"{STAGE}: validation loss", total=len(samples)) as advance:
         for start in range(0, len(samples), batch_size):
             rows = [encode(student, sample, data) for sample in samples[start : start + batch_size]]
             nats, count = answer_loss(student, rows)
             total, weight = total + float(nats), weight + count
+            advance(len(rows))
     return total / weight
 
 
