@@ -16,6 +16,7 @@ from caption.glossary import load_glossary
 from caption.statements import CENTERED_SHARE, Both, describe
 from cosfly.coc import Coc
 
+MODEL = "rules-2"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
 DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
 MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3

@@ -20,7 +20,7 @@ from caption.client import KEY_VARIABLE, ChatClient, NoAnswer
 from caption.images import FrameEncoder
 from caption.prompts import Question, answer_schema, mirror_messages, mirror_schema, question_messages
 from caption.protocol import answer_key, base_url, shown_url, with_image_ids
-from caption.rules import write_answers
+from caption.rules import MODEL, write_answers
 from caption.schema import BudgetConfig, EndpointConfig, ImageConfig, Modality, Reply
 from cosfly.coc import Coc
 from cosfly.runner import rng_for
@@ -51,7 +51,7 @@ class RuleTeacher:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.record: dict[str, Any] = {"kind": "rules", "model": "rules-1", "settings": {"seed": seed}}
+        self.record: dict[str, Any] = {"kind": "rules", "model": MODEL, "settings": {"seed": seed}}
         self._last: tuple[str, tuple[Coc, Coc]] | None = None
 
     def _answers(self, question: Question) -> tuple[Coc, Coc]:
