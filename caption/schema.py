@@ -202,7 +202,7 @@ class BudgetConfig(Config):
 class VllmConfig(Config):
     """The engine in this process, for teacher `vllm:MODEL_DIR`."""
 
-    batch: int = Field(256, ge=1, description="requests handed to the engine at once")
+    batch: int = Field(256, ge=1, description="most requests in the engine at once")
     max_model_len: int | None = Field(None, ge=1024, description="context length; empty takes the model's")
     gpu_memory_utilization: float = Field(0.9, gt=0, le=1, description="share of the accelerator's memory")
     tensor_parallel_size: int = Field(1, ge=1, description="accelerators that share the model")

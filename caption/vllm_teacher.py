@@ -1,17 +1,18 @@
 """A teacher in this process: the vLLM engine over a model folder (`--teacher vllm:MODEL_DIR`, extra `vllm`).
 
-Written against the documented interface of vLLM 0.26: `LLM.chat` over a list of conversations with one `SamplingParams` each,
-`StructuredOutputsParams(json=...)`, and `RequestOutput` with `outputs[0].text` and `finish_reason`. The engine likes many requests
-at once: windows that wait for an answer are gathered into one batch.
+Run with vLLM 0.26 (docs/teachers.md has the figures). The engine has a thread of its own: a request joins while others are
+answered (`LLM.enqueue_chat`, `LLMEngine.step`), and one that the engine refuses costs only itself.
 """
 
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib.util
-import logging
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import os
+import queue
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,12 @@ from caption.prompts import Question, answer_schema, mirror_messages, mirror_sch
 from caption.schema import CaptionConfig, Reply
 from caption.teacher import KeptAnswers, SharedFrames, sampling_seed
 from cosfly.coc import Coc
-from cosfly.errors import EnvironmentMissing, InputError
-
-log = logging.getLogger(__name__)
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 
 PREFIX = "vllm:"
 INSTALL = 'pip install "cosfly[vllm]" on a machine with an accelerator'
-GATHER_S = 0.05  # how long a batch waits for more requests once one is there
+ADDED_PER_STEP = 8  # requests handed over between two looks at what is finished
+FINISHED = ("stop", "length")  # what the engine says of an answer; others are its own failures
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Request:
     messages: list[dict]
     sampling: dict[str, Any]  # keyword arguments of SamplingParams, without structured_outputs
     schema: dict | None
+    template: dict[str, Any] = field(default_factory=dict)  # chat_template_kwargs
 
 
 class VllmTeacher:
@@ -49,23 +50,19 @@ class VllmTeacher:
         self.record: dict[str, Any] = {}
         self.frames = SharedFrames(cfg.image)
         self.kept = KeptAnswers(answers, budget, str(self.folder))
-        self._thread = ThreadPoolExecutor(1, "vllm")  # the engine is called from one thread only
-        self._waiting: list[tuple[Request, asyncio.Future]] = []
-        self._working: asyncio.Task | None = None
-        self._engine: Any = None
+        self._engine = EngineThread(self.folder, cfg)
 
     async def __aenter__(self) -> VllmTeacher:
-        loop = asyncio.get_running_loop()
-        self._engine = await loop.run_in_executor(self._thread, load_engine, self.folder, self.cfg)
+        await self._engine.start()
         c = self.cfg.endpoint
         settings = {"temperature": c.temperature, "top_p": c.top_p, "max_tokens": c.max_tokens, "seed": self.seed}
-        self.record = {"kind": "vllm", "model": self.folder.name, "settings": settings}
+        extra = {"extra_body": dict(c.extra_body)}
+        self.record = {"kind": "vllm", "model": self.folder.name, "settings": settings | extra}
         return self
 
     async def __aexit__(self, *exc: object) -> None:
         self.frames.close()
-        self._thread.shutdown(wait=True, cancel_futures=True)
-        self._engine = None
+        await self._engine.stop()
 
     async def ask(self, question: Question) -> Reply:
         messages, digests = await self.frames.messages(question)
@@ -81,51 +78,109 @@ class VllmTeacher:
     ) -> Reply:
         request = build_request(self.cfg, messages, schema, sampling_seed(self.seed, sample_id, purpose))
         body = {"model": self.record["model"], "messages": messages, **request.sampling}
+        if request.template:
+            body["chat_template_kwargs"] = request.template
         identity = {"sample_id": sample_id, "purpose": purpose}
-        return await self.kept.give(identity, body, digests, schema, lambda: self._generate(request))
+        return await self.kept.give(identity, body, digests, schema, lambda: self._engine.answer(request))
 
-    # --- batches ---
 
-    async def _generate(self, request: Request) -> dict:
-        answered: asyncio.Future[dict] = asyncio.get_running_loop().create_future()
-        self._waiting.append((request, answered))
-        if self._working is None or self._working.done():
-            self._working = asyncio.create_task(self._work())
-        return await answered
+class EngineThread:
+    """The engine on its thread. Requests may come at any time; at most `vllm.batch` of them are in the engine."""
 
-    async def _work(self) -> None:
-        loop = asyncio.get_running_loop()
-        while self._waiting:
-            await asyncio.sleep(GATHER_S)
-            most = self.cfg.vllm.batch
-            batch, self._waiting = self._waiting[:most], self._waiting[most:]
+    def __init__(self, folder: Path, cfg: CaptionConfig) -> None:
+        self.folder, self.cfg = folder, cfg
+        self._thread = ThreadPoolExecutor(1, "vllm")  # the engine is called from one thread only
+        self._new: queue.SimpleQueue[tuple[Request, Future[dict]] | None] = queue.SimpleQueue()
+        self._open: dict[str, tuple[Request, Future[dict]]] = {}
+        self._is_closing = False
+        self._broken: TeacherError | None = None
+
+    async def start(self) -> None:
+        """Load the engine and serve.
+
+        Raises:
+            EnvironmentMissing, ConfigError: see load_engine.
+        """
+        try:
+            engine = await asyncio.get_running_loop().run_in_executor(self._thread, load_engine, self.folder, self.cfg)
+        except BaseException:
+            self._thread.shutdown(wait=False)
+            raise
+        self._thread.submit(self._serve, engine)
+
+    async def answer(self, request: Request) -> dict:
+        """Give text, usage, structured and finish_reason.
+
+        Raises:
+            NoAnswer: the engine refuses this request. TeacherError: it is broken and will answer nothing.
+        """
+        answered: Future[dict] = Future()
+        self._new.put((request, answered))
+        return await asyncio.wrap_future(answered)
+
+    async def stop(self) -> None:
+        """End the thread and the engine; what is still asked stays without an answer."""
+        self._is_closing = True
+        self._new.put(None)
+        await asyncio.get_running_loop().run_in_executor(None, self._thread.shutdown)
+        gc.collect()  # the engine's processes and memory go with its last reference
+
+    # --- on the thread ---
+
+    def _serve(self, engine: Any) -> None:
+        while not self._is_closing:
+            for request, answered in self._take():
+                if answered.set_running_or_notify_cancel():
+                    self._add(engine, request, answered)
             try:
-                found: list[dict | NoAnswer] = list(
-                    await loop.run_in_executor(self._thread, chat, self._engine, [request for request, _ in batch])
-                )
-            except (ValueError, RuntimeError) as error:  # what the engine raises for a prompt it cannot take
-                found = await self._one_by_one(batch, str(error))
-            for (_, answered), result in zip(batch, found, strict=True):
-                if answered.done():
-                    continue
-                if isinstance(result, NoAnswer):
-                    answered.set_exception(result)
-                else:
-                    answered.set_result(result)
+                if self._open and not self._is_closing:
+                    self._step(engine)
+            except Exception as error:
+                self._break(error)
 
-    async def _one_by_one(self, batch: list[tuple[Request, asyncio.Future]], problem: str) -> list[dict | NoAnswer]:
-        """Ask each alone, so that one prompt that is too long does not cost the others their answer."""
-        if len(batch) == 1:
-            return [NoAnswer("engine", " ".join(problem.split())[:200], is_final=True)]
-        log.warning("vllm: a batch of %d failed (%s); asking each alone", len(batch), " ".join(problem.split())[:200])
-        loop = asyncio.get_running_loop()
-        results: list[dict | NoAnswer] = []
-        for request, _ in batch:
+    def _take(self) -> list[tuple[Request, Future[dict]]]:
+        """Give requests that came meanwhile; waits for one where there is nothing else to do."""
+        taken: list[tuple[Request, Future[dict]]] = []
+        while len(taken) < min(ADDED_PER_STEP, self.cfg.vllm.batch - len(self._open)):
             try:
-                results += await loop.run_in_executor(self._thread, chat, self._engine, [request])
-            except (ValueError, RuntimeError) as error:
-                results.append(NoAnswer("engine", " ".join(str(error).split())[:200], is_final=True))
-        return results
+                found = self._new.get(block=not (self._open or taken))
+            except queue.Empty:
+                break
+            if found is None:
+                break
+            taken.append(found)
+        return taken
+
+    def _add(self, engine: Any, request: Request, answered: Future[dict]) -> None:
+        if self._broken is not None:
+            answered.set_exception(self._broken)
+            return
+        try:
+            self._open[enqueue(engine, request)] = (request, answered)
+        except (ValueError, RuntimeError) as error:  # what the engine raises for a prompt that it cannot take
+            answered.set_exception(NoAnswer("engine", _one_line(error), is_final=True))
+        except Exception as error:  # the process behind the engine is gone, or a bug: no request will be answered
+            self._break(error, answered)
+
+    def _step(self, engine: Any) -> None:
+        for output in [output for output in engine.llm_engine.step() if output.finished]:
+            request, answered = self._open.pop(output.request_id)
+            found = read_output(output)
+            if found["finish_reason"] in FINISHED:
+                answered.set_result(found | {"structured": "plain" if request.schema is None else "json_schema"})
+            else:
+                answered.set_exception(NoAnswer("engine", f"it ended with {found['finish_reason']!r}"))
+
+    def _break(self, error: Exception, *more: Future[dict]) -> None:
+        self._broken = TeacherError(
+            "the vLLM engine broke",
+            where=f"{PREFIX}{self.folder}",
+            got=f"{type(error).__name__}: {_one_line(error)}",
+            fix="its messages above tell why; run the same command again: nothing answered is asked twice",
+        )
+        for answered in (*more, *(answered for _, answered in self._open.values())):
+            answered.set_exception(self._broken)
+        self._open.clear()
 
 
 # --- the engine's interface -------------------------------------------------------------------------------------------
@@ -149,7 +204,9 @@ def build_request(cfg: CaptionConfig, messages: list[dict], schema: dict, seed: 
     """Give one request in plain values. `image_uuid` gives no id here: in one process the engine hashes pictures itself."""
     c = cfg.endpoint
     sampling = {"temperature": c.temperature, "top_p": c.top_p, "max_tokens": c.max_tokens, "seed": seed}
-    return Request(messages, sampling, schema if c.json_schema else None)
+    more = dict(c.extra_body)
+    template = more.pop("chat_template_kwargs", {})
+    return Request(messages, sampling | more, schema if c.json_schema else None, template)
 
 
 def engine_arguments(folder: Path, cfg: CaptionConfig) -> dict[str, Any]:
@@ -158,11 +215,12 @@ def engine_arguments(folder: Path, cfg: CaptionConfig) -> dict[str, Any]:
     num_images = frames if cfg.image.layout == "tiled" else frames * len(cfg.image.modalities)
     arguments: dict[str, Any] = {
         "model": str(folder),
-        "limit_mm_per_prompt": {"image": num_images},
+        "limit_mm_per_prompt": {"image": num_images, "video": 0},  # without the 0, room is kept for a video
         "gpu_memory_utilization": cfg.vllm.gpu_memory_utilization,
         "tensor_parallel_size": cfg.vllm.tensor_parallel_size,
-        # Free whitespace between fields lets a model pad for ever and slows decoding several times.
-        "structured_outputs_config": {"disable_any_whitespace": True},
+        # Free whitespace between fields lets a model pad for ever and slows decoding several times. The engine forbids it
+        # only where the backend is named; "auto" is refused.
+        "structured_outputs_config": {"backend": "xgrammar", "disable_any_whitespace": True},
     }
     if cfg.vllm.max_model_len is not None:
         arguments["max_model_len"] = cfg.vllm.max_model_len
@@ -174,35 +232,45 @@ def load_engine(folder: Path, cfg: CaptionConfig) -> Any:
 
     Raises:
         EnvironmentMissing: vllm is not installed, or the engine does not start here.
+        ConfigError: it does not know a setting.
     """
     if importlib.util.find_spec("vllm") is None:
-        raise EnvironmentMissing("the vLLM engine is not installed", where=f"vllm:{folder}", fix=INSTALL)
-    from vllm import LLM
-
+        raise EnvironmentMissing("the vLLM engine is not installed", where=f"{PREFIX}{folder}", fix=INSTALL)
+    os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # else it reports to its makers
     try:
+        from vllm import LLM
+
+        try:
+            sampling_parameters(build_request(cfg, [], {}, 0))
+        except (TypeError, ValueError) as error:
+            where = "caption.endpoint"
+            raise ConfigError("vLLM refuses the sampling settings", where=where, got=_one_line(error)) from None
         return LLM(**engine_arguments(folder, cfg))
-    except (RuntimeError, ValueError, OSError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise EnvironmentMissing("the vLLM engine does not start", where=f"vllm:{folder}", got=reason) from None
+    except TypeError as error:  # an argument that LLM does not have
+        raise ConfigError("vLLM refuses an argument", where="caption.vllm.engine", got=_one_line(error)) from None
+    except (ImportError, RuntimeError, ValueError, OSError) as error:
+        reason = _one_line(error)
+        raise EnvironmentMissing("the vLLM engine does not start", where=f"{PREFIX}{folder}", got=reason) from None
 
 
-def chat(engine: Any, requests: list[Request]) -> list[dict]:
-    """Answer requests in one call of the engine, in their order."""
+def sampling_parameters(request: Request) -> Any:
+    """Give vLLM's own parameters of a request."""
     from vllm import SamplingParams
     from vllm.sampling_params import StructuredOutputsParams
 
-    parameters = [
-        SamplingParams(
-            **request.sampling,
-            structured_outputs=None if request.schema is None else StructuredOutputsParams(json=request.schema),
-        )
-        for request in requests
-    ]
-    outputs = engine.chat([request.messages for request in requests], parameters, use_tqdm=False)
-    return [
-        read_output(output) | {"structured": "plain" if request.schema is None else "json_schema"}
-        for request, output in zip(requests, outputs, strict=True)
-    ]
+    structure = StructuredOutputsParams(json=request.schema) if request.schema else None
+    return SamplingParams(**request.sampling, structured_outputs=structure)
+
+
+def enqueue(engine: Any, request: Request) -> str:
+    """Hand one request to the engine; gives the id that its output will have."""
+    [name] = engine.enqueue_chat(
+        [request.messages],
+        [sampling_parameters(request)],
+        use_tqdm=False,
+        chat_template_kwargs=request.template or None,
+    )
+    return str(name).partition("-")[0]  # the engine adds a random part that outputs do not have
 
 
 def read_output(output: Any) -> dict:
@@ -213,3 +281,7 @@ def read_output(output: Any) -> dict:
         "completion_tokens": len(completion.token_ids),
     }
     return {"text": completion.text, "usage": usage, "finish_reason": completion.finish_reason}
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,7 +1,8 @@
 """The vLLM teacher without vLLM: what it asks of the engine, how it reads what the engine gives back, and its absence.
 
-The engine's outputs are stand-ins of the documented shape (`RequestOutput.outputs[0].text`, `.token_ids`, `.finish_reason`,
-`RequestOutput.prompt_token_ids`); whether a real engine accepts the requests is a matter for a machine with an accelerator.
+The stand-in behaves as vLLM 0.26 did on one H200: `enqueue_chat` gives an id with a random part that the output lacks and raises
+ValueError for a prompt that is too long, `step` gives what is finished in any order, a dead engine raises an Exception of its own,
+and `disable_any_whitespace` is refused unless a backend is named.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from teacher_server import CHINESE, ENGLISH, is_mirror
 
 from caption.schema import CaptionConfig
 from caption.stage import run
-from caption.vllm_teacher import Request, build_request, chat, engine_arguments, load_engine, read_output
+from caption.vllm_teacher import Request, build_request, engine_arguments, load_engine, read_output
 from cosfly.coc import read_captions
-from cosfly.errors import EnvironmentMissing, InputError
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 from specimens import make_playback_tree
 
 
@@ -36,36 +37,64 @@ def output(text: str, num_prompt: int = 1280, finish_reason: str = "stop") -> Si
 
 
 class Recorded:
-    """Keeps its keyword arguments, as the documented parameter classes do."""
+    """Keeps its keyword arguments, as the parameter classes do."""
 
     def __init__(self, **values) -> None:
         self.values = values
+        if "top_kk" in values:
+            raise TypeError("Unexpected keyword argument 'top_kk'")
+
+
+class EngineDeadError(Exception):
+    """As in vLLM: neither a RuntimeError nor a ValueError."""
 
 
 @pytest.fixture
 def stand_in(monkeypatch):
-    """Modules with the two documented parameter classes and an engine that answers like an obedient model."""
+    """Modules with the classes that we use and an engine that answers like an obedient model."""
 
     class Engine:
-        batches: list = []  # noqa: RUF012
+        asked: list = []  # noqa: RUF012  # conversations, in the order of their coming
+        templates: list = []  # noqa: RUF012
+        open_at_step: list = []  # noqa: RUF012
         refused = None
+        dies_after = None
+        finish_reason = "stop"
+        num_loaded = 0
 
         def __init__(self, **arguments) -> None:
-            self.arguments = arguments
+            structured = arguments["structured_outputs_config"]
+            if structured.get("disable_any_whitespace") and structured.get("backend") not in ("xgrammar", "guidance"):
+                raise ValueError("disable_any_whitespace is only supported for xgrammar and guidance backends.")
+            if "gdn_prefil" in arguments:
+                raise TypeError("EngineArgs.__init__() got an unexpected keyword argument 'gdn_prefil'")
+            Engine.num_loaded += 1
+            self.llm_engine = self
+            self.open: list = []
 
-        def chat(self, messages, sampling_params, use_tqdm=True):
-            Engine.batches.append(list(zip(messages, sampling_params, strict=True)))
-            found = []
-            for conversation, parameters in Engine.batches[-1]:
-                if conversation == Engine.refused:
-                    raise ValueError("The decoder prompt is longer than the maximum model length")
-                schema = parameters.values["structured_outputs"].values["json"]
-                decision = schema["properties"]["flight_decision"]["enum"][0]
-                answer = CHINESE if is_mirror({"messages": conversation}) else ENGLISH
-                found.append(output(json.dumps({**answer, "flight_decision": decision})))
-            return found
+        def enqueue_chat(self, messages, sampling_params, use_tqdm=True, chat_template_kwargs=None):
+            [conversation], [parameters] = messages, sampling_params
+            if conversation == Engine.refused:
+                raise ValueError("The decoder prompt (length 4096) is longer than the maximum model length of 2500.")
+            name = str(len(Engine.asked))
+            Engine.asked.append(conversation)
+            Engine.templates.append(chat_template_kwargs)
+            schema = parameters.values["structured_outputs"].values["json"]
+            answer = CHINESE if is_mirror({"messages": conversation}) else ENGLISH
+            decision = schema["properties"]["flight_decision"]["enum"][0]
+            found = output(json.dumps({**answer, "flight_decision": decision}), finish_reason=Engine.finish_reason)
+            found.request_id, found.finished = name, True
+            self.open.append(found)
+            return [f"{name}-89abcdef"]
 
-    Engine.batches = []
+        def step(self):
+            if Engine.dies_after is not None and len(Engine.asked) > Engine.dies_after:
+                raise EngineDeadError("EngineCore encountered an issue. See stack trace (above) for the root cause.")
+            Engine.open_at_step.append(len(self.open))
+            ended = self.open[1:][::-1] or self.open  # all but the oldest, youngest first
+            self.open = [waiting for waiting in self.open if waiting not in ended]
+            return ended
+
     package, parameters = ModuleType("vllm"), ModuleType("vllm.sampling_params")
     package.__spec__ = importlib.util.spec_from_loader("vllm", None)
     package.LLM, package.SamplingParams = Engine, Recorded  # type: ignore[attr-defined]
@@ -73,6 +102,11 @@ def stand_in(monkeypatch):
     monkeypatch.setitem(sys.modules, "vllm", package)
     monkeypatch.setitem(sys.modules, "vllm.sampling_params", parameters)
     return Engine
+
+
+def settings(model, **sections) -> CaptionConfig:
+    shared = {"teacher": f"vllm:{model}", "image": {"max_side_px": 32}, "repair": {"verdicts": ()}}
+    return CaptionConfig.model_validate(shared | sections)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("vllm") is not None, reason="vllm is installed here")
@@ -94,12 +128,12 @@ def test_the_engine_gets_our_images_and_no_free_whitespace(model):
     cfg = CaptionConfig.model_validate({"vllm": {"max_model_len": 8192, "engine": {"gdn_prefill_backend": "triton"}}})
     arguments = engine_arguments(model, cfg)
     assert arguments["model"] == str(model)
-    assert arguments["limit_mm_per_prompt"] == {"image": 15}
-    assert arguments["structured_outputs_config"] == {"disable_any_whitespace": True}
+    assert arguments["limit_mm_per_prompt"] == {"image": 15, "video": 0}
+    assert arguments["structured_outputs_config"] == {"backend": "xgrammar", "disable_any_whitespace": True}
     assert arguments["max_model_len"] == 8192
     assert arguments["gdn_prefill_backend"] == "triton"
     tiled = CaptionConfig.model_validate({"image": {"layout": "tiled"}})
-    assert engine_arguments(model, tiled)["limit_mm_per_prompt"] == {"image": 5}
+    assert engine_arguments(model, tiled)["limit_mm_per_prompt"] == {"image": 5, "video": 0}
     assert "max_model_len" not in engine_arguments(model, tiled)
 
 
@@ -110,6 +144,10 @@ def test_a_request_holds_sampling_and_schema():
     assert request == Request(messages, {"temperature": 0.3, "top_p": 0.8, "max_tokens": 99, "seed": 5}, schema)
     free = CaptionConfig.model_validate({"endpoint": {"json_schema": False}})
     assert build_request(free, messages, schema, 5).schema is None
+    more = {"top_k": 20, "chat_template_kwargs": {"enable_thinking": False}}
+    thinking = build_request(CaptionConfig.model_validate({"endpoint": {"extra_body": more}}), messages, schema, 5)
+    assert thinking.sampling["top_k"] == 20
+    assert thinking.template == {"enable_thinking": False}
 
 
 def test_an_output_is_read():
@@ -119,44 +157,66 @@ def test_an_output_is_read():
     }  # fmt: skip
 
 
-def test_chat_keeps_the_order_and_names_the_structure(stand_in):
-    schemas = [{"properties": {"flight_decision": {"enum": [word]}}} for word in ("hover", "ascend")]
-    requests = [
-        Request([{"role": "user", "content": [{"type": "text", "text": "x"}]}], {"seed": 1}, s) for s in schemas
-    ]
-    found = chat(stand_in(), requests)
-    assert [json.loads(answer["text"])["flight_decision"] for answer in found] == ["hover", "ascend"]
-    assert {answer["structured"] for answer in found} == {"json_schema"}
-    assert stand_in.batches[0][0][1].values["seed"] == 1
+def test_what_vllm_does_not_know_is_a_setting_not_a_crash(stand_in, model):
+    with pytest.raises(ConfigError, match=r"caption.vllm.engine.*gdn_prefil"):
+        load_engine(model, CaptionConfig.model_validate({"vllm": {"engine": {"gdn_prefil": "triton"}}}))
+    with pytest.raises(ConfigError, match="top_kk"):
+        load_engine(model, CaptionConfig.model_validate({"endpoint": {"extra_body": {"top_kk": 3}}}))
+    whitespace = {"structured_outputs_config": {"disable_any_whitespace": True}}
+    with pytest.raises(EnvironmentMissing, match=r"does not start.*only supported for xgrammar"):
+        load_engine(model, CaptionConfig.model_validate({"vllm": {"engine": whitespace}}))
 
 
-def test_a_run_gathers_windows_into_batches_and_keeps_every_answer(stand_in, model, tmp_path):
+def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_in, model, tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 2, 16, with_augmented=False)
-    cfg = CaptionConfig.model_validate(
-        {"teacher": f"vllm:{model}", "image": {"max_side_px": 32}, "vllm": {"batch": 8}, "repair": {"verdicts": ()}}
-    )
+    template = {"enable_thinking": False}
+    cfg = settings(model, vllm={"batch": 6}, endpoint={"extra_body": {"chat_template_kwargs": template}})
     path = run(cfg, tree, tmp_path / "out")
     captions = list(read_captions(path))
     assert len(captions) == 14
     assert {caption.teacher["kind"] for caption in captions} == {"vllm"}
     assert {caption.teacher["model"] for caption in captions} == {"model-2b"}
     assert all(caption.usage == {"prompt_tokens": 2560, "completion_tokens": 14} for caption in captions)
-    sizes = [len(batch) for batch in stand_in.batches]
-    assert sum(sizes) == 28
-    assert max(sizes) <= 8 < sum(sizes) / len(sizes) * 2  # full batches, not one by one
+    assert len(stand_in.asked) == 28
+    assert stand_in.templates == [template] * 28
+    assert 2 <= max(stand_in.open_at_step) <= 6  # together, and never more than were allowed
     (tmp_path / "out" / "manifest.json").unlink()
     assert run(cfg, tree, tmp_path / "out").read_bytes() == path.read_bytes()
-    assert sum(len(batch) for batch in stand_in.batches) == 28  # nothing was asked again
+    assert len(stand_in.asked) == 28  # nothing was asked again
 
 
 def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, model, tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
-    cfg = CaptionConfig.model_validate(
-        {"teacher": f"vllm:{model}", "image": {"max_side_px": 32}, "repair": {"verdicts": ()}}
-    )
+    cfg = settings(model)
     run(cfg, tree, tmp_path / "first")
-    asked = [conversation for batch in stand_in.batches for conversation, _ in batch]
-    stand_in.refused = next(conversation for conversation in asked if not is_mirror({"messages": conversation}))
+    assert len(stand_in.asked) == 10
+    stand_in.refused = next(asked for asked in stand_in.asked if not is_mirror({"messages": asked}))
     run(cfg, tree, tmp_path / "second")
+    assert len(stand_in.asked) == 18  # the others once each
     windows = json.loads((tmp_path / "second" / "caption_report.json").read_text())["windows"]
     assert windows == {"input": 5, "kept": 4, "dropped": {"engine": 1}, "failed": {}}
+
+
+@pytest.mark.timeout(60)
+def test_an_engine_that_dies_ends_the_run_in_one_line_and_the_next_goes_on(stand_in, model, tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 16, with_augmented=False)
+    cfg = settings(model, vllm={"batch": 2})
+    stand_in.dies_after = 6
+    with pytest.raises(TeacherError, match=r"engine broke.*EngineDeadError"):
+        run(cfg, tree, tmp_path / "out")
+    num_asked = len(stand_in.asked)
+    stand_in.dies_after = None
+    run(cfg, tree, tmp_path / "out")
+    assert num_asked < 14
+    assert 14 < len(stand_in.asked) <= 14 + 2  # those that were in the engine when it died are asked once more
+    windows = json.loads((tmp_path / "out" / "caption_report.json").read_text())["windows"]
+    assert windows == {"input": 7, "kept": 7, "dropped": {}, "failed": {}}
+
+
+def test_an_answer_that_the_engine_gave_up_is_none(stand_in, model, tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
+    stand_in.finish_reason = "abort"
+    with pytest.raises(TeacherError, match=r"3 of 3 windows got no answer.*engine 3"):
+        run(settings(model), tree, tmp_path / "out")
+    stand_in.finish_reason = "stop"
+    assert len(list(read_captions(run(settings(model), tree, tmp_path / "out")))) == 3
