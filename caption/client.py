@@ -6,10 +6,12 @@ The key comes from the environment variable COSFLY_API_KEY and goes into the req
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import random
 import time
+from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -59,19 +61,24 @@ class ChatClient:
         self._jitter = random.Random()  # times of retries only: no product depends on it
         # A connection to each request in flight, each in a client of its own: one pool of 64 connections looks through all of them at
         # every request, and all at each of those, which takes longer than to send fifteen pictures.
-        self._free: list[httpx.AsyncClient] = []
         self._tls = httpx.create_ssl_context()
-        self._free.append(self._connection())
+        self._free = [self._connect()]
 
     async def aclose(self) -> None:
         """Close all connections; none may be in use."""
         for connection in self._free:
             await connection.aclose()
 
-    def _connection(self) -> httpx.AsyncClient:
-        """Give the connection that was used last, or a new one where all are in use."""
-        if self._free:
-            return self._free.pop()
+    @contextlib.contextmanager
+    def _connection(self) -> Iterator[httpx.AsyncClient]:
+        """Lend the connection that was used last, or a new one where all are in use."""
+        connection = self._free.pop() if self._free else self._connect()
+        try:
+            yield connection
+        finally:
+            self._free.append(connection)
+
+    def _connect(self) -> httpx.AsyncClient:
         headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
         limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
         try:
@@ -88,14 +95,11 @@ class ChatClient:
             TimeoutError: the whole answer was not there within `timeout_s`, however steadily it dripped.
             httpx.TransportError: no connection, or it broke.
         """
-        connection = self._connection()
-        try:
+        with self._connection() as connection:
             async with asyncio.timeout(self.cfg.timeout_s):
                 return await connection.post(
                     f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS
                 )
-        finally:
-            self._free.append(connection)
 
     async def complete(self, body: dict, schema: dict) -> dict:
         """Send a request until it is answered; gives text, usage, structured and finish_reason.
@@ -166,7 +170,8 @@ class ChatClient:
             TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
         """
         try:
-            response = await self._free[-1].get(f"{self.url}/models")
+            with self._connection() as connection:
+                response = await connection.get(f"{self.url}/models")
         except httpx.InvalidURL:
             raise self.error("not a URL that can be asked", fix="check --teacher") from None
         except httpx.HTTPError as error:

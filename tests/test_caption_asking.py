@@ -232,7 +232,7 @@ def test_log_lines_stand_in_for_the_display(tree, tmp_path, caplog, monkeypatch)
     caplog.set_level(logging.INFO, "caption.progress")
     with hovering() as server:
         run(settings(server.url, budget={"price_prompt": 10.0}), tree, tmp_path / "out")
-    last = caplog.messages[-1]
+    last = [record.message for record in caplog.records if record.name == "caption.progress"][-1]
     assert "22 of 22 windows; accepted 22 (repaired 0), dropped 0, no answer 0" in last
     assert "tokens 44,000 in 4,400 out, cost 0.44" in last
 
