@@ -240,5 +240,6 @@ def common_causes(failures: list[dict], most: int = 3) -> str:
 def _read_quarantine(path: Path) -> dict[str, dict]:
     if not path.exists():
         return {}
-    records = [parse_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    with open(path, encoding="utf-8") as file:  # not splitlines(): a message may hold other line separators
+        records = [parse_json(line) for line in file]
     return {record["id"]: record for record in records}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,8 +27,8 @@ from cosfly.cli_options import (
     Workers,
     check_failures,
     data_folder,
+    manner,
     resolve,
-    spread,
     tell_product,
 )
 from cosfly.errors import CosflyError
@@ -173,9 +173,10 @@ def pedestrians(
     import cosfly.pedestrians
 
     cfg = resolve(config, overrides, seed, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
     tell_product(
-        cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **manner), out, cfg
+        cosfly.pedestrians.run(cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **manner(cfg, resume)),
+        out,
+        cfg,
     )
 
 
@@ -202,8 +203,9 @@ def plan(
 
     box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
     cfg = resolve(config, overrides, seed, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
-    tell_product(cosfly.planners.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **manner), folder, cfg)
+    tell_product(
+        cosfly.planners.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **manner(cfg, resume)), folder, cfg
+    )
 
 
 def _needed(name: str, value: Path | None) -> Path:
@@ -228,8 +230,7 @@ def plan_compare(
     import cosfly.planners.compare
 
     cfg = resolve(config, overrides, seed, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
-    product = cosfly.planners.compare.run(cfg.plan, map_, paths, out, seed=cfg.seed, **manner)
+    product = cosfly.planners.compare.run(cfg.plan, map_, paths, out, seed=cfg.seed, **manner(cfg, resume))
     _compare_tables(cosfly.planners.compare.table_rows(product))
     typer.echo(product)
 
@@ -272,8 +273,9 @@ def render(
     import cosfly.render
 
     cfg = resolve(config, overrides, seed, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
-    tell_product(cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **manner), out, cfg)
+    tell_product(
+        cosfly.render.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **manner(cfg, resume)), out, cfg
+    )
 
 
 @app.command()
@@ -304,8 +306,7 @@ def inspect(
     import cosfly.qc
 
     cfg = resolve(config, overrides, None, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
-    tell_product(cosfly.qc.run(cfg.inspect, traces, data_folder(data), out, **manner), out, cfg)
+    tell_product(cosfly.qc.run(cfg.inspect, traces, data_folder(data), out, **manner(cfg, resume)), out, cfg)
 
 
 app.add_typer(caption_app, name="caption")
@@ -334,8 +335,9 @@ def release_build(
     import release.package
 
     cfg = resolve(config, overrides, None, workers)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
-    tell_product(release.package.run(cfg.release, data_folder(data), captions, inspected, out, **manner), out, cfg)
+    tell_product(
+        release.package.run(cfg.release, data_folder(data), captions, inspected, out, **manner(cfg, resume)), out, cfg
+    )
 
 
 @release_app.command("verify")

@@ -16,8 +16,8 @@ from cosfly.cli_options import (
     Seed,
     Workers,
     data_folder,
+    manner,
     resolve,
-    spread,
     tell_product,
 )
 
@@ -76,7 +76,6 @@ def caption(
     extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
     cfg = resolve(config, [*(overrides or []), *extra], seed, workers)
     tree = data_folder(data)
-    manner: Any = {"workers": spread(cfg), "resume": resume.value}
     target = out or tree.resolve().parent / "caption"
     if check and cfg.caption.teacher.startswith("http") and not (target / "answers.jsonl").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption)
@@ -87,7 +86,9 @@ def caption(
         _print_rows("What this run will take", planned.rows())
         return
     tell_product(
-        caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, retry_failed=retry_failed, **manner), target, cfg
+        caption.stage.run(cfg.caption, tree, target, seed=cfg.seed, retry_failed=retry_failed, **manner(cfg, resume)),
+        target,
+        cfg,
     )
 
 

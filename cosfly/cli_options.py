@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -66,10 +66,11 @@ def _config_path(config: Path | None) -> Path | None:
     return config
 
 
-def spread(cfg: RunConfig) -> int:
+def manner(cfg: RunConfig, resume: ResumeMode) -> dict[str, Any]:
+    """How a stage works, whatever it makes: arguments that all stages with workers take."""
     from cosfly.pipeline import num_workers
 
-    return num_workers(cfg.workers)
+    return {"workers": num_workers(cfg.workers), "resume": resume.value}
 
 
 def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
