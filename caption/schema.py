@@ -13,8 +13,9 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.coc import Verdict
+from cosfly.chat.client import EndpointConfig
 from cosfly.config import Config
+from cosfly.products.captions import Verdict
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
@@ -157,31 +158,6 @@ class EvidenceConfig(Config):
     tolerance_px: float = Field(3.0, ge=0, description="pixels")
     relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
     drop: bool = Field(False, description="drop a sample whose text contradicts a measured value")
-
-
-class EndpointConfig(Config):
-    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
-    temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
-    top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
-    max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
-    concurrency: int = Field(
-        16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
-    )
-    timeout_s: float = Field(120.0, gt=0, description="limit of one request, from its first byte to its last")
-    total_timeout_s: float = Field(
-        900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
-    )
-    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    backoff_s: float = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
-    max_backoff_s: float = Field(60.0, gt=0, description="longest wait between two tries")
-    stop_after_failures: int = Field(20, ge=1, description="windows in a row without an answer that end the run")
-    json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
-    image_uuid: bool = Field(
-        False, description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it"
-    )
-    extra_body: dict[str, Any] = Field(
-        default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"
-    )
 
 
 class BudgetConfig(Config):

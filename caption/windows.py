@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from caption.actions import label_of, measure
 from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Sample, WindowConfig
-from cosfly.playback import Flight, sample_id
+from caption.truth.actions import label_of, measure
+from cosfly.products.playback import Flight, sample_id
 
 DEFAULT_LABEL = LabelConfig()
 

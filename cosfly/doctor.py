@@ -66,7 +66,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _gl() -> Check:
-    from cosfly.render.gl_backend import gl_report
+    from cosfly.render.gl.backend import gl_report
 
     try:
         return Check("GL (renderer)", "ok", gl_report())

@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.playback import SKY_DEPTH_M, Flight, find_flights, read_depth, read_flight, read_instance, read_rgb
-from cosfly.schema import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.products.frames import SKY_DEPTH_M, read_depth, read_instance, read_rgb
+from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.products.playback import Flight, find_flights, read_flight
 from cosfly.store import write_bytes
 
 TILE_PX = (320, 180)

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+DT_S = 0.5  # pipeline-wide time step (2 Hz): pedestrians, planners, frames, windows
+
 # Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

@@ -17,7 +17,9 @@ import numpy as np
 from cosfly.compiled import njit
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
-from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, Roi
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.roi import Roi
 
 RESOLUTION_M = 0.5  # tab:ped_params
 HUMAN_HEIGHT_M = 2.0  # tab:ped_params

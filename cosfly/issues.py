@@ -1,4 +1,4 @@
-"""What is wrong with a product: one type for inspection (qc) and verification (release), printed in one way."""
+"""What is wrong with a product: one type for inspection and verification (release), printed in one way."""
 
 from __future__ import annotations
 

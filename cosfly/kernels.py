@@ -13,7 +13,8 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.geometry import rotation_matrices
-from cosfly.schema import GROUND_KINDS, KINDS, BoxMap
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS, KINDS
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells
 MAX_CELLS = 1 << 18  # a map with a stray box a thousand kilometres away must not fill the memory

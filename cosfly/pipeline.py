@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import platform
 import resource
 import sys
@@ -13,70 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import Field
 
-import caption.stage
+import caption.run.stage
 import cosfly
-import cosfly.maps
-import cosfly.pedestrians
-import cosfly.planners
-import cosfly.qc
-import cosfly.render
-import cosfly.simplify
+import cosfly.inspection.stage
+import cosfly.maps.stage
+import cosfly.pedestrians.stage
+import cosfly.planners.stage
+import cosfly.render.stage
+import cosfly.simplify.stage
 import release.package
-from caption.schema import CaptionConfig
-from cosfly.config import Config
 from cosfly.errors import NoPathError
 from cosfly.gallery import contact_sheet, preview_gif
-from cosfly.maps import MapsConfig
-from cosfly.pedestrians import PedestriansConfig
-from cosfly.planners import PlanConfig
-from cosfly.qc import InspectConfig
-from cosfly.render import RenderConfig
-from cosfly.simplify import SimplifyConfig
+from cosfly.settings import RunConfig, num_workers
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import read_json, write_bytes, write_json
-from distill.dataset import PrepareConfig
-from distill.evaluate import EvaluateConfig
-from distill.infer import InferConfig
-from distill.train import TrainConfig
-from release.package import ReleaseConfig
 
 log = logging.getLogger(__name__)
-
-
-class DistillConfig(Config):
-    """Settings of the student's four steps."""
-
-    prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
-    train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
-    infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
-    evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
-
-
-class RunConfig(Config):
-    """Everything that `cosfly run` needs; each stage's settings stand with the stage."""
-
-    name: str = Field(
-        "run", pattern=r"^[\w-][\w. -]*$", description="name of the run; `cosfly run` writes to runs/<name>"
-    )
-    seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
-    workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
-    max_failed: int = Field(
-        0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
-    )
-    roi: Path | None = Field(
-        None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
-    )
-    maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
-    simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
-    pedestrians: PedestriansConfig = Field(default_factory=PedestriansConfig, description="step 3")
-    plan: PlanConfig = Field(default_factory=PlanConfig, description="step 4")
-    render: RenderConfig = Field(default_factory=RenderConfig, description="step 5")
-    inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
-    caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
-    release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
-    distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 
 
 @dataclass(frozen=True)
@@ -87,10 +39,6 @@ class StageResult:
     product: Path
     manifest: dict
     was_complete: bool
-
-
-def num_workers(setting: int) -> int:
-    return setting or len(os.sched_getaffinity(0))
 
 
 @dataclass(frozen=True)
@@ -114,18 +62,24 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
     tree, inspected = to["render"], to["inspect"] / "inspect.json"
     captions, published = to["caption"] / "captions.jsonl", to["release"] / "dataset"
     works: dict[str, tuple[Path, Callable[[], Path]]] = {
-        "maps": (boxes, lambda: cosfly.maps.run(cfg.maps, to["maps"], seed=seed, resume=resume)),
-        "simplify": (simplified, lambda: cosfly.simplify.run(cfg.simplify, boxes, to["simplify"], resume=resume)),
+        "maps": (boxes, lambda: cosfly.maps.stage.run(cfg.maps, to["maps"], seed=seed, resume=resume)),
+        "simplify": (simplified, lambda: cosfly.simplify.stage.run(cfg.simplify, boxes, to["simplify"], resume=resume)),
         "pedestrians": (
             paths,
-            lambda: cosfly.pedestrians.run(
+            lambda: cosfly.pedestrians.stage.run(
                 cfg.pedestrians, simplified, to["pedestrians"], seed=seed, roi=cfg.roi, **spread
             ),
         ),
-        "plan": (traces, lambda: cosfly.planners.run(cfg.plan, simplified, paths, to["plan"], seed=seed, **spread)),
-        "render": (tree, lambda: cosfly.render.run(cfg.render, boxes, simplified, traces, tree, seed=seed, **spread)),
-        "inspect": (inspected, lambda: cosfly.qc.run(cfg.inspect, traces, tree, to["inspect"], **spread)),
-        "caption": (captions, lambda: caption.stage.run(cfg.caption, tree, to["caption"], seed=seed, **spread)),
+        "plan": (
+            traces,
+            lambda: cosfly.planners.stage.run(cfg.plan, simplified, paths, to["plan"], seed=seed, **spread),
+        ),
+        "render": (
+            tree,
+            lambda: cosfly.render.stage.run(cfg.render, boxes, simplified, traces, tree, seed=seed, **spread),
+        ),
+        "inspect": (inspected, lambda: cosfly.inspection.stage.run(cfg.inspect, traces, tree, to["inspect"], **spread)),
+        "caption": (captions, lambda: caption.run.stage.run(cfg.caption, tree, to["caption"], seed=seed, **spread)),
         "release": (
             published,
             lambda: release.package.run(cfg.release, tree, captions, inspected, to["release"], **spread),

@@ -8,7 +8,6 @@ item. Load maps and open GL contexts in the factory. The same signature fits an 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import logging.handlers
 import multiprocessing
@@ -20,8 +19,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from cosfly.console import progress_bar
 from cosfly.errors import CosflyError, EnvironmentMissing
@@ -62,12 +59,6 @@ class Finished:
         for record in self.records:
             if record["status"] == "kept":
                 yield record["id"], record["result"]
-
-
-def rng_for(seed: int, stage: str, item_id: str) -> np.random.Generator:
-    """Give the random generator of one item: independent of worker count, order and resumption."""
-    digest = hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
 
 
 def run_items(

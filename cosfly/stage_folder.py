@@ -15,16 +15,8 @@ from typing import Any, Literal
 
 import cosfly
 from cosfly.errors import ResumeError, StorageError, VerifyError
-from cosfly.store import (
-    Journal,
-    check_schema,
-    fingerprint,
-    inside,
-    read_json,
-    remove_partials,
-    sha256_file,
-    write_json,
-)
+from cosfly.journal import Journal
+from cosfly.store import check_schema, fingerprint, inside, read_json, remove_partials, sha256_file, write_json
 
 log = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cosfly.coc import Language
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
+from cosfly.products.captions import Language
 from cosfly.store import read_json
 from distill.student import Device, pick_device, quiet_transformers, require
 

@@ -16,10 +16,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosfly.coc import Caption, Language, Prompt, parse_answer, read_captions
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
-from cosfly.playback import frame_name
+from cosfly.products.captions import Caption, Language, Prompt, parse_answer, read_captions
+from cosfly.products.frames import frame_name
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import dump_json, model_lines, storage_errors
 

@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from cosfly.errors import InputError
-from cosfly.playback import read_depth, read_instance
-from cosfly.schema import KIND_COLORS, KINDS
+from cosfly.products.frames import read_depth, read_instance
+from cosfly.products.kinds import KIND_COLORS, KINDS
 from cosfly.store import inside
 from distill.dataset import Sample
 from distill.student import IMAGE_TOKEN, Student

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cosfly.coc import ACTIONS, FIELDS, Coc, Language
+from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.runner import rng_for
+from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
 from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts

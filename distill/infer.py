@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.coc import Coc, Language, parse_answer
 from cosfly.config import Config
 from cosfly.errors import InputError
+from cosfly.products.captions import Coc, Language, parse_answer
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import dump_json, model_lines, write_bytes

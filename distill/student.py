@@ -15,9 +15,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.coc import ACTIONS, FIELDS
+from cosfly.chance import rng_for
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
-from cosfly.runner import rng_for
+from cosfly.products.captions import ACTIONS, FIELDS
 from cosfly.store import atomic_folder, read_json
 
 log = logging.getLogger(__name__)

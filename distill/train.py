@@ -16,10 +16,10 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
+from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
-from cosfly.runner import rng_for
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, dump_json, inside, parse_json, storage_errors, write_json
 from distill.checkpoint import (

@@ -6,8 +6,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosfly.coc import FIELDS, Caption, read_captions
 from cosfly.errors import InputError
+from cosfly.products.captions import FIELDS, Caption, read_captions
 from release.columns import CAPTION_FIELDS, ReleasedCaption
 
 

@@ -16,7 +16,8 @@ import pyarrow as pa
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.playback import INVALID_DEPTH_M, SKY_DEPTH_M, Flight, sample_id
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.playback import Flight, sample_id
 
 Modality = Literal["rgb", "depth", "instance"]
 MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "instance")

@@ -20,8 +20,8 @@ from pydantic import Field, field_validator
 import cosfly
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
-from cosfly.inspection import FlightInspection, Inspection, read_inspection
-from cosfly.playback import read_flight
+from cosfly.products.inspection import FlightInspection, Inspection, read_inspection
+from cosfly.products.playback import read_flight
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import (

@@ -16,10 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.coc import ACTIONS
 from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.issues import Report
+from cosfly.products.captions import ACTIONS
 from cosfly.store import CHECKSUMS, inside, read_checksums, sha256_file
 from release import columns
 from release.card import compute_numbers, read_rows, render_card

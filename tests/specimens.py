@@ -12,9 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, world_from_camera
-from cosfly.playback import SKY_DEPTH_M, Camera, Flight, frame_name, write_flight
-from cosfly.schema import DT_S, KINDS, PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
+from cosfly.products.frames import SKY_DEPTH_M, frame_name
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import Camera, Flight, write_flight
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.store import write_json
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cosfly.coc import Caption, Coc, Prompt, write_captions
-from cosfly.playback import find_flights, read_flight, sample_id
+from cosfly.products.captions import Caption, Coc, Prompt, write_captions
+from cosfly.products.playback import find_flights, read_flight, sample_id
 
 WINDOW = 5
 DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")

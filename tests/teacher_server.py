@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from cosfly.coc import ACTIONS
+from cosfly.products.captions import ACTIONS
 
 MODEL = "test-teacher"
 ENGLISH = {

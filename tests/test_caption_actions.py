@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caption.actions import BY_TOKEN, TABLE, label_of, measure, verdict_of
 from caption.schema import FutureMotion, LabelConfig
-from cosfly.coc import ACTION_GROUPS, ACTIONS
+from caption.truth.actions import BY_TOKEN, TABLE, label_of, measure, verdict_of
+from cosfly.products.captions import ACTION_GROUPS, ACTIONS
 
 CFG = LabelConfig()
 

@@ -19,15 +19,15 @@ import pytest
 from rich.console import Console
 from teacher_server import TeacherServer, is_mirror
 
-from caption.answers import AnswerBook, flight_of
-from caption.budget import Budget, BudgetSpent
-from caption.progress import Display, duration
-from caption.protocol import encode_body, with_image_ids
+from caption.run.progress import Display, duration
+from caption.run.stage import run
 from caption.schema import BudgetConfig, CaptionConfig
-from caption.stage import run
-from cosfly.coc import read_captions
+from caption.teachers.answers import AnswerBook, flight_of
+from caption.teachers.budget import Budget, BudgetSpent
+from cosfly.chat.protocol import encode_body, with_image_ids
 from cosfly.errors import ConfigError, TeacherError
-from cosfly.store import Journal
+from cosfly.journal import Journal
+from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 2, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}
@@ -228,11 +228,11 @@ def test_image_ids_are_sent_when_asked_for_and_change_no_answer_key(tree, tmp_pa
 
 
 def test_log_lines_stand_in_for_the_display(tree, tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("caption.progress.SECONDS_BETWEEN_LINES", 0.0)
-    caplog.set_level(logging.INFO, "caption.progress")
+    monkeypatch.setattr("caption.run.progress.SECONDS_BETWEEN_LINES", 0.0)
+    caplog.set_level(logging.INFO, "caption.run.progress")
     with hovering() as server:
         run(settings(server.url, budget={"price_prompt": 10.0}), tree, tmp_path / "out")
-    last = [record.message for record in caplog.records if record.name == "caption.progress"][-1]
+    last = [record.message for record in caplog.records if record.name == "caption.run.progress"][-1]
     assert "22 of 22 windows; accepted 22 (repaired 0), dropped 0, no answer 0" in last
     assert "tokens 44,000 in 4,400 out, cost 0.44" in last
 
@@ -381,7 +381,7 @@ LIMITED = """
 import json, resource, sys
 from pathlib import Path
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.run.stage import run
 from cosfly.errors import StorageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
 try:
@@ -393,7 +393,7 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.run.stage import run
 run(CaptionConfig.model_validate(json.loads(sys.argv[3])), Path(sys.argv[1]), Path(sys.argv[2]))
 """
 # The issue asks for 2,000 windows and 20 kills: COSFLY_KILL_WINDOWS=2000 COSFLY_KILLS=20.

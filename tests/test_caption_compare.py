@@ -8,12 +8,12 @@ import pytest
 from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
-from caption.compare import STRATEGIES, compare, run, text_distance
-from caption.regenerate import Trial
+from caption.run.compare import STRATEGIES, compare, run, text_distance
 from caption.schema import CaptionConfig
+from caption.window_loop import Trial
 from cosfly.cli import app
-from cosfly.coc import Coc
 from cosfly.errors import InputError
+from cosfly.products.captions import Coc
 from specimens import make_playback_tree
 
 

@@ -11,10 +11,10 @@ import pytest
 from teacher_server import ENGLISH, TeacherServer
 from typer.testing import CliRunner
 
-from caption.doctor import ODD_WORD, Finding, examine_endpoint
-from caption.plan import estimate, make_plan
+from caption.run.plan import estimate, make_plan
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 from cosfly.cli import app
 from cosfly.errors import ConfigError
 from specimens import make_playback_tree

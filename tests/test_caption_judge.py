@@ -10,13 +10,13 @@ import pytest
 from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
-from caption.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement
-from caption.judge_gold import read_gold
+from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
-from caption.stage import run
+from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement
+from caption.truth.judge_gold import read_gold
 from cosfly.cli import app
-from cosfly.coc import read_captions
 from cosfly.errors import InputError
+from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 

@@ -7,12 +7,12 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caption.actions import label_of, measure
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.truth.actions import label_of, measure
 from caption.windows import choose_keyframes, iterate_samples, missed_changes
-from cosfly.coc import read_captions
-from cosfly.playback import find_flights, read_flight
+from cosfly.products.captions import read_captions
+from cosfly.products.playback import find_flights, read_flight
 from specimens import make_playback_tree
 
 LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)

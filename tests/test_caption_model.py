@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from caption.doctor import examine_endpoint
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
-from cosfly.coc import parse_answer, read_captions
-from cosfly.store import Journal
+from caption.teachers.doctor import examine_endpoint
+from cosfly.journal import Journal
+from cosfly.products.captions import parse_answer, read_captions
 from distill.student import make_tiny_student
 from specimens import make_playback_tree
 

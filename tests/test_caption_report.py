@@ -8,11 +8,11 @@ from html.parser import HTMLParser
 
 import pytest
 
-from caption.ledger import NUM_CARDS, Shelf
-from caption.report import page_html
+from caption.run.ledger import NUM_CARDS, Shelf
+from caption.run.report import page_html
+from caption.run.stage import run
 from caption.schema import BudgetConfig, CaptionConfig
-from caption.stage import run
-from cosfly.coc import read_captions
+from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 

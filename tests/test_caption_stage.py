@@ -13,14 +13,14 @@ from collections import Counter
 
 import pytest
 
-from caption.actions import label_of, measure
-from caption.glossary import load_glossary
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.truth.actions import label_of, measure
+from caption.truth.glossary import GLOSSARY_FILE, load_glossary
 from caption.windows import iterate_samples
-from cosfly.coc import read_captions
 from cosfly.errors import ConfigError, InputError
-from cosfly.playback import find_flights, read_flight
+from cosfly.products.captions import read_captions
+from cosfly.products.playback import find_flights, read_flight
 from specimens import make_playback_tree
 
 
@@ -84,7 +84,7 @@ def test_another_seed_changes_the_wording_only(tree, done, tmp_path):
 SCRIPT = """
 import sys
 from pathlib import Path
-import caption.stage as stage
+import caption.run.stage as stage
 from caption.schema import CaptionConfig
 plain = stage.write_captions
 def slow(path, captions):
@@ -179,9 +179,7 @@ def test_evidence_can_be_made_a_reason_to_drop(tree, tmp_path):
 
 
 def test_a_glossary_without_an_action_is_refused(tmp_path):
-    from cosfly.config import shipped
-
-    text = shipped("glossary.yaml").read_text(encoding="utf-8").replace("  hover: {en: hover, zh: 悬停}\n", "")
+    text = GLOSSARY_FILE.read_text(encoding="utf-8").replace("  hover: {en: hover, zh: 悬停}\n", "")
     (tmp_path / "glossary.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match="not the closed set; got hover"):
         load_glossary(tmp_path / "glossary.yaml")

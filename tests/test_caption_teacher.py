@@ -16,13 +16,13 @@ from pathlib import Path
 import pytest
 from teacher_server import MODEL, TeacherServer, is_mirror
 
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
-from caption.teacher import KEY_VARIABLE, base_url, shown_url
-from caption.throttle import Throttle
-from cosfly.coc import read_captions
+from caption.teachers.teacher import KEY_VARIABLE, base_url, shown_url
+from cosfly.chat.throttle import Throttle
 from cosfly.errors import ResumeError, TeacherError
-from cosfly.store import Journal
+from cosfly.journal import Journal
+from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 4, "backoff_s": 0.02, "max_backoff_s": 0.05, "timeout_s": 0.5, "concurrency": 4}
@@ -326,7 +326,7 @@ SCRIPT = """
 import json, sys
 from pathlib import Path
 from caption.schema import CaptionConfig
-from caption.stage import run
+from caption.run.stage import run
 run(CaptionConfig.model_validate(json.loads(sys.argv[3])), Path(sys.argv[1]), Path(sys.argv[2]))
 """
 

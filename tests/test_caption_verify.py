@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caption.facts import Facts, measure_facts
-from caption.glossary import load_glossary
-from caption.rules import write_answers
 from caption.schema import EvidenceConfig, WindowConfig
-from caption.verify import check_evidence, check_mirror, flight_numbers
+from caption.teachers.rules import write_answers
+from caption.truth.facts import Facts, measure_facts
+from caption.truth.glossary import load_glossary
+from caption.truth.verify import check_evidence, check_mirror, flight_numbers
 from caption.windows import iterate_samples
-from cosfly.coc import ACTIONS, Coc
+from cosfly.products.captions import ACTIONS, Coc
 from specimens import make_flight
 
 CFG = EvidenceConfig()
@@ -244,7 +244,7 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
 
 
 def test_the_rule_teacher_decides_from_what_it_sees():
-    from caption.rules import decide
+    from caption.teachers.rules import decide
 
     base = dataclasses.replace(PAPER_FACTS, altitude_m=(20.6,) * 5, yaw_deg=(0.0,) * 5, distance_m=(20.0,) * 5)
     cases = {

@@ -15,11 +15,11 @@ from types import ModuleType, SimpleNamespace
 import pytest
 from teacher_server import CHINESE, ENGLISH, is_mirror
 
+from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.stage import run
-from caption.vllm_teacher import Request, build_request, engine_arguments, load_engine, read_output
-from cosfly.coc import read_captions
+from caption.teachers.vllm_engine import Request, build_request, engine_arguments, load_engine, read_output
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
+from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from teacher_server import TeacherServer
 
-from caption.facts import measure_facts
-from caption.images import FrameEncoder, depth_colors, segmentation_colors
-from caption.prompts import answer_schema, make_question, mirror_schema, question_messages, system_prompt
+from caption.run.stage import run
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig
-from caption.stage import run
+from caption.teachers.images import FrameEncoder, depth_colors, segmentation_colors
+from caption.teachers.prompts import answer_schema, make_question, mirror_schema, question_messages, system_prompt
+from caption.truth.facts import measure_facts
 from caption.windows import current_frames, iterate_samples
-from cosfly.coc import ACTIONS
-from cosfly.playback import find_flights, read_flight, write_flight
-from cosfly.schema import KINDS
+from cosfly.products.captions import ACTIONS
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import find_flights, read_flight, write_flight
 from specimens import PERSON_ID, make_flight, make_playback_tree
 
 NO_IMAGES = WindowConfig(require_images=False)

@@ -9,10 +9,10 @@ import time
 import pytest
 
 from cosfly import cli, doctor
-from cosfly.cli_options import tell_product
+from cosfly.cli.options import tell_product
 from cosfly.doctor import Check
 from cosfly.errors import InputError
-from cosfly.pipeline import RunConfig
+from cosfly.settings import RunConfig
 from cosfly.store import write_json
 
 

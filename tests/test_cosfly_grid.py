@@ -20,7 +20,9 @@ from cosfly.grid import (
     roi_mask,
     surface,
 )
-from cosfly.schema import KINDS, Roi, make_box_map
+from cosfly.products.boxes import make_box_map
+from cosfly.products.kinds import KINDS
+from cosfly.products.roi import Roi
 
 BUILDINGS, WATER, ROADS = KINDS["Buildings"], KINDS["Water"], KINDS["Roads"]
 

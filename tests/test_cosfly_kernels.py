@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from cosfly import kernels
 from cosfly.geometry import rotation_matrices, rotation_matrix
-from cosfly.schema import KINDS, make_box_map
+from cosfly.products.boxes import make_box_map
+from cosfly.products.kinds import KINDS
 
 NO_TURN = np.eye(3)[None]
 

@@ -13,16 +13,18 @@ from shapely.geometry import Point, Polygon, box
 
 from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, ResumeError
-from cosfly.maps import MapsConfig, load_map, run
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
 from cosfly.maps.cityjson_file import read_model, rule_of
 from cosfly.maps.footprints import Rectangle, cover, covered_ground, oriented_rectangle, rectangle_polygon, united
-from cosfly.maps.overview import draw_overview
 from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
-from cosfly.schema import KINDS, BoxMap, read_boxes, read_roi
-from cosfly.simplify import SimplifyConfig, cross_validate, simplify
+from cosfly.maps.stage import MapsConfig, load_map, run
+from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.products.roi import read_roi
+from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
+from cosfly.topview import draw_overview
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:

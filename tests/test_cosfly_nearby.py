@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
 
 from cosfly import kernels
-from cosfly.planners import PlanConfig, Scenario, loss, muco, nearby, start, step
+from cosfly.planners import loss, muco, nearby, start, step
+from cosfly.planners.stage import PlanConfig, Scenario
 
 
 def random_boxes(rng, count, size_m=40.0):

@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from cosfly.astar import find_route
+from cosfly.chance import rng_for
 from cosfly.config import build
 from cosfly.errors import ConfigError, CosflyError, NoPathError
+from cosfly.geometry import DT_S
 from cosfly.grid import OccupancyGrid
-from cosfly.pedestrians import (
+from cosfly.journal import Journal
+from cosfly.pedestrians.astar import find_route
+from cosfly.pedestrians.stage import (
     Ground,
     PedestriansConfig,
     make_walk,
@@ -24,9 +27,11 @@ from cosfly.pedestrians import (
     sample_start,
     walkable_ground,
 )
-from cosfly.runner import rng_for
-from cosfly.schema import DT_S, KINDS, Roi, make_box_map, read_boxes, read_paths, write_boxes
-from cosfly.store import Journal, dump_json
+from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.products.roi import Roi
+from cosfly.products.walks import read_paths
+from cosfly.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
 
@@ -347,7 +352,7 @@ def test_fewer_paths_are_the_first_of_more(map_file, tmp_path):
 
 def test_killed_and_resumed_gives_the_same_bytes(map_file, tmp_path):
     program = (
-        "import sys; from pathlib import Path; from cosfly.pedestrians import PedestriansConfig, run\n"
+        "import sys; from pathlib import Path; from cosfly.pedestrians.stage import PedestriansConfig, run\n"
         "run(PedestriansConfig(num_paths=250), Path(sys.argv[1]), Path(sys.argv[2]))"
     )
     victim = subprocess.Popen([sys.executable, "-c", program, str(map_file), str(tmp_path / "killed")])
@@ -415,7 +420,7 @@ def test_the_report_sums_up_its_lines():
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     from cosfly.maps.simworld import SimWorldConfig, load
-    from cosfly.simplify import SimplifyConfig, simplify
+    from cosfly.simplify.stage import SimplifyConfig, simplify
 
     folder = shared_data / "simworld-progen"
     city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))

@@ -13,8 +13,11 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import NoPathError
-from cosfly.planners import PlanConfig, compare, compare_plots
-from cosfly.schema import read_traces, write_boxes, write_paths
+from cosfly.planners import compare, compare_plots
+from cosfly.planners.stage import PlanConfig
+from cosfly.products.boxes import write_boxes
+from cosfly.products.traces import read_traces
+from cosfly.products.walks import write_paths
 
 CFG = PlanConfig()
 
@@ -144,7 +147,8 @@ def test_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
 def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkeypatch):
     code = (
         "import os, pathlib, signal, sys\n"
-        "from cosfly.planners import PlanConfig, compare\n"
+        "from cosfly.planners import compare\n"
+        "from cosfly.planners.stage import PlanConfig\n"
         "real = compare.plan_flight\n"
         "def deadly(walk, *rest):\n"
         "    if walk.path_id == 'b': os.kill(os.getpid(), signal.SIGKILL)\n"

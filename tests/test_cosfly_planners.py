@@ -12,13 +12,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-import cosfly.planners as planners
+import cosfly.planners.stage as planners
+from cosfly import flight_metrics as metrics
 from cosfly import kernels
 from cosfly.errors import InputError, NoPathError, ResumeError
-from cosfly.geometry import look_at
-from cosfly.planners import MucoConfig, PlanConfig, loss, metrics, muco, start, step
+from cosfly.geometry import DT_S, look_at
+from cosfly.planners import loss, muco, start, step
 from cosfly.planners.nearby import nothing_nearby
-from cosfly.schema import DT_S, KINDS, PedestrianPath, make_box_map, read_traces, write_boxes, write_paths
+from cosfly.planners.stage import MucoConfig, PlanConfig
+from cosfly.products.boxes import make_box_map, write_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.products.traces import read_traces
+from cosfly.products.walks import PedestrianPath, write_paths
 
 CFG = PlanConfig()
 
@@ -474,7 +479,7 @@ def test_same_bytes_with_two_workers_and_after_a_kill(inputs, tmp_path):
     reference = planners.run(CFG, *inputs, tmp_path / "one").read_bytes()
     assert planners.run(CFG, *inputs, tmp_path / "two", workers=2).read_bytes() == reference
     code = (
-        "import sys, pathlib, cosfly.planners as p\n"
+        "import sys, pathlib, cosfly.planners.stage as p\n"
         "m, w, o = map(pathlib.Path, sys.argv[1:])\n"
         "p.run(p.PlanConfig(), m, w, o)\n"
     )

@@ -9,17 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
-from cosfly.playback import (
-    COLUMNS,
-    find_flights,
-    read_depth,
-    read_flight,
-    read_instance,
-    read_meta,
-    read_rgb,
-    sample_id,
-    write_flight,
-)
+from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.playback import COLUMNS, find_flights, read_flight, sample_id, write_flight
 from specimens import PERSON_ID, make_playback_tree
 
 

@@ -18,26 +18,25 @@ from hypothesis import strategies as st
 from PIL import Image
 from test_renderers_contract import pose_towards, street
 
-from cosfly import gallery, playback
+from cosfly import gallery
 from cosfly.config import build
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError
 from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matrices, world_from_camera
 from cosfly.kernels import obstacle_index, signed_distances
-from cosfly.playback import Camera, read_depth, read_flight, read_instance, read_meta, read_rgb
-from cosfly.render import Frame, RenderConfig, gl_backend, open_renderer, plan_flight, run
-from cosfly.render import meshes as unit_meshes
+from cosfly.products import playback
+from cosfly.products.boxes import make_box_map, write_boxes
+from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import Camera, read_flight
+from cosfly.products.traces import DroneTrace, write_traces
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
+from cosfly.render.gl import backend as gl_backend
+from cosfly.render.gl import meshes as unit_meshes
+from cosfly.render.gl.scene import GROUND_PLANE_HALF_M, MAX_BOX_ID, PERSON_ID, SHARED_ID, build_scene, instance_ids
 from cosfly.render.person import choose_clothes, pose_person, walk_of
 from cosfly.render.perturbation import Ground, PerturbationConfig, Poses, in_frame, perturb
-from cosfly.render.scene import (
-    GROUND_PLANE_HALF_M,
-    MAX_BOX_ID,
-    PERSON_ID,
-    SHARED_ID,
-    build_scene,
-    instance_ids,
-)
-from cosfly.schema import KINDS, PERSON_HALF_EXTENTS_M, DroneTrace, make_box_map, write_boxes, write_traces
+from cosfly.render.stage import Frame, RenderConfig, open_renderer, plan_flight, run
 from cosfly.store import read_checksums, sha256_file
 
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
@@ -488,7 +487,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from cosfly.config import build
-from cosfly.render import RenderConfig, run
+from cosfly.render.stage import RenderConfig, run
 inputs = [Path(p) for p in sys.argv[1:4]]
 if __name__ == "__main__":
     run(build(RenderConfig, {config!r}, "test"), *inputs, Path(sys.argv[4]), seed=5)

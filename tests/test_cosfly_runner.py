@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from cosfly.chance import rng_for
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.runner import Item, Outcome, rng_for, run_items
+from cosfly.journal import Journal
+from cosfly.runner import Item, Outcome, run_items
 from cosfly.stage_folder import StageFolder
-from cosfly.store import Journal, dump_json
+from cosfly.store import dump_json
 
 
 def make_worker(log: Path):

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, ResumeError
-from cosfly.merge import MergeRule, clusters, fill_share, merge
-from cosfly.schema import KINDS, BoxMap, make_box_map, read_boxes, write_boxes
-from cosfly.simplify import SimplifyConfig, crop_below_ground, cross_validate, prune_nested, run, simplify
+from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.simplify.merge import MergeRule, clusters, fill_share, merge
+from cosfly.simplify.stage import SimplifyConfig, crop_below_ground, cross_validate, prune_nested, run, simplify
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}

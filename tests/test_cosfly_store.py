@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from cosfly import store
 from cosfly.errors import InputError, ResumeError, StorageError, VerifyError
+from cosfly.journal import Journal
 from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import Journal, inside, read_json, write_bytes, write_json
+from cosfly.store import inside, read_json, write_bytes, write_json
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

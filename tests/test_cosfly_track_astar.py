@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from test_cosfly_planners import CANYON, WORLDS, assert_safe, scenario_of, town_of, walk_along
 
-import cosfly.planners as planners
-from cosfly import kernels
+import cosfly.planners.stage as planners
+from cosfly import flight_metrics, kernels
 from cosfly.errors import NoPathError
-from cosfly.planners import PlanConfig, TrackAStarConfig, smooth, track_astar
+from cosfly.planners import smooth, track_astar
+from cosfly.planners.stage import PlanConfig, TrackAStarConfig
 
 CFG = PlanConfig(planner="track_astar")
 
@@ -149,8 +150,8 @@ def test_smoothing_makes_flights_smoother_and_loses_no_sight():
     raw, _ = track_astar.search_flight(scenario, obstacles, CFG, 3.0)
     points, facts = smooth.smooth_flight(raw, scenario.targets_m, obstacles, CFG, 3.0, 0.0)
     assert facts["smoothing"] == "accepted"
-    assert planners.metrics.jerk_rms(points) < 0.5 * planners.metrics.jerk_rms(raw)
-    assert planners.metrics.length_m(points) <= planners.metrics.length_m(raw)
+    assert flight_metrics.jerk_rms(points) < 0.5 * flight_metrics.jerk_rms(raw)
+    assert flight_metrics.length_m(points) <= flight_metrics.length_m(raw)
     before, after = (kernels.visibility(obstacles, p, scenario.targets_m) for p in (raw, points))
     assert (after >= before - 0.05).all()
     np.testing.assert_array_equal(points[[0, -1]], raw[[0, -1]])
@@ -263,7 +264,9 @@ def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
 
 
 def test_the_stage_flies_it(tmp_path):
-    from cosfly.schema import read_traces, write_boxes, write_paths
+    from cosfly.products.boxes import write_boxes
+    from cosfly.products.traces import read_traces
+    from cosfly.products.walks import write_paths
 
     write_boxes(tmp_path / "map.json", town_of(*CANYON))
     write_paths(tmp_path / "path.json", [walk_along("a", [(0, 0), (40, 0)])], {})

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
+from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
 
 BEND_45 = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.5]])  # a straight step, then a diagonal one
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions
 
-from cosfly.coc import parse_answer, write_captions
 from cosfly.errors import InputError, ResumeError, VerifyError
+from cosfly.products.captions import parse_answer, write_captions
 from distill.dataset import (
     SPLITS,
     PrepareConfig,

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from cosfly import pipeline
-from cosfly.coc import read_captions
 from cosfly.config import load
 from cosfly.errors import ResumeError
-from cosfly.pipeline import RunConfig
-from cosfly.playback import find_flights, read_flight
+from cosfly.products.captions import read_captions
+from cosfly.products.playback import find_flights, read_flight
+from cosfly.settings import RunConfig
 from cosfly.store import read_json
 
 TINY = [

@@ -19,11 +19,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.coc import Caption, Coc, Prompt, write_captions
 from cosfly.errors import InputError
-from cosfly.inspection import FlightFunnel, FlightInspection, Funnel, Inspection, TrajectoryFunnel, write_inspection
 from cosfly.issues import Issue
-from cosfly.playback import find_flights, read_depth, read_flight, read_instance, read_rgb, sample_id
+from cosfly.products.captions import Caption, Coc, Prompt, write_captions
+from cosfly.products.frames import read_depth, read_instance, read_rgb
+from cosfly.products.inspection import (
+    FlightFunnel,
+    FlightInspection,
+    Funnel,
+    Inspection,
+    TrajectoryFunnel,
+    write_inspection,
+)
+from cosfly.products.playback import find_flights, read_flight, sample_id
 from cosfly.store import read_json, sha256_file, write_json
 from release.card import render_card, size_category
 from release.package import ReleaseConfig, plan_shards, run

@@ -15,13 +15,15 @@ import pytest
 
 from cosfly.errors import EnvironmentMissing
 from cosfly.geometry import intrinsic_matrix, look_at, rotation_matrices, world_from_camera
-from cosfly.playback import SKY_DEPTH_M, Camera
-from cosfly.render import RENDERERS, open_renderer
+from cosfly.products.boxes import BoxMap, make_box_map
+from cosfly.products.frames import SKY_DEPTH_M
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import Camera
 from cosfly.render.camera import rendered_visibility, view_target
-from cosfly.render.frame import FAR_M, NEAR_M
+from cosfly.render.contract import FAR_M, NEAR_M
+from cosfly.render.gl.scene import GROUND_PLANE_DROP_M, GROUND_PLANE_HALF_M, NO_INSTANCE, PERSON_ID, build_scene
 from cosfly.render.person import choose_clothes, pose_person
-from cosfly.render.scene import GROUND_PLANE_DROP_M, GROUND_PLANE_HALF_M, NO_INSTANCE, PERSON_ID, build_scene
-from cosfly.schema import KINDS, BoxMap, make_box_map
+from cosfly.render.stage import RENDERERS, open_renderer
 
 SIZE = (320, 180)
 DEPTH_TOLERANCE_M = 0.005

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.schema import KINDS, BoxMap, make_box_map
+from cosfly.products.boxes import BoxMap, make_box_map
+from cosfly.products.kinds import KINDS
 
 Pair = Sequence[float] | np.ndarray  # x and y
 

@@ -11,9 +11,9 @@ import itertools
 
 import numpy as np
 
+from cosfly.chance import rng_for
 from cosfly.maps.boxlist import BoxList
-from cosfly.runner import rng_for
-from cosfly.schema import BoxMap
+from cosfly.products.boxes import BoxMap
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.
 CENSUS = {

@@ -21,7 +21,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.footprints import cover, polygons_of, rectangle_polygon, united
-from cosfly.schema import BoxMap
+from cosfly.products.boxes import BoxMap
 
 SLAB_M = 0.3
 STEEP = 0.02  # a surface whose projection is less than this share of its area is a wall: it has no footprint

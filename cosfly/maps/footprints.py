@@ -9,7 +9,9 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.schema import GROUND_KINDS, KINDS, BoxMap, Roi, RoiPolygon
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.roi import Roi, RoiPolygon
 
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
 JOIN_M = 0.3  # slabs this close hang together

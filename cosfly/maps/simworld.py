@@ -21,7 +21,8 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
-from cosfly.schema import KIND_NAMES, BoxMap
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KIND_NAMES
 from cosfly.store import read_json
 
 log = logging.getLogger(__name__)

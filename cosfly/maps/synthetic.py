@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import census_town
@@ -31,8 +32,7 @@ from cosfly.maps.town_blocks import (
     ring,
     tree,
 )
-from cosfly.runner import rng_for
-from cosfly.schema import BoxMap
+from cosfly.products.boxes import BoxMap
 
 GENERATOR_VERSION = "1"
 

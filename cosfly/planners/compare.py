@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import NoPathError
-from cosfly.planners import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
+from cosfly.planners.stage import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
+from cosfly.products.boxes import read_boxes
+from cosfly.products.traces import DroneTrace, write_traces
+from cosfly.products.walks import PedestrianPath, read_paths
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.schema import DroneTrace, PedestrianPath, read_boxes, read_paths, write_traces
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import read_json, write_bytes, write_json
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cosfly.maps.overview import add_caption, draw_overview, png_bytes
-from cosfly.schema import BoxMap, DroneTrace, PedestrianPath
+from cosfly.products.boxes import BoxMap
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import PedestrianPath
+from cosfly.topview import add_caption, draw_overview, png_bytes
 
 MARGIN_M = 25.0
 SIZE_PX = 1400

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.compiled import njit
+from cosfly.geometry import DT_S
 from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, signed_distances, visibility
-from cosfly.schema import DT_S
 
 if TYPE_CHECKING:
-    from cosfly.planners import PlanConfig, TrackAStarConfig
+    from cosfly.planners.stage import PlanConfig, TrackAStarConfig
 
 ROUNDING_M = 1e-9
 

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.compiled import njit
+from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, collect_hits, free_rays, nearest_box
-from cosfly.schema import DT_S
 
 # Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
 # the others climb over what blocks the way and are tried only where the first two do not suffice.

@@ -22,11 +22,11 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.errors import NoPathError
+from cosfly.geometry import DT_S
 from cosfly.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, BoxIndex, _clip, _in_box_frame, collect_hits, nearest_box
-from cosfly.planners import Plan, PlanConfig, Scenario
 from cosfly.planners.smooth import smooth_flight
+from cosfly.planners.stage import Plan, PlanConfig, Scenario
 from cosfly.planners.start import behind, smoothed_headings
-from cosfly.schema import DT_S
 
 MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
 NUM_SECTORS = 128  # of the horizon round a target

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosfly.geometry import box_corners, project
-from cosfly.playback import Camera
-from cosfly.render.frame import NEAR_M, Frame
-from cosfly.render.scene import PERSON_ID
-from cosfly.schema import PERSON_HALF_EXTENTS_M
+from cosfly.products.playback import Camera
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.render.contract import NEAR_M, Frame
+from cosfly.render.gl.scene import PERSON_ID
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly

@@ -13,13 +13,15 @@ import numpy as np
 
 from cosfly.errors import RenderError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
-from cosfly.playback import COORDINATES, Camera, Flight, frame_name, write_flight
+from cosfly.products.frames import frame_name
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import COORDINATES, Camera, Flight, write_flight
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import TargetView, rendered_visibility, view_target
-from cosfly.render.frame import FAR_M, NEAR_M, Frame, Renderer
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, Renderer
+from cosfly.render.gl.scene import PERSON_ID
 from cosfly.render.person import Clothes, Walk, pose_person
 from cosfly.render.perturbation import Poses
-from cosfly.render.scene import PERSON_ID
-from cosfly.schema import KINDS, PERSON_HALF_EXTENTS_M
 from cosfly.store import dump_json, sha256_bytes, sha256_file, storage_errors, write_checksums
 
 FRAME_SCHEMA, FRAME_VERSION = "cosfly.frame", "1.0"

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cosfly.render import meshes
-from cosfly.render.body import Body
-from cosfly.render.parts import CLOTH, LAYER_STEP, PART, STANDING_LAYER, tags
-from cosfly.render.scene import PERSON_ID
-from cosfly.schema import KINDS, TARGET_HEIGHT_M
+from cosfly.products.kinds import KINDS
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.render.gl import meshes
+from cosfly.render.gl.body import Body
+from cosfly.render.gl.parts import CLOTH, LAYER_STEP, PART, STANDING_LAYER, tags
+from cosfly.render.gl.scene import PERSON_ID
 
 STRIDE_M = 1.35  # two steps
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65

@@ -16,8 +16,10 @@ from pydantic import Field
 from cosfly.config import Config
 from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
 from cosfly.kernels import BoxIndex, signed_distances
-from cosfly.playback import Camera
-from cosfly.schema import GROUND_KINDS, PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M, BoxMap
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS
+from cosfly.products.playback import Camera
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 STEP_UP_M = 0.5  # a shifted person may stand this much higher or lower than before, not on a roof

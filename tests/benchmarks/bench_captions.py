@@ -1,7 +1,7 @@
 """Windows per second and peak memory of the rule teacher with all checks. Run: python tests/benchmarks/bench_captions.py 10000 100000
 
 Each size runs in a process of its own, on one core. `loop` is from flight arrays to written caption lines (window, facts, label,
-prompts, both answers, structure, verdict, evidence, mirror, JSON); `stage` is the whole of `caption.stage.run` on a playback
+prompts, both answers, structure, verdict, evidence, mirror, JSON); `stage` is the whole of `caption.run.stage.run` on a playback
 tree without pictures: reading trajectories, part files, merge, report. Memory is the peak of the resident set.
 """
 
@@ -20,12 +20,12 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from caption.regenerate import caption_window
+from caption.run.stage import run
 from caption.schema import CaptionConfig, WindowConfig
-from caption.stage import run
-from caption.teacher import RuleTeacher
+from caption.teachers.teacher import RuleTeacher
+from caption.window_loop import caption_window
 from caption.windows import iterate_samples
-from cosfly.coc import Caption, write_captions
+from cosfly.products.captions import Caption, write_captions
 from specimens import FIRST_SECOND, make_flight, make_playback_tree
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))

@@ -25,14 +25,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from caption.asking import Asking
-from caption.flights import allot, named_flights
-from caption.images import MODALITY_FILES, FrameEncoder
-from caption.protocol import encode_body
+from caption.run.asking import Asking
+from caption.run.flights import allot, named_flights
+from caption.run.stage import open_stage
 from caption.schema import CaptionConfig
-from caption.stage import open_stage
-from caption.teacher import SharedFrames
-from cosfly.playback import SKY_DEPTH_M
+from caption.teachers.images import MODALITY_FILES, FrameEncoder
+from caption.teachers.teacher import SharedFrames
+from cosfly.chat import client
+from cosfly.chat.protocol import encode_body
+from cosfly.products.frames import SKY_DEPTH_M
 from specimens import make_playback_tree
 
 WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2
@@ -112,16 +113,14 @@ def _client(
         bodies.append(plain_encode(payload))
         return bodies[-1]
 
-    import caption.client
-
     SharedFrames.__init__ = init  # type: ignore[method-assign]
-    caption.client.encode_body = recording if encoder is None else plain_encode
+    client.encode_body = recording if encoder is None else plain_encode
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, 0).run(allotted))
         seconds = time.monotonic() - start_s
     finally:
-        SharedFrames.__init__, caption.client.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
+        SharedFrames.__init__, client.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
     assert not asked.unanswered, asked.unanswered[:3]
     return seconds, bodies, frames[0].encoder
 

@@ -12,12 +12,14 @@ import numpy as np
 import scenes
 from scipy.optimize import minimize
 
+from cosfly import flight_metrics as metrics
+from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
+from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
-from cosfly.planners import PLANNERS, PlanConfig, Scenario, load_planner, make_scenario, metrics, muco, start
+from cosfly.planners import muco, start
 from cosfly.planners.loss import evaluate, make_state
-from cosfly.runner import rng_for
-from cosfly.schema import DT_S
+from cosfly.planners.stage import PLANNERS, PlanConfig, Scenario, load_planner, make_scenario
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
 

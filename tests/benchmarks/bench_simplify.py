@@ -13,9 +13,10 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from cosfly.merge import clusters
-from cosfly.schema import KINDS, BoxMap
-from cosfly.simplify import SimplifyConfig, cross_validate, simplify
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KINDS
+from cosfly.simplify.merge import clusters
+from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
 
 
 def peer_clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""The stage: all windows of all flights, counted, shown and resumable."""

@@ -1,0 +1,245 @@
+"""Asks a teacher that takes its time (an endpoint, an engine) about all flights, from one process.
+
+Windows go out in order of flight and time, a bounded number at once, across the borders of flights. A flight is written when its
+last window is done. Windows without an answer sit in `quarantine.jsonl` until a later run gets one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from caption.run.flights import Allotted
+from caption.run.progress import Display
+from caption.schema import CaptionConfig, Sample
+from caption.teachers.answers import AnswerBook, flight_of
+from caption.teachers.budget import Budget, BudgetSpent
+from caption.teachers.teacher import EndpointTeacher, Teacher, first_budget, shown_url
+from caption.teachers.vllm_engine import PREFIX, VllmTeacher
+from caption.truth.judge import open_judge
+from caption.window_loop import caption_window
+from cosfly.chat.client import NoAnswer
+from cosfly.errors import CosflyError, InputError, TeacherError
+from cosfly.products.captions import Caption, write_captions
+from cosfly.stage_folder import StageFolder, Tally
+from cosfly.store import dump_json, parse_json, write_bytes
+
+log = logging.getLogger(__name__)
+
+ANSWERS, QUARANTINE, FAILURES = "answers.jsonl", "quarantine.jsonl", "failures.jsonl"
+WAITING_WINDOWS = (
+    16  # begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked
+)
+
+
+@dataclass
+class Asked:
+    """What came of a run: flights, windows without an answer, flights not begun, and why it stopped early (None: not)."""
+
+    flights: Tally
+    unanswered: list[dict] = field(default_factory=list)
+    num_flights_left: int = 0
+    stopped: str | None = None
+
+
+@dataclass
+class _OpenFlight:
+    """A flight whose windows are being asked."""
+
+    allotted: Allotted
+    captions: list[Caption] = field(default_factory=list)
+    pending: int = 0
+    is_read: bool = False
+    has_gap: bool = False
+
+
+class Asking:
+    """One run of a teacher over the allotted flights."""
+
+    def __init__(self, stage: StageFolder, cfg: CaptionConfig, seed: int, *, retry_failed: bool = False) -> None:
+        self.stage, self.cfg, self.seed = stage, cfg, seed
+        self.open: dict[str, _OpenFlight] = {}
+        self.failures: list[dict] = []  # flights that cannot be read
+        self.unanswered: list[dict] = []
+        self.quarantine = _read_quarantine(stage.path / QUARANTINE)
+        self.only = frozenset(self.quarantine) if retry_failed else None
+        in_flight = cfg.vllm.batch if cfg.teacher.startswith(PREFIX) else cfg.endpoint.concurrency
+        self.most_open = in_flight + WAITING_WINDOWS
+        self.failed_in_row = self.num_flights_left = 0
+        self.stopped: str | None = None
+
+    async def run(self, allotted: list[Allotted]) -> Asked:
+        """Ask about every window that has no answer yet.
+
+        Raises:
+            TeacherError: no window would get an answer. What was answered is kept.
+        """
+        asked = Asked(Tally(num_input=len(allotted)))
+        parts = {flight.name: flight.part(self.stage.path) for flight in allotted}
+        path = self.stage.path / ANSWERS
+        book = AnswerBook(path, lambda name: name in parts and parts[name].exists())
+        if book.num_damaged:
+            log.warning("%s: %d damaged lines are left out", path, book.num_damaged)
+        budget = first_budget(self.cfg.budget, self.cfg.endpoint, self.cfg.image, book)
+        guesses = {flight.name: flight.guess_num_windows(self.cfg.window) for flight in allotted}
+        self.book = book
+        try:
+            with book, Display(sum(guesses.values()), budget) as self.display:
+                async with (
+                    open_teacher(self.cfg, book, self.seed, budget) as teacher,
+                    open_judge(self.cfg.judge, self.stage.path, self.seed) as self.judge,
+                ):
+                    teacher.kept.only = self.only
+                    await self._ask_all(allotted, teacher, asked.flights, guesses)
+        finally:
+            self._write_failures()
+        asked.flights.num_input -= self.num_flights_left
+        asked.unanswered, asked.num_flights_left, asked.stopped = self.unanswered, self.num_flights_left, self.stopped
+        return asked
+
+    async def _ask_all(self, allotted: list[Allotted], teacher: Teacher, tally: Tally, guesses: dict[str, int]) -> None:
+        """Keep `concurrency` requests in flight, whatever flight they belong to."""
+        running: set[asyncio.Task] = set()
+        flights_to_retry = None if self.only is None else {flight_of(sample_id) for sample_id in self.only}
+        try:
+            for flight in allotted:
+                if flight.part(self.stage.path).exists():
+                    tally.kept += 1
+                    self.display.skip(guesses[flight.name])
+                    continue
+                if self.stopped or (flights_to_retry is not None and flight.name not in flights_to_retry):
+                    self.num_flights_left += 1
+                    continue
+                running = await self._ask_flight(flight, teacher, tally, guesses[flight.name], running)
+            while running:
+                running = await _some_done(running)
+        finally:
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
+
+    async def _ask_flight(
+        self, allotted: Allotted, teacher: Teacher, tally: Tally, guessed: int, running: set[asyncio.Task]
+    ) -> set[asyncio.Task]:
+        flight = self.open[allotted.name] = _OpenFlight(allotted)
+        num_windows = 0
+        try:
+            for sample in allotted.samples(self.cfg):
+                num_windows += 1
+                flight.pending += 1
+                running.add(asyncio.create_task(self._one(flight, sample, teacher)))
+                if len(running) >= self.most_open:
+                    running = await _some_done(running)
+                if self.stopped:
+                    flight.has_gap = True
+                    break
+        except InputError as error:
+            self.failures.append({"id": allotted.name, "code": error.code, "message": str(error)})
+            tally.failed[error.code] = tally.failed.get(error.code, 0) + 1
+            log.error("caption: %s: %s", allotted.name, error)
+        else:
+            if num_windows:
+                tally.kept += 1
+            else:
+                tally.dropped["too_short"] = tally.dropped.get("too_short", 0) + 1
+        self.display.correct_total(guessed, num_windows if not self.stopped else guessed)
+        flight.is_read = True
+        self._close_if_done(flight)
+        return running
+
+    async def _one(self, flight: _OpenFlight, sample: Sample, teacher: Teacher) -> None:
+        sample_id = sample.observed.sample_id
+        try:
+            caption = await caption_window(sample, teacher, self.cfg, self.judge)
+        except BudgetSpent as error:
+            self.stopped = self.stopped or str(error)
+            self._leave_out(flight, {"id": sample_id, "code": "not_asked", "message": str(error)})
+        except NoAnswer as error:
+            failure = {"id": sample_id, "code": error.cause, "message": str(error)}
+            if error.cause == "not_asked":
+                self._leave_out(flight, failure)
+            else:
+                self._record_gap(flight, failure)
+        except CosflyError as error:
+            if error.fatal:
+                raise
+            self._record_gap(flight, {"id": sample_id, "code": error.code, "message": str(error)})
+        else:
+            flight.captions.append(caption)
+            self.quarantine.pop(sample_id, None)
+            self.failed_in_row = 0
+            self.display.finish(caption)
+        flight.pending -= 1
+        self._close_if_done(flight)
+
+    def _leave_out(self, flight: _OpenFlight, failure: dict) -> None:
+        flight.has_gap = True
+        self.unanswered.append(failure)
+
+    def _record_gap(self, flight: _OpenFlight, failure: dict) -> None:
+        self._leave_out(flight, failure)
+        self.quarantine[failure["id"]] = failure
+        self.display.miss()
+        self.failed_in_row += 1
+        if self.failed_in_row >= self.cfg.endpoint.stop_after_failures:
+            raise TeacherError(
+                f"{self.failed_in_row} windows in a row got no answer",
+                where=shown_url(self.cfg.teacher),
+                got=f"{common_causes(self.unanswered)}; the last: {failure['message']}",
+                fix="see to the server, then run the same command again: nothing answered is asked twice",
+            )
+
+    def _close_if_done(self, flight: _OpenFlight) -> None:
+        """Write a flight's part once its last window is done. One with a gap stays unfinished, for the next run."""
+        if not flight.is_read or flight.pending:
+            return
+        allotted = flight.allotted
+        del self.open[allotted.name]
+        gap = allotted.gap(self.stage.path)
+        if flight.captions:
+            flight.captions.sort(key=lambda caption: caption.frame_index)
+            write_captions(gap if flight.has_gap else allotted.part(self.stage.path), flight.captions)
+        if not flight.has_gap:
+            gap.unlink(missing_ok=True)
+        self.book.forget(allotted.name)
+
+    def _write_failures(self) -> None:
+        """Write what failed: flights and windows of this run, and the quarantine of all runs."""
+        windows = [failure for failure in self.unanswered if failure["code"] != "not_asked"]
+        for name, records in ((FAILURES, self.failures + windows), (QUARANTINE, list(self.quarantine.values()))):
+            write_bytes(self.stage.path / name, "".join(dump_json(record) + "\n" for record in records).encode())
+
+
+def open_teacher(
+    cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget
+) -> contextlib.AbstractAsyncContextManager[EndpointTeacher | VllmTeacher]:
+    """Make the teacher that the settings name; it is ready inside `async with`."""
+    if cfg.teacher.startswith(PREFIX):
+        return VllmTeacher(cfg, book, seed, budget)
+    return EndpointTeacher(cfg.teacher, cfg.endpoint, cfg.image, book, seed, budget)
+
+
+async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:
+    done, pending = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+    for task in done:
+        task.result()  # raises what ends the run
+    return pending
+
+
+def common_causes(failures: list[dict], most: int = 3) -> str:
+    """Give the most common causes with their counts."""
+    counts = Counter(failure["code"] for failure in failures)
+    ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+    return ", ".join(f"{cause} {count}" for cause, count in ordered[:most])
+
+
+def _read_quarantine(path: Path) -> dict[str, dict]:
+    if not path.exists():
+        return {}
+    with open(path, encoding="utf-8") as file:  # not splitlines(): a message may hold other line separators
+        records = [parse_json(line) for line in file]
+    return {record["id"]: record for record in records}

@@ -1,0 +1,166 @@
+"""`compare-strategies`: the four ways of re-generation on the same conflicts.
+
+Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. Nothing of it enters a
+data set. The distance of a repaired text from the first answer stands for naturalness: what a model says freely is
+natural, and the further a constraint moves it, the less it is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from dataclasses import asdict, dataclass
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import get_args
+
+from rich.table import Table
+
+from caption.run.asking import ANSWERS, open_teacher
+from caption.run.flights import allot, named_flights
+from caption.schema import CaptionConfig, Sample, Strategy
+from caption.teachers.answers import AnswerBook
+from caption.teachers.teacher import RuleTeacher, Teacher, first_budget
+from caption.window_loop import Trial, try_strategy
+from cosfly.chat.client import NoAnswer
+from cosfly.errors import InputError
+from cosfly.products.captions import Coc
+from cosfly.store import write_json
+
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+RESULT = "compare_strategies.json"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One strategy over all conflicts; means are over the conflicts, the distance over those repaired.
+
+    consistent: final decision equals the label. repaired: no longer rejected.
+    """
+
+    strategy: Strategy
+    num_conflicts: int
+    repaired: int
+    consistent: int
+    text_distance: float | None
+    asks_per_conflict: float
+    tokens_per_conflict: float
+
+
+def text_distance(one: Coc, two: Coc) -> float:
+    """Give 0 for the same words in the same order, 1 where no word is shared."""
+    a, b = (f"{coc.critical_components} {coc.reasoning_trace}".split() for coc in (one, two))
+    return 1.0 - SequenceMatcher(None, a, b, autojunk=False).ratio()
+
+
+def compare(strategy: Strategy, trials: list[Trial]) -> Comparison:
+    """Sum up the trials of one strategy."""
+    distances = [text_distance(trial.first, trial.last) for trial in trials if trial.last is not None]
+    count = max(1, len(trials))
+    return Comparison(
+        strategy=strategy,
+        num_conflicts=len(trials),
+        repaired=len(distances),
+        consistent=sum(trial.verdict == "CONSISTENT" for trial in trials if trial.last is not None),
+        text_distance=round(sum(distances) / len(distances), 3) if distances else None,
+        asks_per_conflict=round(sum(trial.asks for trial in trials) / count, 3),
+        tokens_per_conflict=round(sum(trial.tokens for trial in trials) / count, 1),
+    )
+
+
+def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:
+    """Find conflicts among the first answers and repair each by every strategy.
+
+    Args:
+        conflicts: stop looking after so many.
+    Raises:
+        InputError: no conflict was found. TeacherError: the endpoint cannot be used.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    found = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
+    num_windows, trials = found
+    if not trials[STRATEGIES[0]]:
+        raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
+    comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]
+    value = {
+        "schema": "cosfly.compare_strategies",
+        "schema_version": "1.0",
+        "teacher": "rules" if cfg.teacher == "rules" else "endpoint",
+        "windows": num_windows,
+        "strategies": [asdict(comparison) for comparison in comparisons],
+    }
+    write_json(out / RESULT, value)
+    return comparisons
+
+
+async def _try_all(
+    cfg: CaptionConfig, data: Path, out: Path, seed: int, most: int
+) -> tuple[int, dict[Strategy, list[Trial]]]:
+    trials: dict[Strategy, list[Trial]] = {strategy: [] for strategy in STRATEGIES}
+    num_windows = 0
+    async with _teacher(cfg, out, seed) as teacher:
+        for batch in _batches(_samples(cfg, data), 1 if cfg.teacher == "rules" else cfg.endpoint.concurrency):
+            num_windows += len(batch)
+            for tried in await asyncio.gather(*(_try_each(sample, teacher, cfg) for sample in batch)):
+                if tried is not None and len(trials[STRATEGIES[0]]) < most:
+                    for strategy in STRATEGIES:
+                        trials[strategy].append(tried[strategy])
+            if len(trials[STRATEGIES[0]]) >= most:
+                break
+    return num_windows, trials
+
+
+async def _try_each(sample: Sample, teacher: Teacher, cfg: CaptionConfig) -> dict[Strategy, Trial] | None:
+    """Give a trial per strategy; None where the first answer is no conflict or an answer is missing."""
+    found: dict[Strategy, Trial] = {}
+    for strategy in STRATEGIES:
+        try:
+            trial = await try_strategy(sample, teacher, cfg, strategy)
+        except NoAnswer:
+            return None
+        if trial is None:
+            return None
+        found[strategy] = trial
+    return found
+
+
+def _samples(cfg: CaptionConfig, data: Path) -> Iterable[Sample]:
+    for flight in allot(named_flights(data), cfg)[0]:
+        yield from (sample for sample in flight.samples(cfg) if sample.problem is None)
+
+
+def _batches(samples: Iterable[Sample], size: int) -> Iterable[list[Sample]]:
+    batch: list[Sample] = []
+    for sample in samples:
+        batch.append(sample)
+        if len(batch) == size:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+@asynccontextmanager
+async def _teacher(cfg: CaptionConfig, out: Path, seed: int) -> AsyncIterator[Teacher]:
+    if cfg.teacher == "rules":
+        yield RuleTeacher(seed)
+        return
+    with AnswerBook(out / ANSWERS, lambda flight: False) as book:  # the first answer is asked once for all strategies
+        budget = first_budget(cfg.budget, cfg.endpoint, cfg.image, book)
+        async with open_teacher(cfg, book, seed, budget) as teacher:
+            yield teacher
+
+
+def comparison_table(comparisons: list[Comparison]) -> Table:
+    """Give the comparison as a table for the terminal."""
+    table = Table(title=f"Re-generation of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
+    for column in ("strategy", "repaired", "consistent", "text distance", "asks each", "tokens each"):
+        table.add_column(column, justify="left" if column == "strategy" else "right", no_wrap=column == "strategy")
+    for c in comparisons:
+        share = f"{100 * c.consistent / c.num_conflicts:.1f} %"
+        distance = "-" if c.text_distance is None else f"{c.text_distance:.3f}"
+        table.add_row(
+            c.strategy, str(c.repaired), share, distance, f"{c.asks_per_conflict:.2f}", f"{c.tokens_per_conflict:.0f}"
+        )
+    return table

@@ -1,0 +1,109 @@
+"""The flights of a run: their names, their share of a limit, their windows, and their part files.
+
+A finished flight is a part file `parts/<name>.jsonl`. A flight that a limit cuts is `parts/<name>.<windows>.cut`, which another
+limit does not take for finished; one in which a window has no answer yet is `parts/<name>.gap`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from caption.schema import CaptionConfig, Sample, WindowConfig
+from caption.windows import current_frames, iterate_samples
+from cosfly.errors import InputError
+from cosfly.products.playback import find_flights, read_flight
+
+PARTS = "parts"
+
+
+@dataclass(frozen=True)
+class Allotted:
+    """A flight and what a run may take of it: `most` windows, or all (None)."""
+
+    name: str
+    folder: Path
+    most: int | None = None
+
+    def part(self, stage_path: Path) -> Path:
+        end = ".jsonl" if self.most is None else f".{self.most}.cut"
+        return stage_path / PARTS / f"{self.name}{end}"
+
+    def gap(self, stage_path: Path) -> Path:
+        return stage_path / PARTS / f"{self.name}.gap"
+
+    @property
+    def item_id(self) -> str:
+        return self.name if self.most is None else f"{self.name}[:{self.most}]"
+
+    def samples(self, cfg: CaptionConfig) -> Iterator[Sample]:
+        """Yield its windows in order of time.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        flight = read_flight(self.folder, strict=False)
+        for number, sample in enumerate(iterate_samples(flight, cfg.window, cfg.label)):
+            if number == self.most:
+                return
+            yield sample
+
+    def guess_num_windows(self, cfg: WindowConfig) -> int:
+        """Guess the number of windows from the frame folders, without reading the flight: for display and estimates."""
+        frames = self.folder / "frames_playback"
+        count = sum(1 for entry in frames.iterdir() if entry.name.startswith("frame_")) if frames.is_dir() else 0
+        count = len(current_frames(count, cfg))
+        return count if self.most is None else min(count, self.most)
+
+
+def named_flights(data: Path) -> list[tuple[str, Path]]:
+    """Give (flight id, folder) in the order of the product.
+
+    Raises:
+        InputError: two flights have one name, so their samples could not be told apart.
+    """
+    named: dict[str, Path] = {}
+    for folder in find_flights(data):
+        name = f"{folder.resolve().parent.name}_{folder.resolve().name}"
+        if name in named:
+            raise InputError(
+                "two flights of one name", where=data, got=f"{named[name]} and {folder}", fix="give the tree of one run"
+            )
+        named[name] = folder
+    return sorted(named.items(), key=lambda pair: f"{pair[0]}_frame_")  # the order of their sample ids
+
+
+def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[Allotted], bool]:
+    """Say which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any out."""
+    if cfg.limit is None:
+        return [Allotted(name, folder) for name, folder in flights], False
+    left = cfg.limit
+    allotted: list[Allotted] = []
+    for name, folder in flights:
+        try:
+            flight = read_flight(folder, strict=False)
+            count = sum(1 for _ in iterate_samples(flight, cfg.window, cfg.label))
+        except InputError:
+            count = 0  # the work itself records the failure
+        if left == 0 and count > 0:
+            return allotted, True
+        allotted.append(Allotted(name, folder, left if count > left else None))
+        if count > left:
+            return allotted, True
+        left -= count
+    return allotted, False
+
+
+def name_of_part(path: Path) -> str:
+    """Give the flight's name of a part file."""
+    return re.sub(r"(\.jsonl|\.gap|\.\d+\.cut)$", "", path.name)
+
+
+def parts_of(stage_path: Path, allotted: list[Allotted], with_gaps: bool) -> list[Path]:
+    """Give the part files of a run in the order of the product."""
+    found = [flight.part(stage_path) for flight in allotted]
+    if with_gaps:
+        found += [flight.gap(stage_path) for flight in allotted if not flight.part(stage_path).exists()]
+    return sorted((path for path in found if path.exists()), key=lambda path: f"{name_of_part(path)}_frame_")

@@ -1,0 +1,226 @@
+"""`cosfly caption --plan`: calls, tokens, time and money of a run, with a range, from a few trial windows.
+
+The trial windows are real ones, spread over the flights, asked exactly as the run will ask them; their answers stay in the
+journal, so the run does not ask them again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caption.run.asking import ANSWERS, open_teacher
+from caption.run.flights import Allotted, allot, named_flights
+from caption.run.progress import duration
+from caption.run.stage import open_stage
+from caption.schema import CaptionConfig, Sample
+from caption.teachers.answers import AnswerBook
+from caption.teachers.budget import BudgetSpent
+from caption.teachers.prompts import answer_schema, make_question
+from caption.teachers.teacher import EndpointTeacher, first_budget
+from caption.truth.facts import measure_facts
+from caption.window_loop import caption_window
+from cosfly.chat.client import NoAnswer
+from cosfly.errors import ConfigError, InputError, TeacherError
+from cosfly.products.captions import Caption
+from cosfly.stage_folder import Resume
+
+TRIAL_WINDOWS = 6
+CONFIDENCE = 0.9
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure of the whole run: expected, and a range that holds it with 90 % if the trial windows are like the others."""
+
+    low: float
+    expected: float
+    high: float
+
+    def scaled(self, factor: float) -> Estimate:
+        return Estimate(self.low * factor, self.expected * factor, self.high * factor)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will take. Cost is 0 where no price is set."""
+
+    num_windows: int  # to do, without those of finished flights
+    num_finished: int
+    num_trials: int
+    num_accepted_trials: int
+    calls: Estimate
+    prompt_tokens: Estimate
+    image_tokens: Estimate | None
+    completion_tokens: Estimate
+    cost: Estimate
+    seconds: Estimate
+    concurrency: int
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Give the table's rows."""
+        windows = f"about {self.num_windows:,} to do" + (f", {self.num_finished:,} done" if self.num_finished else "")
+        rows = [
+            ("windows", windows),
+            ("trial", f"{self.num_trials} windows, {self.num_accepted_trials} accepted; their answers are kept"),
+            ("calls", _count(self.calls)),
+            ("tokens in", _count(self.prompt_tokens)),
+            ("of these images", "unknown" if self.image_tokens is None else _count(self.image_tokens)),
+            ("tokens out", _count(self.completion_tokens)),
+        ]
+        cost = self.cost
+        priced = f"{cost.expected:,.2f} ({cost.low:,.2f} to {cost.high:,.2f})"
+        rows.append(("cost", priced if cost.expected > 0 else "set budget.price_prompt and budget.price_completion"))
+        seconds = self.seconds
+        low, expected, high = (duration(value) for value in (seconds.low, seconds.expected, seconds.high))
+        rows.append(("time", f"{expected} ({low} to {high}) with {self.concurrency} in flight"))
+        return rows
+
+
+def make_plan(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Plan:
+    """Estimate a run by asking about a few windows.
+
+    Raises:
+        ConfigError: the teacher is not an endpoint. InputError: no window. TeacherError: no trial window got an answer.
+    """
+    if not cfg.teacher.startswith("http"):
+        raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
+    stage = open_stage(cfg, data, out, seed, resume)
+    allotted, _ = allot(named_flights(data), cfg)
+    left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]
+    guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
+    num_windows = sum(guesses[flight.name] for flight in left)
+    samples = _trial_samples([flight for flight in left if guesses[flight.name]], guesses, cfg)
+    if not samples:
+        raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
+    trial = asyncio.run(_try(cfg, out, seed, samples))
+    return plan_from(trial, num_windows, sum(guesses.values()) - num_windows, cfg)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What the trial windows took, each in its own place of every list."""
+
+    captions: list[Caption]
+    seconds: list[float]
+    image_tokens: int | None  # of one question with all its pictures
+
+
+def plan_from(trial: Trial, num_windows: int, num_finished: int, cfg: CaptionConfig) -> Plan:
+    """Scale a trial to all windows."""
+    captions = trial.captions
+    prompt = estimate([caption.usage.get("prompt_tokens", 0) for caption in captions]).scaled(num_windows)
+    completion = estimate([caption.usage.get("completion_tokens", 0) for caption in captions]).scaled(num_windows)
+    # Every ask but the mirror's carries the pictures; a mirror is at least one ask of an answered window.
+    asks_with_pictures = [caption.attempts - (caption.zh is not None) for caption in captions]
+    pictures = (
+        None if trial.image_tokens is None else estimate(asks_with_pictures).scaled(trial.image_tokens * num_windows)
+    )
+    budget = cfg.budget
+    cost = Estimate(
+        *(
+            (getattr(prompt, which) * budget.price_prompt + getattr(completion, which) * budget.price_completion) / 1e6
+            for which in ("low", "expected", "high")
+        )
+    )
+    per_window = estimate(trial.seconds).scaled(num_windows)
+    in_flight = cfg.endpoint.concurrency
+    # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's windows.
+    seconds = Estimate(
+        per_window.low / in_flight, per_window.expected / in_flight, per_window.high / min(len(captions), in_flight)
+    )
+    return Plan(
+        num_windows=num_windows,
+        num_finished=num_finished,
+        num_trials=len(captions),
+        num_accepted_trials=sum(caption.status == "accepted" for caption in captions),
+        calls=estimate([caption.attempts for caption in captions]).scaled(num_windows),
+        prompt_tokens=prompt,
+        image_tokens=pictures,
+        completion_tokens=completion,
+        cost=cost,
+        seconds=seconds,
+        concurrency=in_flight,
+    )
+
+
+def estimate(values: Sequence[float]) -> Estimate:
+    """Give the mean and its Student confidence interval, not below 0; of one value the interval is 0 to twice the value."""
+    array = np.asarray(values, dtype=np.float64)
+    mean = float(array.mean())
+    if len(array) == 1:
+        return Estimate(0.0, mean, 2.0 * mean)
+    from scipy.stats import t  # slow to import, and needed here only
+
+    half = float(t.ppf((1 + CONFIDENCE) / 2, len(array) - 1) * array.std(ddof=1) / np.sqrt(len(array)))
+    return Estimate(max(0.0, mean - half), mean, mean + half)
+
+
+def _trial_samples(flights: list[Allotted], guesses: dict[str, int], cfg: CaptionConfig) -> list[Sample]:
+    """Take windows from flights spread over all, each from another part of its flight."""
+    count = min(TRIAL_WINDOWS, sum(guesses[flight.name] for flight in flights))
+    samples: dict[str, Sample] = {}
+    for number in range(count):
+        flight = flights[number * len(flights) // count]
+        position = min(guesses[flight.name] - 1, (2 * number + 1) * guesses[flight.name] // (2 * count))
+        try:
+            found = next(itertools.islice(flight.samples(cfg), position, None), None)
+        except InputError:
+            continue  # the run itself records it
+        if found is not None:
+            samples[found.observed.sample_id] = found
+    return list(samples.values())
+
+
+async def _try(cfg: CaptionConfig, out: Path, seed: int, samples: list[Sample]) -> Trial:
+    with AnswerBook(out / ANSWERS, lambda name: False) as book:
+        budget = first_budget(cfg.budget, cfg.endpoint, cfg.image, book)
+        async with open_teacher(cfg, book, seed, budget) as teacher:
+            assert isinstance(teacher, EndpointTeacher)
+            image_tokens = await _image_tokens(samples[0], teacher, cfg)
+            results = await asyncio.gather(*(_answered(sample, teacher, cfg) for sample in samples))
+        captions = [result for result in results if isinstance(result, Caption)]
+        seconds = [book.latency_s(caption.sample_id) for caption in captions]
+    if not captions:
+        raise TeacherError("no trial window got an answer", where=teacher.client.shown, got=str(results[0]))
+    return Trial(captions, seconds, image_tokens)
+
+
+async def _answered(sample: Sample, teacher: EndpointTeacher, cfg: CaptionConfig) -> Caption | str:
+    try:
+        return await caption_window(sample, teacher, cfg)
+    except (NoAnswer, BudgetSpent) as error:
+        return str(error)
+
+
+async def _image_tokens(sample: Sample, teacher: EndpointTeacher, cfg: CaptionConfig) -> int | None:
+    """Ask one prompt with and without its pictures, for one token each: the difference is theirs."""
+    question = make_question(sample.observed, measure_facts(sample.observed), cfg.image)
+    messages, _ = await teacher.frames.messages(question)
+    counts: list[int] = []
+    for asked in (messages, [_without_images(message) for message in messages]):
+        body = teacher.body("plan", "image_tokens", asked) | {"max_tokens": 1}
+        try:
+            found = await teacher.client.complete(body, answer_schema())
+        except NoAnswer:
+            return None
+        if "prompt_tokens" not in found["usage"]:
+            return None
+        counts.append(found["usage"]["prompt_tokens"])
+    return counts[0] - counts[1]
+
+
+def _without_images(message: dict) -> dict:
+    content = message["content"]
+    if isinstance(content, str):
+        return message
+    return message | {"content": [part for part in content if part["type"] != "image_url"]}
+
+
+def _count(value: Estimate) -> str:
+    return f"{value.expected:,.0f} ({value.low:,.0f} to {value.high:,.0f})"

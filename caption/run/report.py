@@ -1,0 +1,304 @@
+"""`report.html`: one self-contained page of a captioning run that a person can read. Made from the report's counts and some samples."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from caption.schema import BudgetConfig
+from cosfly.errors import InputError
+from cosfly.products.captions import ACTIONS, Caption, Coc
+from cosfly.products.frames import frame_name, read_rgb
+from cosfly.store import write_bytes
+
+PICTURE_WIDTH_PX = 240
+VERDICTS = {  # color, what it means
+    "CONSISTENT": ("#2f855a", "the decision is the label"),
+    "SOFT_CONFLICT": ("#d69e2e", "another decision, which the flight does not contradict"),
+    "HARD_CONFLICT": ("#c53030", "the flight contradicts the decision"),
+    "ABSTAIN": ("#718096", "geometry cannot tell"),
+}
+STYLE = """
+:root { --line: #e2e8f0; --soft: #4a5568; }
+* { box-sizing: border-box; }
+body { font: 15px/1.5 system-ui, "Segoe UI", "Noto Sans", "Noto Sans CJK SC", sans-serif; margin: 28px auto; padding: 0 20px;
+  max-width: 1340px; color: #1a202c; background: #f7fafc; }
+h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 19px; margin: 34px 0 8px; } h3 { font-size: 14px; margin: 0 0 6px; }
+p.lead { color: var(--soft); margin: 0 0 12px; max-width: 900px; } small, .small { color: #718096; font-size: 12.5px; }
+.note { border-left: 4px solid #d69e2e; background: #fffaf0; padding: 8px 12px; margin: 10px 0; max-width: 900px; }
+.tiles { display: flex; flex-wrap: wrap; gap: 12px; } .tile, .panel, .card { background: #fff; border: 1px solid var(--line);
+  border-radius: 8px; } .tile { padding: 10px 18px; min-width: 130px; } .tile b { display: block; font-size: 24px; line-height: 1.2;
+  font-variant-numeric: tabular-nums; } .panel { padding: 14px 18px; overflow-x: auto; }
+.grid { display: grid; grid-template-columns: repeat(auto-fit, minmax(310px, 1fr)); gap: 12px; }
+.stack { display: flex; height: 22px; border-radius: 4px; overflow: hidden; margin: 3px 0 10px; } .stack i { display: block; }
+.key { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin-right: 5px; }
+table { border-collapse: collapse; } th { text-align: left; font-weight: 600; color: var(--soft); } th, td { padding: 4px 12px 4px 0; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+table.confusion td { width: 46px; height: 30px; padding: 0; text-align: center; border: 1px solid #fff; font-size: 13px;
+  font-variant-numeric: tabular-nums; } table.confusion td.total { border: 0; color: var(--soft); padding-left: 8px; }
+table.confusion th.row { text-align: right; padding-right: 10px; white-space: nowrap; font-weight: 500; font-size: 13px; }
+table.confusion th.column { height: 170px; vertical-align: bottom; padding: 0 0 6px; text-align: left; font-weight: 500; font-size: 13px; }
+table.confusion th.column span { writing-mode: vertical-rl; transform: rotate(180deg); white-space: nowrap; margin-left: 12px; }
+table.confusion td.right { outline: 2px solid #2f855a; outline-offset: -2px; }
+.card { padding: 14px 16px; margin: 0 0 14px; } .card header { display: flex; flex-wrap: wrap; gap: 8px; align-items: center;
+  margin-bottom: 8px; } .card header b { margin-right: 6px; overflow-wrap: anywhere; }
+.tag { padding: 1px 9px; border-radius: 9px; color: #fff; font-size: 12px; font-weight: 600; } .tag.plain { background: #edf2f7; color: #2d3748; }
+.frames { display: grid; grid-template-columns: repeat(5, 1fr); gap: 6px; margin-bottom: 10px; } .frames figure { margin: 0; }
+.frames img { width: 100%; border-radius: 4px; display: block; } .frames figcaption { font-size: 12px; color: #718096; }
+.gone { aspect-ratio: 16 / 9; background: #edf2f7; color: #718096; display: grid; place-items: center; border-radius: 4px; font-size: 12px; }
+.texts { display: grid; grid-template-columns: 1fr 1fr; gap: 22px; } .texts p { margin: 0 0 6px; overflow-wrap: anywhere; }
+.texts .what { color: #718096; font-size: 12px; display: block; } .bad { color: #c53030; }
+"""
+DIFFERENT_TEACHER = (
+    "The rule teacher is a deterministic baseline: it looks at the flight data of five frames and at no picture. It is a "
+    "different teacher than the paper's, so these shares say nothing about the paper's 21.5 / 57.5 / 21.0 %."
+)
+
+
+def write_page(
+    path: Path, report: Mapping[str, Any], cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
+) -> None:
+    """Write the page.
+
+    Args:
+        report: `caption_report.json`. cards: captions to show. folders: flight id -> its folder, for the pictures.
+    """
+    write_bytes(path, page_html(report, cards, folders, budget).encode())
+
+
+def page_html(
+    report: Mapping[str, Any], cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
+) -> str:
+    """Give the page's text."""
+    teacher = report["teacher"]
+    who = f"teacher: {teacher.get('kind', 'none')}, model {teacher.get('model', 'unknown')}"
+    note = f'<p class="note">{escape(DIFFERENT_TEACHER)}</p>' if teacher.get("kind") == "rules" else ""
+    shown = "".join(_card(caption, folders) for caption in cards)
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>cosfly: captions</title><style>{STYLE}</style></head><body>
+<h1>Captions</h1>
+<p class="lead">{escape(who)}</p>
+{_tiles(report)}
+{note}
+<h2>Verdicts</h2>
+<div class="panel">{_verdicts(report)}</div>
+<h2>Label against the teacher's first decision</h2>
+<p class="lead">Rows: the decision that the real flight implies. Columns: what the teacher decided before any repair. Framed: agreement.</p>
+<div class="panel">{_confusion(report["confusion_label_to_first_decision"])}</div>
+<h2>Length of the texts</h2>
+<p class="lead">Accepted captions, characters.</p>
+<div class="grid">{_histograms(report["lengths"])}</div>
+<h2>Re-generation, checks and cost</h2>
+<div class="grid">{_repairs(report)}{_checks(report)}{_cost(report, budget)}</div>
+<h2>{len(cards)} samples</h2>
+<p class="lead">Chosen by the hash of their ids, the kinds of outcome taking turns. Frames are 0.5 s apart, the last one is the current.</p>
+{shown}
+</body></html>
+"""
+
+
+def _tiles(report: Mapping[str, Any]) -> str:
+    windows = report["windows"]
+    dropped, repaired = sum(windows["dropped"].values()), report["repair"]["rejected"]
+    values = [
+        ("windows", windows["input"]),
+        ("accepted", windows["kept"]),
+        ("dropped", dropped),
+        ("unanswered", sum(windows["failed"].values())),
+        ("asked for again", repaired),
+        ("asks in all", report["asks"]),
+    ]
+    keyframes = report.get("keyframes")
+    if keyframes:
+        values += [
+            ("calls saved by keyframes", keyframes["calls_saved"]),
+            ("changes missed", keyframes["changes_missed"]),
+        ]
+    return (
+        '<div class="tiles">' + "".join(f'<div class="tile"><b>{n:,}</b>{name}</div>' for name, n in values) + "</div>"
+    )
+
+
+def _verdicts(report: Mapping[str, Any]) -> str:
+    rows = []
+    for title, key in (("First answers", "verdicts_of_first_answers"), ("Accepted captions", "verdicts_of_accepted")):
+        counts = report[key]
+        total = sum(counts.values()) or 1
+        bars = "".join(
+            f'<i style="width:{100 * counts.get(name, 0) / total:.2f}%;background:{color}" title="{name}"></i>'
+            for name, (color, _) in VERDICTS.items()
+        )
+        rows.append(f'<h3>{title} ({sum(counts.values()):,})</h3><div class="stack">{bars}</div>')
+    first, last = report["verdicts_of_first_answers"], report["verdicts_of_accepted"]
+    lines = "".join(
+        f'<tr><td><span class="key" style="background:{color}"></span>{name}</td><td>{meaning}</td>'
+        f'<td class="n">{_share(first, name)}</td><td class="n">{_share(last, name)}</td></tr>'
+        for name, (color, meaning) in VERDICTS.items()
+    )
+    head = '<tr><th>verdict</th><th></th><th class="n">first answers</th><th class="n">accepted</th></tr>'
+    return f"{''.join(rows)}<table>{head}{lines}</table>"
+
+
+def _share(counts: Mapping[str, int], name: str) -> str:
+    total = sum(counts.values())
+    return f"{counts.get(name, 0):,} ({100 * counts.get(name, 0) / total:.1f} %)" if total else "&ndash;"
+
+
+def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
+    labels = [name for name in (*ACTIONS, "none") if name in confusion]
+    decisions = [name for name in ACTIONS if any(name in row for row in confusion.values())]
+    if not labels:
+        return "No answer."
+    head = "".join(f'<th class="column"><span>{_words(name)}</span></th>' for name in decisions)
+    rows = ""
+    for label in labels:
+        row, total = confusion[label], sum(confusion[label].values())
+        cells = ""
+        for decision in decisions:
+            count = row.get(decision, 0)
+            share = count / total
+            ink = "#fff" if share > 0.55 else "#1a202c"
+            mark = ' class="right"' if decision == label else ""
+            cells += f'<td{mark} style="background:rgba(43,108,176,{share:.2f});color:{ink}">{count or ""}</td>'
+        rows += f'<tr><th class="row">{_words(label)}</th>{cells}<td class="total">{total:,}</td></tr>'
+    return f'<table class="confusion"><tr><th></th>{head}<th></th></tr>{rows}</table>'
+
+
+def _words(token: str) -> str:
+    return escape(token.replace("_", " "))
+
+
+def _histograms(lengths: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    languages = {"en": "English", "zh": "Chinese"}
+    return "".join(
+        f'<div class="panel"><h3>{languages[language]}, {_words(field)}</h3>{_histogram(histogram)}</div>'
+        for language, fields in lengths.items()
+        for field, histogram in fields.items()
+    )
+
+
+def _histogram(histogram: Mapping[str, Any]) -> str:
+    counts, width = histogram["counts"], histogram["bin_characters"]
+    total = sum(counts)
+    if not total:
+        return "No text."
+    first = next(i for i, count in enumerate(counts) if count)
+    shown = counts[first:]
+    # Never fewer than eight bins, else a single one fills the picture.
+    step = 280.0 / max(8, len(shown))
+    bars = "".join(
+        f'<rect x="{i * step:.1f}" y="{100 - 92 * count / max(shown):.1f}" width="{max(1.0, step - 1.5):.1f}" '
+        f'height="{92 * count / max(shown):.1f}" fill="#2b6cb0"><title>{(first + i) * width}&ndash;{(first + i + 1) * width - 1} '
+        f"characters: {count}</title></rect>"
+        for i, count in enumerate(shown)
+    )
+    end_x = len(shown) * step
+    labels = f'<text x="0" y="115">{first * width}</text><text x="{end_x:.0f}" y="115" text-anchor="end">{len(counts) * width}</text>'
+    middle = next(i for i in range(len(counts)) if 2 * sum(counts[: i + 1]) >= total)
+    return (
+        f'<svg viewBox="0 0 280 120" width="100%" font-size="11" fill="#4a5568"><line x1="0" y1="100" x2="280" y2="100" '
+        f'stroke="#cbd5e0"/>{bars}{labels}</svg><div class="small">{total:,} texts, median {middle * width} to '
+        f"{(middle + 1) * width - 1}</div>"
+    )
+
+
+def _table(title: str, rows: Sequence[tuple[str, str]], nothing: str) -> str:
+    lines = "".join(f'<tr><td>{escape(name)}</td><td class="n">{escape(value)}</td></tr>' for name, value in rows)
+    return f'<div class="panel"><h3>{title}</h3>{f"<table>{lines}</table>" if rows else escape(nothing)}</div>'
+
+
+def _repairs(report: Mapping[str, Any]) -> str:
+    repair = report["repair"]
+    rows = [
+        (f"{strategy}: {outcome.replace('_', ' ')}", f"{count:,}")
+        for strategy, outcomes in repair["outcomes_by_strategy"].items()
+        for outcome, count in outcomes.items()
+    ]
+    rows += [(f"after {asks} more ask{'s' if asks != '1' else ''}", f"{n:,}") for asks, n in repair["asks"].items()]
+    judged = [(f"judge: {name.replace('_', ' ')}", f"{n:,}") for name, n in report["judgements"].items()]
+    return _table("Re-generation, by strategy and outcome", rows + judged, "No answer was rejected.")
+
+
+def _checks(report: Mapping[str, Any]) -> str:
+    rows = [(f"dropped: {reason}", f"{count:,}") for reason, count in report["windows"]["dropped"].items()]
+    rows += [(f"languages: {name}", f"{count:,}") for name, count in report["bilingual"].items()]
+    rows += [(f"evidence: {name}", f"{count:,}") for name, count in report["evidence_contradictions"].items()]
+    rows += [(f"mended: {name.replace('_', ' ')}", f"{count:,}") for name, count in report["recovered"].items()]
+    return _table("Checks", rows, "Nothing was checked.")
+
+
+def _cost(report: Mapping[str, Any], budget: BudgetConfig) -> str:
+    prompt, answer = (report["tokens"].get(name, 0) for name in ("prompt_tokens", "completion_tokens"))
+    accepted = report["windows"]["kept"]
+    rows = [("prompt tokens", f"{prompt:,}"), ("answer tokens", f"{answer:,}")]
+    if accepted:
+        rows.append(("tokens per accepted caption", f"{(prompt + answer) / accepted:,.0f}"))
+    cost = (prompt * budget.price_prompt + answer * budget.price_completion) / 1e6
+    priced = bool(budget.price_prompt or budget.price_completion)
+    rows.append(("cost", f"{cost:,.2f}" if priced else "no prices set"))
+    if priced and accepted:
+        rows.append(("cost per 1,000 accepted", f"{1000 * cost / accepted:,.2f}"))
+    return _table("Tokens and cost", rows, "")
+
+
+# --- cards ------------------------------------------------------------------------------------------------------------
+
+
+def _card(caption: Caption, folders: Mapping[str, Path]) -> str:
+    tags = []
+    if caption.verdict:
+        tags.append(f'<span class="tag" style="background:{VERDICTS[caption.verdict][0]}">{caption.verdict}</span>')
+    tags.append(f'<span class="tag plain">label: {_words(caption.label or "none")}</span>')
+    if caption.repair:
+        rung = caption.repair["rung"] or caption.repair["outcome"]
+        first = f"{caption.repair['first_decision']} ({caption.repair['first_verdict']})"
+        tags.append(f'<span class="tag plain">re-generated ({_words(rung)}); first: {_words(first)}</span>')
+    if caption.judge:
+        tags.append(f'<span class="tag plain">judge: {_words(caption.judge["verdict"])}</span>')
+    if caption.status == "dropped":
+        tags.append(f'<span class="tag" style="background:#c53030">dropped: {_words(str(caption.drop_reason))}</span>')
+    folder = folders.get(f"{caption.trajectory}_{caption.variant}")
+    pictures = "".join(_picture(folder, index) for index in caption.window[-5:])
+    problems = caption.checks.get("evidence")
+    found = "" if not isinstance(problems, list) else "".join(f'<p class="bad">{escape(p)}</p>' for p in problems)
+    return (
+        f'<article class="card"><header><b>{escape(caption.sample_id)}</b>{"".join(tags)}</header>'
+        f'<div class="frames">{pictures}</div>'
+        f'<div class="texts">{_text(caption.en, "English", "en")}{_text(caption.zh, "中文", "zh-CN")}</div>{found}</article>'
+    )
+
+
+def _picture(folder: Path | None, index: int) -> str:
+    shown = None
+    if folder is not None:
+        try:
+            rgb = read_rgb(folder / frame_name(index))
+        except InputError:
+            pass
+        else:
+            size = (PICTURE_WIDTH_PX, max(1, round(PICTURE_WIDTH_PX * rgb.shape[0] / rgb.shape[1])))
+            small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+            done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])
+            shown = base64.b64encode(data.tobytes()).decode("ascii") if done else None
+    image = (
+        f'<img alt="frame {index}" src="data:image/jpeg;base64,{shown}">'
+        if shown
+        else '<div class="gone">no picture</div>'
+    )
+    return f"<figure>{image}<figcaption>frame {index}</figcaption></figure>"
+
+
+def _text(coc: Coc | None, language: str, code: str) -> str:
+    if coc is None:
+        return f'<div><span class="what">{language}</span><p>&ndash;</p></div>'
+    return (
+        f'<div lang="{code}"><span class="what">{language}: critical components</span><p>{escape(coc.critical_components)}</p>'
+        f'<span class="what">reasoning</span><p>{escape(coc.reasoning_trace)}</p>'
+        f'<span class="what">decision</span><p><code>{escape(coc.flight_decision)}</code></p></div>'
+    )

@@ -1,0 +1,203 @@
+"""Stage `caption`: reads a playback tree, writes `captions.jsonl` and `caption_report.json`.
+
+The rule teacher works on flights in processes; a teacher that takes its time is asked from one process (asking.py). Each
+finished flight is a part file; the parts are merged last, so that memory stays flat.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from caption.run.asking import ANSWERS, Asked, Asking, common_causes
+from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of
+from caption.run.ledger import Ledger
+from caption.run.report import write_page
+from caption.schema import CaptionConfig
+from caption.teachers.teacher import RuleTeacher, Teacher, shown_url
+from caption.truth.judge import open_judge
+from caption.window_loop import caption_window
+from cosfly.errors import ConfigError, InputError, TeacherError
+from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
+from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_json
+
+log = logging.getLogger(__name__)
+
+PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
+# Settings that change how a teacher is asked, not what is asked: a run may be continued with others.
+MANNERS = (
+    "concurrency", "timeout_s", "total_timeout_s", "max_tries", "backoff_s", "max_backoff_s", "stop_after_failures",
+    "image_uuid",
+)  # fmt: skip
+
+
+def run(
+    cfg: CaptionConfig,
+    data: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    resume: Resume = "if-same",
+    retry_failed: bool = False,
+) -> Path:
+    """Caption the flights of a playback tree.
+
+    Args:
+        data: playback tree, ours or of the public layout.
+        workers: processes of the rule teacher; an endpoint's requests in flight are `endpoint.concurrency`.
+        retry_failed: ask only about the windows that stand in `quarantine.jsonl`.
+    Returns:
+        `captions.jsonl`.
+    Raises:
+        InputError: no flight, or no flight that is long enough.
+        TeacherError: the endpoint cannot be used, a budget is used up, or windows stayed without an answer; what was
+            answered is kept.
+    """
+    stage = open_stage(cfg, data, out, seed, resume)
+    if stage.is_complete and not _has_more(stage, cfg):
+        return out / PRODUCT
+    allotted, is_cut = allot(named_flights(data), cfg)
+    if cfg.teacher == "rules":
+        if retry_failed:
+            raise ConfigError("the rule teacher never fails to answer", where="--retry-failed", fix="give --teacher")
+        asked = Asked(_run_rules(stage, allotted, cfg, seed, workers))
+    else:
+        asked = asyncio.run(Asking(stage, cfg, seed, retry_failed=retry_failed).run(allotted))
+    ledger = _merge(stage, allotted, with_gaps=bool(asked.unanswered))
+    tally = ledger.tally(len(asked.unanswered))
+    is_whole = not (asked.unanswered or asked.num_flights_left)
+    if tally.num_input == 0 and is_whole:
+        _complain_of_nothing(stage, cfg, data, asked.flights)
+    report = ledger.report(asked.flights, tally)
+    write_json(stage.path / REPORT, report)
+    folders = {flight.name: flight.folder for flight in allotted}
+    write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
+    if not is_whole:
+        _tell_what_is_left(cfg, asked, tally)
+        return out / PRODUCT
+    outputs = [path for path in (out / PRODUCT, out / REPORT, out / PAGE, out / ANSWERS) if path.exists()]
+    stage.finish(outputs, tally, flights=asked.flights.as_dict(), limit=cfg.limit if is_cut else None)
+    if not is_cut:
+        shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
+    return out / PRODUCT
+
+
+def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
+    """Open the stage's folder for these settings.
+
+    Raises:
+        ResumeError: it holds work made with another prompt, model or input; names what differs.
+    """
+    return StageFolder.open(out, "caption", config=_recorded(cfg), inputs={"data": data}, seed=seed, resume=resume)
+
+
+def _recorded(cfg: CaptionConfig) -> dict:
+    """Give the settings that decide what is asked: not the endpoint's address, which may hold a password, manners, limits."""
+    config = cfg.model_dump(mode="json")
+    config["teacher"] = (
+        cfg.teacher if cfg.teacher == "rules" else "vllm" if cfg.teacher.startswith("vllm:") else "endpoint"
+    )
+    config["endpoint"] = {name: value for name, value in config["endpoint"].items() if name not in MANNERS}
+    for name in ("limit", "budget", "vllm"):
+        del config[name]
+    judge = {name: value for name, value in config["judge"].items() if name not in (*MANNERS, "open_flights")}
+    config["judge"] = judge | {"url": None if cfg.judge.url is None else "endpoint"}
+    return config
+
+
+def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
+    """Tell whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
+    limit = stage.manifest().get("limit")
+    if limit is None or (cfg.limit is not None and cfg.limit <= limit):
+        return False
+    (stage.path / "manifest.json").unlink()
+    return True
+
+
+def _complain_of_nothing(stage: StageFolder, cfg: CaptionConfig, data: Path, flights: Tally) -> None:
+    failures = (stage.path / "failures.jsonl").read_text(encoding="utf-8").splitlines()
+    raise InputError(
+        "no window to caption",
+        where=data,
+        got=f"flights: {flights}" + (f", first failure {failures[0]}" if failures else ""),
+        expected=f"a flight of at least {cfg.window.num_frames + cfg.window.future_frames} frames",
+    )
+
+
+def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
+    """Say why the product is not whole.
+
+    Raises:
+        TeacherError: a budget is used up, or windows got no answer.
+    """
+    missed = [failure for failure in asked.unanswered if failure["code"] != "not_asked"]
+    if asked.stopped:
+        raise TeacherError(
+            "stopped before the budget was passed",
+            where=shown_url(cfg.teacher),
+            got=f"{asked.stopped}; {tally.kept} windows accepted so far",
+            fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
+        )
+    if missed:
+        raise TeacherError(
+            f"{len(missed)} of {tally.num_input} windows got no answer",
+            where=shown_url(cfg.teacher),
+            got=common_causes(missed),
+            fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
+        )
+    log.info("caption: all of the quarantine has its answer; run again without --retry-failed for what was never asked")
+
+
+# --- rules ------------------------------------------------------------------------------------------------------------
+
+
+def _run_rules(stage: StageFolder, allotted: list[Allotted], cfg: CaptionConfig, seed: int, workers: int) -> Tally:
+    items = [Item(flight.item_id, flight) for flight in allotted]
+    args = (cfg, stage.path, seed)
+    return run_items(stage, items, start_rules, args, workers=workers, label="caption").tally
+
+
+def start_rules(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
+    """Worker factory of run_items: one item is one flight."""
+    teacher = RuleTeacher(seed)
+
+    def work(item: Item) -> Outcome:
+        flight: Allotted = item.payload
+        num_windows = asyncio.run(_caption_in_order(flight, teacher, cfg, stage_path, seed))
+        if num_windows == 0:
+            return Outcome({}, drop_reason="too_short")
+        return Outcome({"windows": num_windows})
+
+    return work
+
+
+async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path, seed: int) -> int:
+    async with open_judge(cfg.judge, stage_path, seed) as judge:
+        captions = [await caption_window(sample, teacher, cfg, judge) for sample in flight.samples(cfg)]
+    if captions:
+        write_captions(flight.part(stage_path), captions)
+    return len(captions)
+
+
+# --- the product ------------------------------------------------------------------------------------------------------
+
+
+def _merge(stage: StageFolder, allotted: list[Allotted], *, with_gaps: bool) -> Ledger:
+    """Join the parts to `captions.jsonl`, one at a time, and count on the way."""
+    ledger = Ledger()
+    parts = parts_of(stage.path, allotted, with_gaps)
+
+    def lines() -> Iterator[str]:
+        for part in parts:
+            for line, caption in caption_lines(part):
+                ledger.add(caption)
+                yield line
+
+    write_caption_lines(stage.path / PRODUCT, lines())
+    return ledger

@@ -1,0 +1,322 @@
+"""`cosfly caption doctor URL`: what an endpoint can really do, found by trying, before a run pays for it.
+
+Servers answer 200 to much that they ignore: a schema, images, a limit. Each check therefore asks for something whose effect shows
+in the answer or in the token count.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import httpx
+import numpy as np
+
+from caption.schema import CaptionConfig, ObservedWindow
+from caption.teachers.images import MODALITY_FILES
+from caption.teachers.prompts import answer_schema, make_question, system_prompt
+from caption.truth.facts import measure_facts
+from cosfly.chat.client import RETRIED_STATUS, ChatClient
+from cosfly.chat.protocol import response_format
+from cosfly.errors import TeacherError
+from cosfly.products.captions import parse_answer
+from cosfly.store import parse_json
+
+State = Literal["ok", "warning", "unusable"]
+
+TRIES = 3
+ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
+NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table. `unusable`: captioning cannot work; `warning`: it can, and what to know."""
+
+    name: str
+    state: State
+    detail: str
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What one request gave: `value` is the decoded body of a 200, else None and `detail` tells why."""
+
+    status: int
+    value: dict[str, Any] | None
+    detail: str
+    seconds: float
+
+    @property
+    def _choice(self) -> dict:
+        choices = (self.value or {}).get("choices")
+        first = choices[0] if isinstance(choices, list) and choices else {}
+        return first if isinstance(first, dict) else {}
+
+    @property
+    def message(self) -> dict:
+        message = self._choice.get("message")
+        return message if isinstance(message, dict) else {}
+
+    @property
+    def text(self) -> str:
+        content = self.message.get("content")
+        return content if isinstance(content, str) else ""
+
+    @property
+    def finish_reason(self) -> str | None:
+        return self._choice.get("finish_reason")
+
+    @property
+    def prompt_tokens(self) -> int | None:
+        usage = (self.value or {}).get("usage")
+        count = usage.get("prompt_tokens") if isinstance(usage, dict) else None
+        return count if type(count) is int else None
+
+
+def examine_endpoint(url: str, cfg: CaptionConfig) -> list[Finding]:
+    """Try an endpoint. It is usable if no finding is `unusable`."""
+    return asyncio.run(_Examination(url, cfg).run())
+
+
+class _Examination:
+    def __init__(self, url: str, cfg: CaptionConfig) -> None:
+        self.cfg = cfg
+        self.client = ChatClient(url, cfg.endpoint)
+        self.model = ""
+        self.findings: list[Finding] = []
+        self.tokens_per_image: int | None = None
+        frames = cfg.window.num_frames
+        self.num_images = frames if cfg.image.layout == "tiled" else frames * len(cfg.image.modalities)
+
+    async def run(self) -> list[Finding]:
+        try:
+            self.model = await self.client.find_model()
+        except TeacherError as error:
+            return [Finding("model", "unusable", str(error))]
+        else:
+            self._add("model", "ok", self.model)
+            if await self._text():
+                await self._cut()
+                await self._schema()
+                if await self._image() and await self._many_images():
+                    await self._largest_prompt()
+        finally:
+            await self.client.aclose()
+        return self.findings
+
+    def _add(self, name: str, state: State, detail: str) -> None:
+        self.findings.append(Finding(name, state, detail))
+
+    async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Probe:
+        body: dict[str, Any] = {"model": self.model, "messages": messages, "temperature": 0.0, "max_tokens": max_tokens}
+        body |= self.cfg.endpoint.extra_body
+        if schema is not None:
+            body["response_format"] = response_format(schema)
+        probe = Probe(0, None, "", 0.0)
+        for attempt in range(TRIES):
+            start_s = time.monotonic()
+            try:
+                response = await self.client.send(body)
+            except (TimeoutError, httpx.HTTPError) as error:
+                probe = Probe(0, None, self.client.clean(f"{type(error).__name__} {error}"), time.monotonic() - start_s)
+            else:
+                probe = _read(response, self.client, time.monotonic() - start_s)
+                if response.status_code not in RETRIED_STATUS:
+                    return probe
+            if attempt + 1 < TRIES:
+                await asyncio.sleep(self.cfg.endpoint.backoff_s)
+        return probe
+
+    # --- the checks, in order ---
+
+    async def _text(self) -> bool:
+        probe = await self._ask([_user("Reply with the one word: ready")], self.cfg.endpoint.max_tokens)
+        if probe.value is None or not (probe.text or probe.message):
+            self._add("answers", "unusable", probe.detail or "no message in the answer")
+            return False
+        self._add("answers", "ok", f"in {probe.seconds:.1f} s: {probe.text.strip()[:40]!r}")
+        counted = probe.prompt_tokens is not None
+        detail = (
+            "reported"
+            if counted
+            else "not reported: --max-cost and --max-tokens cannot be kept, --plan knows no tokens"
+        )
+        self._add("token usage", "ok" if counted else "warning", detail)
+        thoughts = probe.message.get("reasoning_content") or probe.message.get("reasoning") or ""
+        if thoughts or "<think" in probe.text:
+            detail = (
+                f"on: {len(thoughts) or len(probe.text)} characters before the answer; switch it off: {NO_THINKING}"
+            )
+            self._add("thinking", "warning", detail)
+        else:
+            self._add("thinking", "ok", "off")
+        return True
+
+    async def _cut(self) -> None:
+        probe = await self._ask([_user("Write the numbers from one to two hundred in words.")], 8)
+        state: State = "ok" if probe.finish_reason == "length" else "warning"
+        detail = repr(probe.finish_reason) if probe.value is not None else probe.detail
+        text = f"an answer cut at 8 tokens says {detail}"
+        self._add(
+            "finish reason", state, text if state == "ok" else f"{text}, not 'length': cut answers count as broken"
+        )
+
+    async def _schema(self) -> None:
+        schema = {
+            "type": "object",
+            "properties": {"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}},
+            "required": ["animal", "legs"],
+            "additionalProperties": False,
+        }
+        probe = await self._ask([_user("Hello! How are you today?")], 256, schema)
+        if probe.value is None:
+            self._add("JSON schema", "warning", f"refused ({probe.detail}); answers are parsed from plain text")
+            return
+        try:
+            is_applied = parse_json(probe.text) == {"animal": ODD_WORD, "legs": 7}
+        except ValueError:
+            is_applied = False
+        if is_applied:
+            self._add("JSON schema", "ok", "applied: the answer had a shape that the model would not choose")
+            return
+        self._add(
+            "JSON schema",
+            "warning",
+            f"accepted and ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text.strip()[:40]!r}; answers are parsed "
+            "from plain text, an anchored decision is not enforced",
+        )
+
+    async def _image(self) -> bool:
+        question = "What colour is the image? One word."
+        with_image = await self._ask([_user(question, self._pictures(1))], 32)
+        if with_image.value is None:
+            self._add("image input", "unusable", f"refused: {with_image.detail}")
+            return False
+        without = await self._ask([_user(question)], 32)
+        if with_image.prompt_tokens is None or without.prompt_tokens is None:
+            self._add("image input", "warning", "accepted; whether it was looked at cannot be told without token usage")
+            return True
+        self.tokens_per_image = with_image.prompt_tokens - without.prompt_tokens
+        if self.tokens_per_image <= 0:
+            self._add("image input", "unusable", "accepted and ignored: the prompt did not grow by a token")
+            return False
+        side = self.cfg.image.max_side_px
+        self._add("image input", "ok", f"{self.tokens_per_image} tokens for one of {side}x{side * 9 // 16}")
+        return True
+
+    async def _many_images(self) -> bool:
+        """Find how many images a prompt may hold, up to what we send."""
+        low, high = 1, self.num_images + 1  # low works, high does not
+        tried, refusal, dropped = self.num_images, "", ""
+        while high - low > 1:
+            probe = await self._ask([_user("Reply with the one word: ready", self._pictures(tried))], 8)
+            if probe.value is not None:
+                low, dropped = tried, self._dropped(probe, tried)
+            else:
+                high, refusal = tried, probe.detail
+            tried = (low + high) // 2
+        if low >= self.num_images:
+            detail = dropped or f"{low}, as many as our prompts hold"
+            self._add("images per prompt", "warning" if dropped else "ok", detail)
+            return True
+        self._add(
+            "images per prompt",
+            "unusable",
+            f"{low}, our prompts hold {self.num_images} ({refusal}); raise the server's limit (vLLM: --limit-mm-per-prompt "
+            f"'{{\"image\": {self.num_images}}}'), or set image.layout=tiled or fewer image.modalities",
+        )
+        return False
+
+    def _dropped(self, probe: Probe, count: int) -> str:
+        """Some servers drop images beyond a limit in silence: the token count shows it. Gives the finding, or ""."""
+        if self.tokens_per_image and probe.prompt_tokens and probe.prompt_tokens < 0.8 * count * self.tokens_per_image:
+            return f"{count} images took {probe.prompt_tokens} tokens, one takes {self.tokens_per_image}: some were dropped"
+        return ""
+
+    async def _largest_prompt(self) -> None:
+        """Send a prompt as long as ours get, with our answer limit and schema."""
+        limit = self.cfg.endpoint.max_tokens
+        messages = largest_messages(self.cfg, self._pictures(self.num_images))
+        probe = await self._ask(messages, limit, answer_schema() if self.cfg.endpoint.json_schema else None)
+        length = self.client.model_entry.get("max_model_len")
+        known = f" of {length} that the model holds" if isinstance(length, int) else ""
+        if probe.value is None:
+            self._add("largest prompt", "unusable", f"with {limit} tokens for the answer{known}: {probe.detail}")
+            return
+        used = probe.prompt_tokens
+        if isinstance(length, int) and used is not None and used + limit > length:
+            self._add("largest prompt", "unusable", f"{used} tokens and {limit} for the answer, more than {length}")
+            return
+        self._add("largest prompt", "ok", f"{used or 'unknown'} tokens and {limit} for the answer{known}")
+        parsed = parse_answer(probe.text)
+        state: State = "ok" if parsed.coc is not None else "warning"
+        mended = f", after mending {', '.join(parsed.recovered)}" if parsed.recovered else ""
+        detail = f"{parsed.reason or 'of the right structure'}{mended}; {probe.seconds:.1f} s, {probe.finish_reason!r}"
+        self._add("answer to it", state, detail)
+
+    def _pictures(self, count: int) -> list[dict]:
+        """Make pictures of our size, each different, so that a cache does not answer for them."""
+        side = self.cfg.image.max_side_px
+        width = side * (len(self.cfg.image.modalities) if self.cfg.image.layout == "tiled" else 1)
+        return [_picture(width, side * 9 // 16, number) for number in range(count)]
+
+
+def largest_messages(cfg: CaptionConfig, pictures: list[dict]) -> list[dict]:
+    """Give messages as long as ours get: a made-up window whose numbers have many digits."""
+    count = cfg.window.num_frames
+    far = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
+    window = ObservedWindow(
+        sample_id="doctor_ORI_frame_00004",
+        town="doctor",
+        trajectory="doctor",
+        variant="ORI",
+        indices=tuple(range(count)),
+        width_px=1280,
+        height_px=720,
+        time_s=0.5 * np.arange(count),
+        positions_m=far,
+        rotations_deg=np.tile([-123.4, -123.4, -123.4], (count, 1)),
+        targets_m=far + 100.0,
+        target_uv=np.tile([1234.5, 654.3], (count, 1)),
+        target_bbox=np.tile([1200.0, 600.0, 1260.0, 700.0], (count, 1)),
+        target_depth_m=np.full(count, 123.4),
+        in_view=np.ones(count, bool),
+        visible=np.ones(count, bool),
+        visibility=np.full(count, 0.5),
+        frame_folders=tuple(Path(f"frame_{i:05d}") for i in range(count)),
+        frame_files=tuple(frozenset(MODALITY_FILES.values()) for _ in range(count)),
+    )
+    question = make_question(window, measure_facts(window), cfg.image)
+    content = [*pictures, {"type": "text", "text": question.prompts["en"].user}]
+    return [{"role": "system", "content": system_prompt("en")}, {"role": "user", "content": content}]
+
+
+def _user(text: str, pictures: list[dict] | None = None) -> dict:
+    return {"role": "user", "content": [*pictures, {"type": "text", "text": text}] if pictures else text}
+
+
+def _picture(width: int, height: int, number: int) -> dict:
+    image = np.full((height, width, 3), (40, 40, 200), np.uint8)
+    cv2.putText(image, str(number), (width // 8, height // 2), cv2.FONT_HERSHEY_SIMPLEX, 2.0, (255, 255, 255), 3)
+    done, data = cv2.imencode(".jpg", image)
+    assert done
+    url = f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+    return {"type": "image_url", "image_url": {"url": url}}
+
+
+def _read(response: httpx.Response, client: ChatClient, seconds: float) -> Probe:
+    if response.status_code != 200:
+        return Probe(response.status_code, None, f"HTTP {response.status_code} {client.detail(response)}", seconds)
+    try:
+        value = parse_json(response.content)
+    except ValueError:
+        return Probe(200, None, "the body is not JSON", seconds)
+    if not isinstance(value, dict):
+        return Probe(200, None, "the body is not a JSON object", seconds)
+    return Probe(200, value, "", seconds)

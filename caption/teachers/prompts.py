@@ -1,0 +1,229 @@
+"""Prompts: versioned text files filled with the facts of one observed window, and the pictures that go with them.
+
+Nothing here takes the future. The files are `prompts/*.txt`; their first line is a version, and every caption records the
+hash of what was asked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from string import Template
+
+from caption.schema import ImageConfig, Modality, ObservedWindow
+from caption.teachers.images import EncodedImage, FrameEncoder, available_modalities
+from caption.truth.facts import Facts
+from caption.truth.glossary import load_glossary
+from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, Prompt
+from cosfly.store import dump_json
+
+PROMPTS = Path(__file__).with_name("prompts")
+
+_MODALITY_WORDS: dict[Language, dict[Modality, str]] = {
+    "en": {
+        "rgb": "RGB",
+        "depth": "depth in pseudo-colour (bright is near, dark is far)",
+        "segmentation": "segmentation with the pedestrian in red",
+    },
+    "zh": {"rgb": "RGB 图像", "depth": "深度伪彩色图（亮为近，暗为远）", "segmentation": "分割图（行人标为红色）"},
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a teacher is asked about one window: the facts for those who compute, prompts and pictures for those who look.
+
+    decision: None for a free answer, else the decision that the answer must hold (anchored). rejected: the decision of an
+    earlier answer that did not fit, named as a hint. ask: counts the asks of the
+    same kind, so that each has its own sampling seed and journal key.
+    """
+
+    window: ObservedWindow
+    facts: Facts
+    prompts: dict[Language, Prompt]
+    modalities: tuple[Modality, ...]
+    decision: str | None = None
+    rejected: str | None = None
+    ask: int = 0
+
+    @property
+    def purpose(self) -> str:
+        """A name of this ask, stable between runs and unlike any other of its window."""
+        kind = self.decision or (f"hint_{self.rejected}" if self.rejected else "free")
+        return f"{kind}/{self.ask}"
+
+
+@cache
+def read_prompt(name: str) -> Template:
+    """Read `prompts/<name>.txt` without its version line."""
+    text = (PROMPTS / f"{name}.txt").read_text(encoding="utf-8")
+    version, _, body = text.partition("\n")
+    assert version.startswith("# version: "), f"{name}.txt lacks its version line"
+    return Template(body.rstrip("\n"))
+
+
+@cache
+def system_prompt(language: Language) -> str:
+    return read_prompt(f"system_{language}").substitute(actions=", ".join(ACTIONS))
+
+
+@cache
+def anchored_prompt(decision: str) -> str:
+    """Give the English system prompt with a decision as a hard constraint (the anchored strategy of sec:appendix_e)."""
+    words = load_glossary().actions[decision]["en"]
+    return system_prompt("en") + "\n" + read_prompt("anchored_en").substitute(decision=decision, decision_words=words)
+
+
+def build_prompts(
+    window: ObservedWindow, facts: Facts, modalities: tuple[Modality, ...], layout: str
+) -> dict[Language, Prompt]:
+    """Write the prompts of both languages from one window."""
+    numbers = _numbers(window, facts)
+    languages: tuple[Language, Language] = ("en", "zh")
+    return {
+        language: Prompt(
+            system=system_prompt(language),
+            user=_user_prompt(numbers, window, facts, _images_sentence(modalities, layout, language), language),
+        )
+        for language in languages
+    }
+
+
+def prompt_hash(prompts: dict[Language, Prompt]) -> str:
+    digest = hashlib.sha256()
+    for number, prompt in enumerate(prompts.values()):
+        digest.update(b"\x00" if number else b"")
+        digest.update(_encoded(prompt.system))
+        digest.update(b"\x00" + prompt.user.encode())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=8)
+def _encoded(system: str) -> bytes:
+    return system.encode()
+
+
+def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, images: str, language: Language) -> str:
+    unknown, unit = _WORDS_OF_NUMBERS[language]
+    speed = facts.target_speed_mps
+    words = load_glossary().visibility
+    own = {
+        "images": images,
+        "target_speed": unknown if speed is None else f"{speed:.2f}{unit}",
+        "visibility": ", ".join([words[word][language] for word in facts.visibility]),
+        "target": "; ".join([_target_text(*p) or unknown for p in window.targets_m.tolist()]),
+    }
+    return _filled(f"user_{language}") % (numbers | own)
+
+
+_WORDS_OF_NUMBERS: dict[Language, tuple[str, str]] = {"en": ("unknown", " m/s"), "zh": ("未知", " 米/秒")}
+
+
+def _numbers(window: ObservedWindow, facts: Facts) -> dict[str, str]:
+    """Give the numbers of a prompt, which are the same in both languages."""
+    step_s = float(window.time_s[-1] - window.time_s[0]) / (len(window.indices) - 1)
+    poses = zip(window.positions_m.tolist(), window.rotations_deg.tolist(), strict=True)
+    return {
+        "num_frames": str(len(window.indices)),
+        "step_s": f"{step_s:.1f}",
+        # The oldest frame has no earlier one in the window: 0.0 by definition, as in the paper's sample.
+        "speed": ", ".join(["0.0" if v is None else f"{v:.2f}" for v in facts.speed_mps]),
+        "altitude": ", ".join([f"{v:.1f}" for v in facts.altitude_m]),
+        "yaw": ", ".join([f"{v:.1f}" for v in facts.yaw_deg]),
+        "pose": "; ".join([_pose_text(*p, *r) for p, r in poses]),
+    }
+
+
+# Five windows of a flight share a frame, and both languages its text.
+@lru_cache(maxsize=64)
+def _pose_text(x: float, y: float, z: float, pitch: float, yaw: float, roll: float) -> str:
+    return f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})"
+
+
+@lru_cache(maxsize=64)
+def _target_text(x: float, y: float, z: float) -> str:
+    """Give a position, "" where it is not known."""
+    return "" if x != x else f"({x:z.2f}, {y:z.2f}, {z:z.2f})"
+
+
+@cache
+def _filled(name: str) -> str:
+    """Give a prompt file as a format for `%`, which is ten times faster than a template."""
+    body = read_prompt(name).template.replace("%", "%%")
+    return re.sub(r"\$(\w+)", r"%(\1)s", body)
+
+
+@cache
+def _images_sentence(modalities: tuple[Modality, ...], layout: str, language: Language) -> str:
+    if not modalities:
+        return {"en": "No images are given.", "zh": "未提供图像。"}[language]
+    words = [_MODALITY_WORDS[language][modality] for modality in modalities]
+    if language == "zh":
+        listed = "、".join(words)
+        return f"每帧一张图像，从左到右为：{listed}。" if layout == "tiled" else f"每帧依次给出：{listed}。"
+    listed = ", ".join(words)
+    if layout == "tiled":
+        return f"Each frame is one image, from left to right: {listed}."
+    return f"Each frame is given as: {listed}."
+
+
+# --- requests ---------------------------------------------------------------------------------------------------------
+
+
+def answer_schema(decision: str | None = None) -> dict:
+    """Give the JSON schema of an answer; a given decision is the enum's one value."""
+    limits = {"critical_components": (20, 1200), "reasoning_trace": (30, 1600)}  # bounded: a server may pad for ever
+    properties: dict[str, dict] = {
+        name: {"type": "string", "minLength": low, "maxLength": high} for name, (low, high) in limits.items()
+    }
+    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(ACTIONS)}
+    return {"type": "object", "properties": properties, "required": list(FIELDS), "additionalProperties": False}
+
+
+def mirror_schema(decision: str) -> dict:
+    """Give the schema of the Chinese mirror: shorter texts, the decision fixed."""
+    schema = answer_schema(decision)
+    schema["properties"]["critical_components"]["minLength"] = 7
+    schema["properties"]["reasoning_trace"]["minLength"] = 10
+    return schema
+
+
+def question_messages(question: Question, encoder: FrameEncoder) -> tuple[list[dict], list[str]]:
+    """Give the chat messages of a question and the digests of its pictures.
+
+    The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share the
+    system prompt as a prefix and four of five frames as identical pictures.
+    """
+    content: list[dict] = []
+    digests: list[str] = []
+    if question.modalities:
+        for number, folder in enumerate(question.window.frame_folders):
+            content.append({"type": "text", "text": f"t{number}:"})
+            for image in encoder.encode(folder, question.modalities):
+                content.append(_image_part(image))
+                digests.append(image.digest)
+    content.append({"type": "text", "text": question.prompts["en"].user})
+    system = system_prompt("en") if question.decision is None else anchored_prompt(question.decision)
+    if question.rejected is not None:
+        system += "\n" + read_prompt("hint_en").substitute(rejected=question.rejected)
+    return [{"role": "system", "content": system}, {"role": "user", "content": content}], digests
+
+
+def _image_part(image: EncodedImage) -> dict:
+    return {"type": "image_url", "image_url": {"url": image.url}}
+
+
+def mirror_messages(english: Coc) -> list[dict]:
+    """Give the chat messages that ask for the Chinese mirror of an English answer."""
+    system = read_prompt("mirror_system").substitute(glossary=load_glossary().quoted())
+    user = read_prompt("mirror_user").substitute(english=dump_json(english.model_dump()))
+    return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+
+
+def make_question(window: ObservedWindow, facts: Facts, image: ImageConfig) -> Question:
+    """Make the free question of a window."""
+    modalities = available_modalities(window, image.modalities)
+    return Question(window, facts, build_prompts(window, facts, modalities, image.layout), modalities)

@@ -1,0 +1,302 @@
+"""The embedded rule teacher: deterministic, looks only at the facts measured on the observed frames.
+
+It decides from pixel offset, box trend, distances, speeds and visibility, and writes English and Chinese from the same
+facts. Wording varies with the sample's generator. Its records say `kind: rules`; it is no model and sees no picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caption.teachers.statements import CENTERED_SHARE, Both, describe
+from caption.truth.facts import Facts
+from caption.truth.glossary import load_glossary
+from cosfly.products.captions import Coc
+
+MODEL = "rules-2"  # its name in the records; counts changes of decisions and wording
+STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
+DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
+MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3
+
+
+@dataclass(frozen=True)
+class Cues:
+    """Trends derived from facts; 0.0 where a fact is missing."""
+
+    offset_share: float  # of the image width, positive to the right
+    last_turn_deg: float
+    last_climb_m: float
+    turn_deg: float  # expected of the next steps, positive to the left
+    climb_m: float
+    gap_m: float  # change of the horizontal distance over the window
+    pace_mps: float  # drone speed less target speed
+    speed_now_mps: float
+
+
+def find_cues(facts: Facts) -> Cues:
+    dx = facts.offset_x_px[-1] if facts.is_visible_now else None
+    first, last = facts.distance_m[0], facts.distance_m[-1]
+    # The camera follows the line of sight, which is the heading less the target's place in the picture: one shaky frame
+    # moves both and leaves their difference as it is.
+    offsets = (
+        [offset or 0 for offset in facts.offset_x_px] if None not in facts.offset_x_px else [0] * len(facts.yaw_deg)
+    )
+    degrees = DEGREES_PER_IMAGE_WIDTH / facts.width_px
+    sight_deg = [yaw_deg - degrees * offset for yaw_deg, offset in zip(facts.yaw_deg, offsets, strict=True)]
+    speed = facts.speed_mps[-1] or 0.0
+    return Cues(
+        offset_share=0.0 if dx is None else dx / facts.width_px,
+        last_turn_deg=facts.yaw_deg[-1] - facts.yaw_deg[-2],
+        last_climb_m=facts.altitude_m[-1] - facts.altitude_m[-2],
+        turn_deg=STEPS_AHEAD * _slope(sight_deg) - degrees * (dx or 0),
+        climb_m=STEPS_AHEAD * _slope(facts.altitude_m),
+        gap_m=0.0 if first is None or last is None else last - first,
+        pace_mps=0.0 if facts.target_speed_mps is None else speed - facts.target_speed_mps,
+        speed_now_mps=speed,
+    )
+
+
+def _slope(values: Sequence[float]) -> float:
+    """Give the change per step of the straight line nearest to a series."""
+    middle = (len(values) - 1) / 2.0
+    weights = [i - middle for i in range(len(values))]
+    return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(w * w for w in weights)
+
+
+def decide(facts: Facts) -> str:
+    """Choose an action from the observed frames alone."""
+    cues = find_cues(facts)
+    turn_deg, climb_m = cues.turn_deg, cues.climb_m
+    if not facts.is_visible_now:
+        return "search_to_reacquire_target"
+    if cues.speed_now_mps < STILL_MPS and abs(turn_deg) < MIN_TURN_DEG and abs(climb_m) < MIN_CLIMB_M:
+        return "hover"
+    if abs(turn_deg) >= MIN_TURN_DEG:
+        return "yaw_left_to_follow" if turn_deg > 0 else "yaw_right_to_follow"
+    if abs(climb_m) >= MIN_CLIMB_M:
+        return "ascend" if climb_m > 0 else "descend"
+    if cues.gap_m >= MIN_GAP_M and cues.pace_mps <= -MIN_PACE_MPS:
+        return "speed_up"
+    if cues.gap_m <= -MIN_GAP_M and cues.pace_mps >= MIN_PACE_MPS:
+        return "slow_down"
+    return "track_straight"
+
+
+def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None = None) -> tuple[Coc, Coc]:
+    """Write the English and the Chinese answer from the same facts.
+
+    Args:
+        decision: the decision to justify (anchored); None decides freely.
+    """
+    draws = iter(rng.integers(0, 1 << 16, 16).tolist())
+
+    def pick(options: tuple[Both, ...]) -> Both:
+        return options[next(draws) % len(options)]
+
+    token = decision or decide(facts)
+    statements = [pick(options) for options in describe(facts)]
+    causes = [pick(options) for options in _causes(facts, token)]
+    action = load_glossary().actions[token]
+    conclusion = pick(
+        (
+            (f"Therefore the drone should {action['en']}.", f"因此无人机应{action['zh']}。"),
+            (f"The decision that follows is to {action['en']}.", f"由此得出的决策是{action['zh']}。"),
+            (f"For this reason the next step is to {action['en']}.", f"基于此，下一步应{action['zh']}。"),
+        )
+    )
+    english = Coc(
+        critical_components=_capital("; ".join(en for en, _ in statements)) + ".",
+        reasoning_trace=" ".join(_capital(en) + "." for en, _ in causes) + " " + conclusion[0],
+        flight_decision=token,
+    )
+    chinese = Coc(
+        critical_components="；".join(zh for _, zh in statements) + "。",
+        reasoning_trace="".join(zh + "。" for _, zh in causes) + conclusion[1],
+        flight_decision=token,
+    )
+    return english, chinese
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+# --- causes -----------------------------------------------------------------------------------------------------------
+
+
+def _causes(f: Facts, token: str) -> list[tuple[Both, ...]]:
+    """Give the reasons for a decision that the facts hold, else its general reason."""
+    cues = find_cues(f)
+    found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
+    return [(wording,) for wording in found[:2]] or [_GENERAL[token]]
+
+
+Cause = Callable[[Facts, Cues], Both | None]
+
+
+def _offset_cause(side: int) -> Cause:
+    en, zh = ("left", "左") if side > 0 else ("right", "右")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        if -side * c.offset_share < CENTERED_SHARE:
+            return None
+        n = abs(f.offset_x_px[-1] or 0)
+        return (
+            f"the target has drifted {n} px to the {en} of the image centre",
+            f"目标已偏离到画面中心{zh}侧 {n} 像素处",
+        )
+
+    return cause
+
+
+def _turn_cause(side: int) -> Cause:
+    en, zh = ("left", "左") if side > 0 else ("right", "右")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        if side * c.last_turn_deg < 0.5 or side * f.yaw_deg[-1] < 1.0:
+            return None
+        n = abs(f.yaw_deg[-1])
+        return (
+            f"keeping the target framed has already taken {n:.1f} deg of yaw to the {en}, and the turn goes on",
+            f"为保持目标在画面内，偏航角已向{zh}转动 {n:.1f} 度，且转动仍在继续",
+        )
+
+    return cause
+
+
+def _bend_cause(side: int) -> Cause:
+    en, zh = ("left", "左") if side > 0 else ("right", "右")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        if f.target_turn_deg is None or side * f.target_turn_deg < 15.0:
+            return None
+        return f"the target bends to the {en}, so the line of sight keeps turning", f"目标向{zh}转弯，视线方向持续变化"
+
+    return cause
+
+
+def _climb_cause(side: int) -> Cause:
+    en, zh = ("climbing", "爬升") if side > 0 else ("descending", "下降")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        moved = f.altitude_m[-1] - f.altitude_m[0]
+        if side * moved < 0.5 or side * c.last_climb_m <= 0:
+            return None
+        return (
+            f"the drone is {en} through an altitude of {f.altitude_m[-1]:.1f} m and the viewing angle is not settled yet",
+            f"无人机正在{zh}，当前高度 {f.altitude_m[-1]:.1f} 米，俯视角度尚未稳定",
+        )
+
+    return cause
+
+
+def _gap_cause(side: int) -> Cause:
+    en, zh = ("increased", "增加") if side > 0 else ("decreased", "减小")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        if side * c.gap_m < 0.5:
+            return None
+        return (
+            f"the horizontal distance has {en} to {f.distance_m[-1]:.1f} m over the observed frames",
+            f"观测期间水平距离已{zh}到 {f.distance_m[-1]:.1f} 米",
+        )
+
+    return cause
+
+
+def _pace_cause(side: int) -> Cause:
+    en, zh = ("above", "高于") if side > 0 else ("below", "低于")
+
+    def cause(f: Facts, c: Cues) -> Both | None:
+        if f.target_speed_mps is None or side * c.pace_mps < MIN_PACE_MPS:
+            return None
+        return (
+            f"the drone speed of {c.speed_now_mps:.2f} m/s is {en} the target speed of {f.target_speed_mps:.2f} m/s",
+            f"无人机速度 {c.speed_now_mps:.2f} 米/秒{zh}目标速度 {f.target_speed_mps:.2f} 米/秒",
+        )
+
+    return cause
+
+
+def _steady(f: Facts, c: Cues) -> Both | None:
+    if not f.is_visible_now or abs(c.offset_share) >= CENTERED_SHARE or abs(c.last_turn_deg) >= 1.0:
+        return None
+    return (
+        "the target stays near the image centre and the yaw is aligned with its path",
+        "目标保持在画面中心附近，偏航方向与其路径一致",
+    )
+
+
+def _lost(f: Facts, c: Cues) -> Both | None:
+    if f.is_visible_now:
+        return None
+    if f.visibility[-1] == "out_of_view":
+        return (
+            "the target is out of view, so its motion can no longer be followed directly",
+            "目标在视野外，无法再直接跟随其运动",
+        )
+    return (
+        "the target is occluded, so its motion can no longer be followed directly",
+        "目标被遮挡，无法再直接跟随其运动",
+    )
+
+
+def _standing(f: Facts, c: Cues) -> Both | None:
+    if f.target_speed_mps is None or f.target_speed_mps >= 0.2:
+        return None
+    return "the target stands almost still, so there is nothing to catch up with", "目标几乎静止，无需追赶"
+
+
+_EVIDENCE: dict[str, tuple[Cause, ...]] = {
+    "track_straight": (_steady,),
+    "yaw_left_to_follow": (_offset_cause(1), _turn_cause(1), _bend_cause(1)),
+    "yaw_right_to_follow": (_offset_cause(-1), _turn_cause(-1), _bend_cause(-1)),
+    "ascend": (_climb_cause(1),),
+    "descend": (_climb_cause(-1),),
+    "speed_up": (_gap_cause(1), _pace_cause(-1)),
+    "slow_down": (_gap_cause(-1), _pace_cause(1)),
+    "move_forward": (_gap_cause(1),),
+    "move_backward": (_gap_cause(-1),),
+    "strafe_left": (_offset_cause(1), _bend_cause(1)),
+    "strafe_right": (_offset_cause(-1), _bend_cause(-1)),
+    "hover": (_standing,),
+    "search_to_reacquire_target": (_lost,),
+}
+
+# Reasons that claim nothing measurable: for a decision that the facts alone do not explain.
+_GENERAL: dict[str, tuple[Both, ...]] = {
+    "track_straight": (("the present course keeps the target in frame", "当前航向可使目标保持在画面内"),),
+    "yaw_left_to_follow": (
+        ("the line of sight to the target calls for a correction of the heading", "对准目标的视线需要修正航向"),
+    ),
+    "yaw_right_to_follow": (
+        ("the line of sight to the target calls for a correction of the heading", "对准目标的视线需要修正航向"),
+    ),
+    "circle_left": (
+        ("a view from another side of the target keeps it well in frame", "换一侧观察目标有利于将其保持在画面内"),
+    ),
+    "circle_right": (
+        ("a view from another side of the target keeps it well in frame", "换一侧观察目标有利于将其保持在画面内"),
+    ),
+    "ascend": (("a higher viewpoint keeps a free line of sight to the target", "更高的视点可保持对目标的通畅视线"),),
+    "descend": (("a lower viewpoint shows the target at a better scale", "更低的视点可让目标尺度更合适"),),
+    "move_forward": (("closing in keeps the target at a useful scale", "靠近目标可保持合适的尺度"),),
+    "move_backward": (
+        ("more room keeps the target and its surroundings in frame", "留出更多空间可将目标与周围环境保持在画面内"),
+    ),
+    "strafe_left": (
+        ("a sideways shift keeps the target framed without a turn", "侧向移动可在不转向的情况下保持目标构图"),
+    ),
+    "strafe_right": (
+        ("a sideways shift keeps the target framed without a turn", "侧向移动可在不转向的情况下保持目标构图"),
+    ),
+    "slow_down": (("the pace has to fit that of the target", "飞行节奏需要与目标相适应"),),
+    "speed_up": (("the pace has to fit that of the target", "飞行节奏需要与目标相适应"),),
+    "search_to_reacquire_target": (("contact with the target has to be secured", "需要确保与目标保持联系"),),
+    "hover": (("holding the present position keeps the target in frame", "保持当前位置可使目标留在画面内"),),
+    "break_off": (("the mission ends the pursuit here", "任务要求在此结束跟踪"),),
+    "return_to_home": (("the mission calls the drone back", "任务要求无人机返回"),),
+}

@@ -1,0 +1,1 @@
+"""What the geometry says: facts, labels, verdicts, evidence."""

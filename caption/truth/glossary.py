@@ -1,0 +1,155 @@
+"""The bilingual glossary (`glossary.yaml`): names of actions and words, units, opposites.
+
+One reader, one frozen record with its patterns compiled; everything that writes or compares the two languages takes it.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import Field
+
+from cosfly.config import Config, build, read_yaml
+from cosfly.errors import ConfigError
+from cosfly.products.captions import ACTIONS, Language
+
+GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
+LANGUAGES: tuple[Language, Language] = ("en", "zh")
+
+
+class _Pair(Config):
+    en: str = Field(description="English")
+    zh: str = Field(description="Chinese")
+
+
+class _Spellings(Config):
+    en: list[str] = Field(description="English")
+    zh: list[str] = Field(description="Chinese")
+
+
+class _Opposites(Config):
+    positive: _Spellings = Field(description="one side")
+    negative: _Spellings = Field(description="the other side")
+
+
+class _GlossaryFile(Config):
+    schema_: str = Field(alias="schema", description="cosfly.glossary")
+    schema_version: str = Field(description="version of this layout")
+    actions: dict[str, _Pair] = Field(description="names of the closed set")
+    visibility: dict[str, _Pair] = Field(description="visibility words")
+    units: dict[str, _Spellings] = Field(description="unit -> spellings, the first is written")
+    terms: list[_Pair] = Field(description="recurring terms")
+    polarity: dict[str, _Opposites] = Field(description="opposites")
+    negations: _Spellings = Field(description="words that turn a term round")
+    not_terms: _Spellings = Field(description="spellings that hold a term but do not mean it")
+
+
+class Number(NamedTuple):
+    """A number in a text: `unit` is a key of the glossary's units, "" where none; `digits` after the point."""
+
+    value: float
+    unit: str
+    digits: int
+    start: int
+
+
+class Glossary:
+    """The glossary with its patterns compiled."""
+
+    def __init__(self, file: _GlossaryFile) -> None:
+        self.actions = {token: {"en": pair.en, "zh": pair.zh} for token, pair in file.actions.items()}
+        self.visibility = {word: {"en": pair.en, "zh": pair.zh} for word, pair in file.visibility.items()}
+        self.terms = [(pair.en, pair.zh) for pair in file.terms]
+        self._units: dict[Language, dict[str, str]] = {"en": {}, "zh": {}}
+        for unit, spellings in file.units.items():
+            for language in LANGUAGES:
+                self._units[language].update(dict.fromkeys(getattr(spellings, language), unit))
+        self._numbers = {language: _number_pattern(self._units[language], language) for language in LANGUAGES}
+        self._poles: dict[Language, dict[str, tuple[str, int]]] = {"en": {}, "zh": {}}
+        for name, pair in file.polarity.items():
+            for language in LANGUAGES:
+                self._poles[language].update(dict.fromkeys(getattr(pair.positive, language), (name, 1)))
+                self._poles[language].update(dict.fromkeys(getattr(pair.negative, language), (name, -1)))
+        self._negations_en, self._negations_zh = set(file.negations.en), tuple(file.negations.zh)
+        self._terms = {
+            language: _term_pattern(self._poles[language], getattr(file.not_terms, language), language)
+            for language in LANGUAGES
+        }
+
+    def numbers(self, text: str, language: Language) -> list[Number]:
+        """Find the numbers of a text with their units; a unit after a list or a product holds for all of it."""
+        found: list[Number] = []
+        for match in self._numbers[language].finditer(text):
+            digits, unit = match["number"], match["unit"]
+            places = len(digits.partition(".")[2])
+            found.append(
+                Number(
+                    float(digits.replace("−", "-")), self._units[language].get(unit or "", ""), places, match.start()
+                )
+            )
+        # "34 x 59 px", "20.0 to 21.4 m": the unit stands once, after the last number.
+        for i in range(len(found) - 2, -1, -1):
+            between = text[found[i].start : found[i + 1].start]
+            if not found[i].unit and found[i + 1].unit and _JOINED.search(between):
+                found[i] = Number(found[i].value, found[i + 1].unit, found[i].digits, found[i].start)
+        return found
+
+    def poles(self, text: str, language: Language) -> list[tuple[str, int, int]]:
+        """Find opposites in a text: (pair, +1 or -1, position), negations applied."""
+        text = text.lower() if language == "en" else text
+        found = []
+        for match in self._terms[language].finditer(text):
+            term = match.group()
+            if term not in self._poles[language]:
+                continue  # one of not_terms
+            name, sign = self._poles[language][term]
+            found.append((name, -sign if self._is_negated(text, match.start(), language) else sign, match.start()))
+        return found
+
+    def _is_negated(self, text: str, start: int, language: Language) -> bool:
+        if language == "zh":
+            return text[max(0, start - 4) : start].endswith(self._negations_zh)
+        words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
+        return bool(self._negations_en.intersection(words[-2:]))
+
+    def quoted(self) -> str:
+        """Give the glossary as lines for a translation prompt."""
+        pairs = [(pair["en"], pair["zh"]) for group in (self.actions, self.visibility) for pair in group.values()]
+        units = {unit: spelling for spelling, unit in reversed(self._units["zh"].items())}
+        english = {unit: spelling for spelling, unit in reversed(self._units["en"].items())}
+        pairs += [(english[unit], units[unit]) for unit in english if unit in units]
+        return "\n".join(f"{en} = {zh}" for en, zh in pairs + self.terms)
+
+
+_JOINED = re.compile(r"^[-+−]?\d+(?:\.\d+)?\s*(?:x|×|by|to|and|,|、|-|–|至|到|和|乘|→|~)\s*$")
+
+
+def _number_pattern(units: dict[str, str], language: Language) -> re.Pattern[str]:
+    spellings = sorted(units, key=len, reverse=True)
+    # An ASCII unit must end where the word ends: "3 m" but not "3 more".
+    options = "|".join(re.escape(s) + (r"(?![A-Za-z/])" if s[-1].isalpha() and s.isascii() else "") for s in spellings)
+    return re.compile(rf"(?<![\w.])(?P<number>[-+−]?\d+(?:\.\d+)?)(?!\d)(?:\s*(?P<unit>{options}))?")
+
+
+def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], language: Language) -> re.Pattern[str]:
+    words = sorted([*poles, *not_terms], key=len, reverse=True)
+    options = "|".join(re.escape(word) for word in words)
+    return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
+
+
+@cache
+def load_glossary(path: Path | None = None) -> Glossary:
+    """Read a glossary, by default the one that ships.
+
+    Raises:
+        ConfigError: malformed, or an action of the closed set is missing.
+    """
+    path = path or GLOSSARY_FILE
+    file = build(_GlossaryFile, read_yaml(path), path)
+    if set(file.actions) != set(ACTIONS):
+        wrong = sorted(set(file.actions) ^ set(ACTIONS))
+        raise ConfigError("the glossary's actions are not the closed set", where=path, got=", ".join(wrong))
+    return Glossary(file)

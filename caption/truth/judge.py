@@ -1,0 +1,224 @@
+"""Phase 4, optional: a language model judges conflicts between a decision and the label; geometry keeps the last word.
+
+A judgement that cannot be read is `unjudged`, never an acceptance. Judgements are journaled per flight, so that a run that is
+continued asks nothing twice. `check_judge` measures a judge on a small gold set before its verdicts are used.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from rich.table import Table
+
+from caption.schema import JudgeConfig, Judgement
+from caption.teachers.answers import flight_of
+from caption.teachers.prompts import read_prompt
+from cosfly.chat.client import ChatClient, EndpointConfig, NoAnswer
+from cosfly.chat.protocol import answer_key, shown_url
+from cosfly.errors import InputError
+from cosfly.journal import Journal
+from cosfly.products.captions import Coc
+from cosfly.store import dump_json
+
+JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
+UNJUDGED = "unjudged"
+FOLDER = "judgements"
+
+_MEANINGS: dict[Judgement, str] = {
+    "ACCEPT_ALTERNATIVE": "the reasoning is sound and its decision is an acceptable alternative to the label",
+    "FIX_LABEL": "the reasoning is sound and argues for the label; only the decision field is wrong",
+    "REJECT_REGEN": "the reasoning is flawed, or contradicts the flight data, and must be written anew",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One conflict: the flight data as the teacher read them, its answer, and the true decision (None: not known)."""
+
+    sample_id: str
+    flight: str
+    answer: Coc
+    label: str | None
+
+
+def judge_messages(case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> list[dict]:
+    """Give the chat messages; `order` is the order in which the options are named."""
+    options = "\n".join(f"- {name}: {_MEANINGS[name]}." for name in order)
+    system = read_prompt("judge_system").substitute(options=options, names=", ".join(order))
+    record = dump_json(case.answer.model_dump(), indent=1)
+    user = read_prompt("judge_user").substitute(flight=case.flight, record=record, label=case.label or "not known")
+    return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+
+
+def judge_schema(order: Sequence[Judgement] = JUDGEMENTS) -> dict:
+    properties = {
+        "verdict": {"type": "string", "enum": list(order)},
+        "reason": {"type": "string", "minLength": 1, "maxLength": 600},
+    }
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+
+
+def parse_judgement(text: str) -> tuple[str, str]:
+    """Read (verdict, reason); a text that does not hold exactly one of the three verdicts and a reason is `unjudged`."""
+    start = text.find("{")
+    try:
+        value, end = json.JSONDecoder(strict=False).raw_decode(text, max(0, start))
+    except (ValueError, RecursionError):
+        return UNJUDGED, "not a JSON object"
+    if not isinstance(value, dict) or "{" in text[end:]:
+        return UNJUDGED, "not one JSON object"
+    verdict, reason = value.get("verdict"), value.get("reason")
+    if verdict not in JUDGEMENTS:
+        return UNJUDGED, f"no such verdict: {str(verdict)[:40]}"
+    if not isinstance(reason, str) or not reason.strip():
+        return UNJUDGED, "no reason given"
+    return verdict, " ".join(reason.split())
+
+
+class Judge:
+    """Asks an endpoint about conflicts. Made by `open_judge`."""
+
+    def __init__(self, client: ChatClient, model: str, cfg: JudgeConfig, folder: Path | None, seed: int) -> None:
+        self.client, self.model, self.cfg, self.folder, self.seed = client, model, cfg, folder, seed
+        self.usage: Counter[str] = Counter()
+        self._known: dict[str, dict[str, dict]] = {}  # flight -> key -> record
+        self._journals: dict[str, Journal] = {}
+
+    async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> dict[str, Any]:
+        """Give {verdict, reason, model}; the verdict is `unjudged` where none could be read or the judge did not answer."""
+        body = {"model": self.model, "messages": judge_messages(case, order), "temperature": 0.0, "seed": self.seed}
+        body |= {"max_tokens": self.cfg.max_tokens, **self.cfg.extra_body}
+        schema = judge_schema(order)
+        key = answer_key(body, [], schema)
+        flight = flight_of(case.sample_id)
+        known = self._read(flight).get(key)
+        if known is None:
+            try:
+                found = await self.client.complete(body, schema)
+            except NoAnswer as error:  # not kept: a later run may ask again
+                return {"verdict": UNJUDGED, "reason": f"no answer: {error.cause}", "model": self.model}
+            known = {"key": key, "sample_id": case.sample_id, "text": found["text"], "usage": found["usage"]}
+            self._keep(flight, known)
+        self.usage.update(known["usage"])
+        verdict, reason = parse_judgement(known["text"])
+        return {"verdict": verdict, "reason": reason, "model": self.model}
+
+    def _read(self, flight: str) -> dict[str, dict]:
+        if flight not in self._known:
+            while len(self._known) >= self.cfg.open_flights:
+                oldest = next(iter(self._known))
+                del self._known[oldest]
+                if oldest in self._journals:
+                    self._journals.pop(oldest).close()
+            records = [] if self.folder is None else Journal(self.folder / f"{flight}.jsonl").read()
+            self._known[flight] = {record["key"]: record for record in records}
+        return self._known[flight]
+
+    def _keep(self, flight: str, record: dict) -> None:
+        if self.folder is not None:
+            if flight not in self._journals:
+                self._journals[flight] = Journal(self.folder / f"{flight}.jsonl")
+            self._journals[flight].append(record)
+        self._read(flight)[record["key"]] = record
+
+    def close(self) -> None:
+        for journal in self._journals.values():
+            journal.close()
+
+
+@asynccontextmanager
+async def open_judge(cfg: JudgeConfig, stage_path: Path | None, seed: int) -> AsyncIterator[Judge | None]:
+    """Connect to the judge that the settings name; None where they name none.
+
+    Args:
+        stage_path: folder that keeps the judgements; None keeps none.
+    Raises:
+        TeacherError: the endpoint cannot be used.
+    """
+    if cfg.url is None:
+        yield None
+        return
+    settings = {name: getattr(cfg, name) for name in ("model", "concurrency", "timeout_s", "max_tries", "json_schema")}
+    client = ChatClient(cfg.url, EndpointConfig(**settings, max_tokens=cfg.max_tokens, temperature=0.0))
+    try:
+        judge = Judge(client, await client.find_model(), cfg, stage_path / FOLDER if stage_path else None, seed)
+        try:
+            yield judge
+        finally:
+            judge.close()
+    finally:
+        await client.aclose()
+
+
+# --- how good a judge is ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class JudgeCheck:
+    """How a judge did on the gold set, every case asked once per rotation of the options.
+
+    num_agreed, num_unjudged: of `num_asks`. num_moved: cases whose verdict depends on the order of the options.
+    first_share: how often it took the option named first, of the answers that could be read; 1/3 is without bias.
+    confusion: (gold, judged) -> count.
+    """
+
+    model: str
+    num_cases: int
+    num_asks: int
+    num_agreed: int
+    num_unjudged: int
+    num_moved: int
+    first_share: float
+    confusion: dict[tuple[str, str], int]
+
+    @property
+    def agreement(self) -> float:
+        return self.num_agreed / self.num_asks
+
+
+async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed: int = 0) -> JudgeCheck:
+    """Measure a judge.
+
+    Raises:
+        TeacherError: the endpoint cannot be used.
+    """
+    orders = [(*JUDGEMENTS[i:], *JUDGEMENTS[:i]) for i in range(len(JUDGEMENTS))]
+    confusion: Counter[tuple[str, str]] = Counter()
+    num_agreed = num_moved = num_first = 0
+    async with open_judge(cfg, None, seed) as judge:
+        if judge is None:
+            raise InputError("no judge to check", where="--judge", got="nothing", expected="the URL of an endpoint")
+        for case, right in gold:
+            verdicts = [(await judge.judge(case, order))["verdict"] for order in orders]
+            confusion.update((right, verdict) for verdict in verdicts)
+            num_agreed += verdicts.count(right)
+            num_moved += len(set(verdicts)) > 1
+            num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
+        model = f"{judge.model} at {shown_url(str(cfg.url))}"
+    num_asks = len(gold) * len(orders)
+    num_unjudged = sum(count for (_, verdict), count in confusion.items() if verdict == UNJUDGED)
+    first_share = num_first / max(1, num_asks - num_unjudged)
+    return JudgeCheck(model, len(gold), num_asks, num_agreed, num_unjudged, num_moved, first_share, dict(confusion))
+
+
+def judge_check_table(check: JudgeCheck) -> Table:
+    """Give the figures as a table for the terminal."""
+    table = Table(title=f"Judge {check.model}", title_justify="left")
+    for column in ("figure", "value", "meaning"):
+        table.add_column(column)
+    asks = f"of {check.num_asks} asks ({check.num_cases} cases, three orders of the options)"
+    table.add_row("agreement", f"{100 * check.agreement:.1f} %", f"with the gold judgement, {asks}; chance is 33.3 %")
+    share = f"{100 * check.first_share:.1f} %"
+    table.add_row("position bias", share, "took the option named first; 33.3 % is without bias")
+    table.add_row("moved", f"{check.num_moved} of {check.num_cases}", "cases whose verdict depends on the order")
+    table.add_row("unparsable", str(check.num_unjudged), f"counted as unjudged, {asks}")
+    for gold in JUDGEMENTS:
+        row = ", ".join(f"{name} {check.confusion.get((gold, name), 0)}" for name in (*JUDGEMENTS, UNJUDGED))
+        table.add_row(f"gold {gold}", str(sum(n for (g, _), n in check.confusion.items() if g == gold)), row)
+    return table

@@ -1,0 +1,1 @@
+"""The OpenAI-compatible chat endpoint, for teachers, judges and students alike."""

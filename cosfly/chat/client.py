@@ -1,0 +1,261 @@
+"""The HTTP client of a chat-completions server: it retries what may pass and names what cannot.
+
+The key comes from the environment variable COSFLY_API_KEY and goes into the request header only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import random
+import time
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+from pydantic import Field
+
+from cosfly.chat.protocol import (
+    base_url,
+    encode_body,
+    read_completion,
+    read_models,
+    response_format,
+    retry_after_s,
+    shown_url,
+)
+from cosfly.chat.throttle import Throttle
+from cosfly.config import Config
+from cosfly.errors import TeacherError
+from cosfly.store import parse_json
+
+log = logging.getLogger(__name__)
+
+KEY_VARIABLE = "COSFLY_API_KEY"
+BUSY_STATUS = frozenset({429, 503, 529})
+RETRIED_STATUS = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
+HEADERS = {"Content-Type": "application/json"}
+
+
+class EndpointConfig(Config):
+    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
+    top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
+    max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
+    concurrency: int = Field(
+        16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
+    )
+    timeout_s: float = Field(120.0, gt=0, description="limit of one request, from its first byte to its last")
+    total_timeout_s: float = Field(
+        900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
+    )
+    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    backoff_s: float = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
+    max_backoff_s: float = Field(60.0, gt=0, description="longest wait between two tries")
+    stop_after_failures: int = Field(20, ge=1, description="windows in a row without an answer that end the run")
+    json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
+    image_uuid: bool = Field(
+        False, description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it"
+    )
+    extra_body: dict[str, Any] = Field(
+        default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"
+    )
+
+
+class NoAnswer(Exception):
+    """A window got no answer; `cause` is a word for the tally. `is_final`: asking again later would not help."""
+
+    def __init__(self, cause: str, detail: str, *, is_final: bool = False) -> None:
+        super().__init__(f"{cause}: {detail}")
+        self.cause, self.detail, self.is_final = cause, detail, is_final
+
+
+class ChatClient:
+    """Sends requests to one server. Close it with `aclose`."""
+
+    def __init__(self, url: str, cfg: EndpointConfig) -> None:
+        self.url, self.shown = base_url(url), shown_url(base_url(url))
+        self.cfg = cfg
+        self.throttle = Throttle(cfg.concurrency)
+        self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
+        self.num_retries = 0
+        self._is_schema_refused = not cfg.json_schema
+        self._key = os.environ.get(KEY_VARIABLE, "")
+        self._jitter = random.Random()  # times of retries only: no product depends on it
+        # A connection to each request in flight, each in a client of its own: one pool of 64 connections looks through all of them at
+        # every request, and all at each of those, which takes longer than to send fifteen pictures.
+        self._tls = httpx.create_ssl_context()
+        self._free = [self._connect()]
+
+    async def aclose(self) -> None:
+        """Close all connections; none may be in use."""
+        for connection in self._free:
+            await connection.aclose()
+
+    @contextlib.contextmanager
+    def _connection(self) -> Iterator[httpx.AsyncClient]:
+        """Lend the connection that was used last, or a new one where all are in use."""
+        connection = self._free.pop() if self._free else self._connect()
+        try:
+            yield connection
+        finally:
+            self._free.append(connection)
+
+    def _connect(self) -> httpx.AsyncClient:
+        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
+        try:
+            return httpx.AsyncClient(headers=headers, timeout=self.cfg.timeout_s, limits=limits, verify=self._tls)
+        except (httpx.InvalidURL, ValueError, UnicodeError) as error:
+            raise TeacherError("the key cannot be sent", where=KEY_VARIABLE, got=type(error).__name__) from None
+
+    # --- one answer ---
+
+    async def send(self, payload: dict) -> httpx.Response:
+        """Send one request once.
+
+        Raises:
+            TimeoutError: the whole answer was not there within `timeout_s`, however steadily it dripped.
+            httpx.TransportError: no connection, or it broke.
+        """
+        with self._connection() as connection:
+            async with asyncio.timeout(self.cfg.timeout_s):
+                return await connection.post(
+                    f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS
+                )
+
+    async def complete(self, body: dict, schema: dict) -> dict:
+        """Send a request until it is answered; gives text, usage, structured and finish_reason.
+
+        Raises:
+            NoAnswer: not within the tries and the time that the settings allow.
+            TeacherError: no request will get an answer.
+        """
+        cause, detail = "no_answer", ""
+        deadline_s = float("inf")
+        for attempt in range(self.cfg.max_tries):
+            wait_s: float | None = None
+            try:
+                async with self.throttle.slot() as given_s:
+                    is_structured = not self._is_schema_refused  # another answer may have told meanwhile
+                    payload = body | ({"response_format": response_format(schema)} if is_structured else {})
+                    deadline_s = min(deadline_s, time.monotonic() + self.cfg.total_timeout_s)
+                    response = await self.send(payload)
+            except (TimeoutError, httpx.TimeoutException):
+                cause, detail = "timeout", f"no answer within {self.cfg.timeout_s:g} s"
+            except httpx.TransportError as error:
+                cause, detail = "connection", self.clean(f"{type(error).__name__} {error}")
+            except httpx.InvalidURL:
+                raise self.error("not a URL that can be asked", fix="check --teacher") from None
+            else:
+                status = response.status_code
+                if status == 200:
+                    found = read_completion(response)
+                    if isinstance(found, dict):
+                        self.throttle.succeeded()
+                        return found | {"structured": "json_schema" if is_structured else "plain"}
+                    cause, detail = "bad_reply", found
+                elif status in RETRIED_STATUS:
+                    cause, detail = f"http_{status}", self.detail(response)
+                    wait_s = retry_after_s(response)
+                    if status in BUSY_STATUS:
+                        self.throttle.was_busy(given_s, wait_s)
+                elif status in (400, 422) and is_structured:
+                    self._refuse_schema(response)
+                    wait_s = 0.0
+                else:
+                    self.stop_if_fatal(response)
+                    raise NoAnswer(f"refused_{status}", self.detail(response), is_final=True)
+            if attempt + 1 == self.cfg.max_tries:
+                break
+            pause_s = self._wait_s(attempt) if wait_s is None else wait_s
+            if time.monotonic() + pause_s >= deadline_s:
+                raise NoAnswer("total_timeout", f"no answer within {self.cfg.total_timeout_s:g} s; the last: {detail}")
+            self.num_retries += 1
+            await asyncio.sleep(pause_s)
+        raise NoAnswer(cause, detail)
+
+    def _refuse_schema(self, response: httpx.Response) -> None:
+        if not self._is_schema_refused:
+            log.warning("%s: refuses a JSON schema (%s); asking without one", self.shown, self.detail(response))
+        self._is_schema_refused = True
+
+    def _wait_s(self, attempt: int) -> float:
+        longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0**attempt)
+        return self._jitter.uniform(0.5, 1.0) * longest
+
+    # --- errors ---
+
+    async def find_model(self) -> str:
+        """Ask which models there are and check ours.
+
+        Raises:
+            TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
+        """
+        try:
+            with self._connection() as connection:
+                response = await connection.get(f"{self.url}/models")
+        except httpx.InvalidURL:
+            raise self.error("not a URL that can be asked", fix="check --teacher") from None
+        except httpx.HTTPError as error:
+            reason = self.clean(f"{type(error).__name__} {error}")
+            raise self.error(
+                "cannot reach the teacher", got=reason, fix="start the server or check --teacher"
+            ) from None
+        wanted = self.cfg.model
+        if response.status_code in (401, 403):
+            self.stop_if_fatal(response)
+        entries = read_models(response)
+        if entries is None:
+            if wanted:
+                return wanted  # some hosts list no models; the first request will tell
+            what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
+            raise self.error(what, got=f"HTTP {response.status_code}", fix="check the URL, or give --model")
+        names = [entry["id"] for entry in entries]
+        if wanted in names or (wanted is None and len(names) == 1):
+            found = wanted or names[0]
+            self.model_entry = entries[names.index(found)]
+            return str(found)
+        listed = ", ".join(names[:8]) or "none"
+        raise self.error(
+            "the endpoint does not have this model" if wanted else "the endpoint has several models",
+            got=wanted or f"{len(names)} models",
+            expected=f"one of {listed}",
+            fix="give --model",
+        )
+
+    def stop_if_fatal(self, response: httpx.Response) -> None:
+        """Raise for what would fail for every window."""
+        status, detail = response.status_code, self.detail(response)
+        if status in (401, 403):
+            raise self.error("the teacher refuses the key", got=f"HTTP {status} {detail}", fix=f"set {KEY_VARIABLE}")
+        if status == 404:
+            raise self.error(
+                "no such model or not a chat endpoint", got=f"HTTP 404 {detail}", fix="check URL and model"
+            )
+        if 300 <= status < 400 or status == 405:
+            raise self.error("not a chat endpoint", got=f"HTTP {status} {detail}", fix="check the URL")
+
+    def error(self, what: str, **parts: Any) -> TeacherError:
+        return TeacherError(what, where=self.shown, **parts)
+
+    def detail(self, response: httpx.Response) -> str:
+        """Give a server's error text, short and without the key."""
+        try:
+            value = parse_json(response.content)
+            error = value.get("error", value) if isinstance(value, dict) else value
+            text = str(error.get("message", error) if isinstance(error, dict) else error)
+        except ValueError:
+            text = response.text
+        return self.clean(text)
+
+    def clean(self, text: str) -> str:
+        """Cut a server's text short and take out the key, should the server echo it."""
+        text = " ".join(text.split())
+        secrets = [self._key, urlsplit(self.url).password or ""]
+        for secret in filter(None, secrets):
+            text = text.replace(secret, "***")
+        return text[:200]

@@ -1,0 +1,63 @@
+"""The command line: one command per stage. The only place with log handlers, tables on the terminal and exit codes.
+
+Nothing heavy is imported before a command runs, so that `cosfly --help` is instant.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from cosfly import __version__
+from cosfly.cli.caption import app as caption_app
+from cosfly.cli.distill import app as distill_app
+from cosfly.cli.release import app as release_app
+from cosfly.cli.run import app as run_app
+from cosfly.cli.stages import app as stages_app
+from cosfly.errors import CosflyError
+
+INTERRUPTED = 130  # the exit code of Ctrl-C: Typer makes it of a KeyboardInterrupt, without a word
+
+app = typer.Typer(
+    help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for group in (run_app, stages_app):
+    app.add_typer(group)  # without a name: its commands stand at the top
+for name, named_group in (("caption", caption_app), ("distill", distill_app), ("release", release_app)):
+    app.add_typer(named_group, name=name)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"cosfly {__version__}")
+        raise typer.Exit
+    from cosfly.console import set_up_logging
+
+    set_up_logging(verbose)
+
+
+def main() -> None:
+    """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
+    try:
+        app()
+    except CosflyError as error:
+        _fail(str(error), 1)
+    except SystemExit as end:
+        if end.code != INTERRUPTED:
+            raise
+        _fail("interrupted; finished work is kept: run the same command again to continue", INTERRUPTED)
+
+
+def _fail(message: str, status: int) -> None:
+    typer.echo(f"error: {message}", err=True)
+    sys.stderr.flush()
+    sys.exit(status)

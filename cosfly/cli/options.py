@@ -1,0 +1,110 @@
+"""What the commands share: their options, the settings they resolve, and how they tell what they made."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosfly.errors import ConfigError, InputError, nearest
+
+if TYPE_CHECKING:
+    from cosfly.settings import RunConfig
+
+
+class ResumeMode(StrEnum):
+    never = "never"
+    if_same = "if-same"
+    force = "force"
+
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with the settings of a run.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", "-s", metavar="A.B=C", help="Override one setting; may be repeated.")
+]
+Seed = Annotated[int | None, typer.Option(help="Seed; every random choice derives from it.")]
+Workers = Annotated[int | None, typer.Option(help="Worker processes; 0 takes one per core.")]
+ResumeOption = Annotated[
+    ResumeMode,
+    typer.Option(
+        help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
+    ),
+]
+OutOption = Annotated[Path, typer.Option(help="Output folder.")]
+MapOption = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
+]
+
+
+def resolve(
+    config: Path | None, overrides: list[str] | None, seed: int | None = None, workers: int | None = None
+) -> RunConfig:
+    """Resolve the settings: defaults, file, --set, then the plain options."""
+    from cosfly.config import load
+    from cosfly.settings import RunConfig
+
+    extra = [f"{name}={value}" for name, value in (("seed", seed), ("workers", workers)) if value is not None]
+    return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+
+
+def _config_path(config: Path | None) -> Path | None:
+    """A path, or the bare name of a configuration that ships with cosfly."""
+    from cosfly.config import shipped
+
+    if config is not None and not config.exists() and config.suffix == "" and len(config.parts) == 1:
+        packaged = shipped(f"{config}.yaml")
+        if packaged.exists():
+            return packaged
+        names = sorted(path.stem for path in packaged.parent.glob("*.yaml") if path.stem != "glossary")
+        raise ConfigError(
+            f"no such configuration{nearest(str(config), names)}", where=config,
+            expected=f"a YAML file, or one that ships: {', '.join(names)}",
+        )  # fmt: skip
+    return config
+
+
+def manner(cfg: RunConfig, resume: ResumeMode) -> dict[str, Any]:
+    """How a stage works, whatever it makes: arguments that all stages with workers take."""
+    from cosfly.settings import num_workers
+
+    return {"workers": num_workers(cfg.workers), "resume": resume.value}
+
+
+def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
+    """Name a stage's product. Nothing kept, or too much failed, is an error: whoever calls the next stage must know."""
+    from cosfly.store import read_json
+
+    typer.echo(product)
+    counts = read_json(out / "manifest.json")["counts"]
+    if counts["kept"] == 0:
+        got = {word: counts[word] for word in ("dropped", "failed") if counts[word]}
+        raise InputError("nothing was kept", where=out, got=str(got), fix="see the records in that folder")
+    check_failures({out.name: counts}, out / "failures.jsonl", cfg)
+
+
+def check_failures(counts_by_stage: dict[str, dict], where: Path, cfg: RunConfig) -> None:
+    """Exit 1, after everything was done, where more items failed than the settings accept."""
+    failed = {stage: counts["failed"] for stage, counts in counts_by_stage.items() if counts["failed"]}
+    if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
+        raise InputError(
+            "some items failed; the others are done",
+            where=where,
+            got=str(failed),
+            expected=f"at most {cfg.max_failed} (max_failed)",
+            fix="mend what the records name and run the same command again: only the failed ones are done again",
+        )
+
+
+def data_folder(data: Path | None) -> Path:
+    """The playback tree: given, or that of the run folder one stands in."""
+    if data is not None:
+        return data
+    for candidate in (Path("render"), Path()):
+        if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
+            return candidate
+    raise InputError(
+        "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
+    )

@@ -1,0 +1,116 @@
+"""The command `cosfly run`, and what tells of this installation: `cosfly config ...` and `cosfly doctor`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cosfly.cli.options import (
+    Overrides,
+    ResumeMode,
+    ResumeOption,
+    Seed,
+    Workers,
+    check_failures,
+    resolve,
+)
+
+if TYPE_CHECKING:
+    from cosfly.pipeline import StageResult
+
+app = typer.Typer()
+
+
+@app.command()
+def run(
+    config: Annotated[
+        Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, simworld, delft.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Run folder; by default runs/<name>.")] = None,
+    overrides: Overrides = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    resume: ResumeOption = ResumeMode.if_same,
+) -> None:
+    """Make a data set from a configuration: all stages in order. Run it again to continue."""
+    from cosfly import pipeline
+
+    cfg = resolve(config, overrides, seed, workers)
+    out = out or Path("runs") / cfg.name
+    results = pipeline.run(cfg, out, resume=resume.value)
+    _closing_table(results, out)
+    check_failures({r.stage: r.manifest["counts"] for r in results}, out, cfg)
+
+
+def _closing_table(results: list[StageResult], out: Path) -> None:
+    from rich.table import Table
+
+    from cosfly.console import console
+
+    table = Table(title=f"What was made in {out}", title_justify="left")
+    for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
+        table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
+    for result in results:
+        counts = result.manifest["counts"]
+        dropped, failed = (
+            ", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed")
+        )
+        seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
+        product = os.path.relpath(result.product, out)
+        table.add_row(result.stage, f"{counts['kept']} of {counts['input']}", dropped, failed, seconds, product)
+    console.print(table)
+    for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
+        console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)
+
+
+config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
+app.add_typer(config_app, name="config")
+
+
+@config_app.command("check")
+def config_check(
+    config: Annotated[Path, typer.Argument(help="YAML file, or the name of one that ships.")],
+    overrides: Overrides = None,
+) -> None:
+    """Check a configuration without running it; reports all problems at once."""
+    resolve(config, overrides)
+    typer.echo(f"{config}: ok")
+
+
+@config_app.command("show")
+def config_show(
+    config: Annotated[
+        Path | None, typer.Argument(help="YAML file, or the name of one that ships; none: the defaults.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Print the resolved configuration: every setting with its value."""
+    import yaml
+
+    cfg = resolve(config, overrides)
+    typer.echo(yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True), nl=False)
+
+
+@app.command()
+def doctor(
+    teacher: Annotated[str | None, typer.Option(help="URL of an endpoint to ask as well.")] = None,
+    out: Annotated[Path, typer.Option(help="Where runs will be written.")] = Path("runs"),
+) -> None:
+    """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from cosfly import doctor as examination
+
+    checks = examination.examine(out, teacher)
+    table = Table(show_header=False, box=None)
+    for check in checks:
+        color = {"ok": "green", "missing": "red", "optional": "yellow"}[check.state]
+        table.add_row(check.name, f"[{color}]{check.state}[/]", escape(check.detail))
+    Console().print(table)
+    if any(check.state == "missing" for check in checks):
+        raise typer.Exit(1)

@@ -1,0 +1,95 @@
+"""Figures of a flight: dynamics by discrete differentiation, distances, visibility (sec:step6). Used by planners and inspect."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosfly.geometry import DT_S
+
+ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
+
+
+def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> float:
+    """Root mean square of the length of a discrete derivative of a path.
+
+    Args:
+        positions_m: (n, 3). order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3).
+    Returns:
+        0 for a path of `order` points or fewer: it has no such difference.
+    Raises:
+        ValueError: positions are not (n, 3), or dt_s is not positive.
+    """
+    differences = np.diff(_path(positions_m), n=order, axis=0)
+    if dt_s <= 0:
+        raise ValueError(f"dt_s must be positive, not {dt_s}")
+    return float(np.sqrt((differences**2).sum(axis=1).mean())) / dt_s**order if len(differences) else 0.0
+
+
+def accel_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
+    """RMS acceleration of waypoints, m/s^2."""
+    return derivative_rms(positions_m, 2, dt_s)
+
+
+def jerk_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
+    """RMS jerk of waypoints, m/s^3."""
+    return derivative_rms(positions_m, 3, dt_s)
+
+
+def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
+    """Give S in (0, 1], 1 for uniform motion (eq:smoothness_score)."""
+    return float(np.exp(-0.5 * (accel_rms_mps2 / ACCEL_SCALE_MPS2 + jerk_rms_mps3 / JERK_SCALE_MPS3)))
+
+
+def length_m(positions_m: np.ndarray) -> float:
+    """Length of the polyline through (n, 3) points."""
+    return float(np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1).sum())
+
+
+def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
+    """Largest mean speed between neighbours; 0 for one point."""
+    steps = np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1)
+    return float(steps.max()) / dt_s if len(steps) else 0.0
+
+
+def flight_metrics(
+    positions_m: np.ndarray,
+    targets_m: np.ndarray,
+    visibility: np.ndarray,
+    clearances_m: np.ndarray,
+    ground_m: float,
+    dt_s: float = DT_S,
+) -> dict[str, float]:
+    """All figures of one flight, JSON-able, rounded to what a reader can use.
+
+    Args:
+        positions_m, targets_m: (n, 3). visibility, clearances_m: (n,). ground_m: altitudes are counted from here.
+    """
+    accel, jerk = accel_rms(positions_m, dt_s), jerk_rms(positions_m, dt_s)
+    altitudes = positions_m[:, 2] - ground_m
+    distances = np.linalg.norm(positions_m - targets_m, axis=1)
+    figures = {
+        "num_points": len(positions_m),
+        "length_m": length_m(positions_m),
+        "duration_s": (len(positions_m) - 1) * dt_s,
+        "speed_max_mps": speed_max_mps(positions_m, dt_s),
+        "visibility_mean": float(visibility.mean()),
+        "visibility_min": float(visibility.min()),
+        "blocked_fraction": float((visibility == 0).mean()),
+        "target_distance_mean_m": float(distances.mean()),
+        "target_distance_std_m": float(distances.std()),
+        "altitude_mean_m": float(altitudes.mean()),
+        "altitude_min_m": float(altitudes.min()),
+        "altitude_max_m": float(altitudes.max()),
+        "accel_rms_mps2": accel,
+        "jerk_rms_mps3": jerk,
+        "smoothness_score": smoothness_score(accel, jerk),
+        "clearance_min_m": float(clearances_m.min()),
+    }
+    return {name: round(value, 4) for name, value in figures.items()}
+
+
+def _path(positions_m: np.ndarray) -> np.ndarray:
+    positions = np.asarray(positions_m, dtype=np.float64)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions must be (n, 3), not {positions.shape}")
+    return positions

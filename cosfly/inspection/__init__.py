@@ -1,0 +1,1 @@
+"""Step 6: measure, accept, review or reject every flight."""

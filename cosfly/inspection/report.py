@@ -1,0 +1,209 @@
+"""`report.html` of the inspection: one self-contained page (no script, no network) for the person who decides."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.issues import Issue
+from cosfly.products.frames import read_rgb
+from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
+from cosfly.products.playback import Flight
+from cosfly.store import write_bytes
+
+CURVE_POINTS = 160
+
+STYLE = """
+:root { --accepted: #2f855a; --review: #b7791f; --rejected: #c53030; --other: #718096; --line: #e2e8f0; }
+* { box-sizing: border-box; }
+body { font: 14px/1.45 system-ui, "Noto Sans", "Noto Sans CJK SC", sans-serif; color: #1a202c; background: #f7fafc;
+  margin: 0 auto; padding: 24px 28px 60px; max-width: 1500px; }
+h1 { font-size: 22px; margin: 0 0 2px; } h2 { font-size: 16px; margin: 28px 0 8px; }
+p.lead { color: #4a5568; margin: 0 0 8px; }
+.funnel { background: #fff; border: 1px solid var(--line); border-radius: 8px; padding: 14px 18px; max-width: 860px; }
+.bar { display: grid; grid-template-columns: 330px 1fr 64px; align-items: center; gap: 12px; margin: 3px 0; }
+.bar.sub span:first-child { padding-left: 18px; color: #4a5568; }
+.bar i { display: block; height: 14px; border-radius: 3px; background: var(--other); min-width: 2px; }
+.bar i.zero { visibility: hidden; } .bar b { text-align: right; font-variant-numeric: tabular-nums; }
+i.accepted { background: var(--accepted); } i.review { background: var(--review); } i.rejected { background: var(--rejected); }
+.scroll { overflow-x: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
+table { border-collapse: collapse; width: 100%; }
+th { text-align: left; font-weight: 600; color: #4a5568; background: #edf2f7; position: sticky; top: 0; }
+th, td { padding: 7px 8px; border-bottom: 1px solid var(--line); vertical-align: top; white-space: nowrap; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.pictures img { height: 72px; border-radius: 4px; margin-right: 4px; vertical-align: top; }
+td.pictures .gone { display: inline-block; width: 128px; height: 72px; line-height: 72px; margin-right: 4px; border-radius: 4px;
+  background: #edf2f7; color: #718096; text-align: center; font-size: 12px; }
+.tag { display: inline-block; padding: 1px 8px; border-radius: 9px; color: #fff; font-size: 12px; font-weight: 600; }
+.tag.accepted { background: var(--accepted); } .tag.review { background: var(--review); } .tag.rejected { background: var(--rejected); }
+tr.open td { border-bottom: 0; } tr.wide td { padding-top: 0; }
+ul.issues { margin: 0; padding: 0 0 0 14px; font-size: 12.5px; white-space: normal; max-width: 1150px; color: #4a5568; }
+ul.issues li { overflow-wrap: anywhere; } ul.issues li.error b { color: var(--rejected); }
+ul.issues li.warning b { color: var(--review); }
+svg { display: block; } small { color: #718096; }
+"""
+
+# column title, metric, format
+COLUMNS = (
+    ("frames", "num_frames", "{:.0f}"),
+    ("m", "length_m", "{:.1f}"),
+    ("a m/s²", "accel_rms_mps2", "{:.2f}"),
+    ("j m/s³", "jerk_rms_mps3", "{:.2f}"),
+    ("S", "smoothness", "{:.3f}"),
+    ("five-ray", "five_ray_mean", "{:.3f}"),
+    ("rendered", "visibility_mean", "{:.3f}"),
+    ("visible", "visible_share", "{:.0%}"),
+    ("IoU", "track_quality", "{:.2f}"),
+)
+
+
+def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> dict[str, Any]:
+    """Give what a row shows, JSON-able: two curves, and the first, middle and last frame as small JPEGs.
+
+    Args:
+        heights_m: (n,) of the drone over the person. width_px: of the pictures; None stands for one that cannot be read.
+    """
+    rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
+    curves = {"height_m": heights_m[rows], "visibility": flight.visibility[rows]}
+    numbers = {
+        name: [None if np.isnan(v) else round(float(v), 3) for v in values.tolist()] for name, values in curves.items()
+    }
+    middle, last = len(flight) // 2, len(flight) - 1
+    return {**numbers, "pictures": [_thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)]}
+
+
+def _thumbnail(frame: Path, width_px: int) -> str | None:
+    try:
+        rgb = read_rgb(frame)
+    except InputError:
+        return None
+    size = (width_px, max(1, round(width_px * rgb.shape[0] / rgb.shape[1])))
+    small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def write_report(path: Path, inspection: Inspection, views: dict[str, dict[str, Any]]) -> None:
+    """Write the page; `views` holds pictures and curves by flight folder."""
+    write_bytes(path, report_html(inspection, views).encode())
+
+
+def report_html(inspection: Inspection, views: dict[str, dict[str, Any]]) -> str:
+    """Give the page's text. Flights that need a look come first."""
+    order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
+    counts = inspection.funnel.flights
+    summary = f"{counts.inspected} flights: {counts.accepted} accepted, {counts.review} to review, {counts.rejected} rejected."
+    heads = "".join(f'<th class="n">{escape(title)}</th>' for title, _, _ in COLUMNS)
+    rows = "\n".join(_row(flight, views.get(flight.folder, {})) for flight in order)
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>cosfly: inspection</title><style>{STYLE}</style></head><body>
+<h1>Inspection</h1>
+<p class="lead">{escape(summary)} A rejected flight breaks a rule; one in review is for a person to decide.</p>
+<h2>Funnel</h2>
+<div class="funnel">{_funnel(inspection)}</div>
+<h2>Flights</h2>
+<p class="lead">a, j: RMS acceleration and jerk of the plan; S: smoothness score; five-ray: mean visibility of the plan;
+rendered: mean visibility of the target in the frames; visible: frames that show it; IoU: projected box against mask.</p>
+<div class="scroll"><table><thead><tr><th>flight</th><th>first, middle, last frame</th>{heads}<th>height over person, visibility</th></tr></thead><tbody>
+{rows}
+</tbody></table></div>
+<h2>Settings</h2>
+<p class="lead">{escape(", ".join(f"{name} {value}" for name, value in inspection.settings.items()))}</p>
+</body></html>
+"""
+
+
+def _funnel(inspection: Inspection) -> str:
+    planned, flights = inspection.funnel.trajectories, inspection.funnel.flights
+    bars = [_bar("trajectories planned", planned.planned, planned.planned)]
+    for reason, count in planned.dropped.items():
+        bars.append(_bar(f"dropped before rendering: {reason}", count, planned.planned, "rejected", sub=True))
+    if planned.not_rendered:
+        bars.append(_bar("not rendered", planned.not_rendered, planned.planned, "rejected", sub=True))
+    bars.append(_bar("trajectories rendered", planned.rendered, planned.planned))
+    for result in RESULTS:
+        bars.append(_bar(result, getattr(planned, result), planned.planned, result, sub=True))
+    bars.append("<hr>")
+    bars.append(_bar("flights inspected (clean, perturbed)", flights.inspected, flights.inspected))
+    for result in RESULTS:
+        bars.append(_bar(result, getattr(flights, result), flights.inspected, result, sub=True))
+    for reason, count in flights.reasons.items():
+        bars.append(_bar(f"reason: {reason}", count, flights.inspected, sub=True))
+    return "\n".join(bars)
+
+
+def _bar(label: str, count: int, total: int, kind: str = "", *, sub: bool = False) -> str:
+    width = 100.0 * count / total if total else 0.0
+    shade = f"{kind} zero" if count == 0 else kind
+    return (
+        f'<div class="bar{" sub" if sub else ""}"><span>{escape(label.replace("_", " "))}</span>'
+        f'<i class="{shade}" style="width:{width:.1f}%"></i><b>{count}</b></div>'
+    )
+
+
+def _row(flight: FlightInspection, view: dict[str, Any]) -> str:
+    issues = "".join(_issue(issue) for issue in flight.issues if issue.severity != "note")
+    name = f"<b>{escape(flight.trajectory)}</b><br>{escape(flight.variant)} <small>{escape(flight.town)}</small>"
+    label = f'{name}<br><span class="tag {flight.result}">{flight.result}</span>'
+    wide = (
+        f'<tr class="wide"><td colspan="{len(COLUMNS) + 3}"><ul class="issues">{issues}</ul></td></tr>'
+        if issues
+        else ""
+    )
+    numbers = "".join(f'<td class="n">{_number(flight.metrics.get(key), form)}</td>' for _, key, form in COLUMNS)
+    pictures = "".join(
+        f'<img alt="frame" src="data:image/jpeg;base64,{picture}">'
+        if picture
+        else '<span class="gone">no picture</span>'
+        for picture in view.get("pictures", [None] * 3)
+    )
+    curves = _curve(view.get("height_m", []), "#2b6cb0", "m", least_span=5.0) + _curve(
+        view.get("visibility", []), "#2f855a", "", (0, 1)
+    )
+    first = '<tr class="open">' if issues else "<tr>"
+    return f'{first}<td>{label}</td><td class="pictures">{pictures}</td>{numbers}<td>{curves}</td></tr>{wide}'
+
+
+def _issue(issue: Issue) -> str:
+    times = f" &times;{issue.count}" if issue.count > 1 else ""
+    text = f"{issue.where}: {issue.got}; expected {issue.expected}"
+    return f'<li class="{issue.severity}"><b>{escape(issue.code)}</b>{times} {escape(text)}</li>'
+
+
+def _number(value: float | int | None, form: str) -> str:
+    return "&ndash;" if value is None else form.format(value)
+
+
+def _curve(
+    values: list[float | None],
+    color: str,
+    unit: str,
+    span: tuple[float, float] | None = None,
+    least_span: float = 0.0,
+) -> str:
+    """Draw a small curve with its range; a gap where a value is unknown. `least_span` keeps noise from looking like flight."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    low, high = span or (min(known), max(known))
+    spare = max(0.0, least_span - (high - low)) / 2.0
+    low, high = low - spare, high + spare
+    width, height = 150.0, 34.0
+    step, scale = width / max(1, len(values) - 1), (height - 4.0) / ((high - low) or 1.0)
+    parts, pen_is_down = [], False
+    for i, value in enumerate(values):
+        if value is None:
+            pen_is_down = False
+            continue
+        parts.append(f"{'L' if pen_is_down else 'M'}{i * step:.1f} {height - 2.0 - (value - low) * scale:.1f}")
+        pen_is_down = True
+    path = f'<path d="{"".join(parts)}" fill="none" stroke="{color}" stroke-width="1.5"/>'
+    label = f"<small>{min(known):.2f} to {max(known):.2f} {unit}</small>"
+    return f'<svg width="{width:.0f}" height="{height:.0f}">{path}</svg>{label}'

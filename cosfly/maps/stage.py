@@ -1,0 +1,76 @@
+"""Stage 1: a map of boxes from one of several sources. Each source is a module with `load(its settings, seed) -> BoxMap`."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from cosfly.config import Config
+from cosfly.maps.cityjson import CityJsonConfig
+from cosfly.maps.footprints import covered_ground
+from cosfly.maps.simworld import SimWorldConfig
+from cosfly.maps.synthetic import SyntheticConfig
+from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_bytes, write_json
+from cosfly.topview import draw_overview, png_bytes
+
+log = logging.getLogger(__name__)
+
+SOURCES = {
+    "synthetic": "cosfly.maps.synthetic:load",
+    "simworld": "cosfly.maps.simworld:load",
+    "cityjson": "cosfly.maps.cityjson:load",
+}
+
+
+class MapsConfig(Config):
+    """Where the map comes from."""
+
+    source: Literal["synthetic", "simworld", "cityjson"] = Field(
+        "synthetic", description="which of the sources to read"
+    )
+    synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
+    simworld: SimWorldConfig = Field(
+        default_factory=SimWorldConfig, description="a SimWorld world file with its asset sizes"
+    )
+    cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
+    picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
+
+
+def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
+    """Read or build the map that the settings name."""
+    module, _, function = SOURCES[cfg.source].partition(":")
+    return getattr(importlib.import_module(module), function)(getattr(cfg, cfg.source), seed)
+
+
+def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+    """Reads the source's files, if it has any; writes `boxes_3d.json`, `roi_polygon.json` and the overview `map.png`.
+
+    The region of interest is what the map has ground for: real maps are not rectangles, and outside of them there is nothing.
+    """
+    # Only the chosen source counts for resumption: the settings of the others change nothing.
+    config = {
+        "source": cfg.source,
+        cfg.source: getattr(cfg, cfg.source).model_dump(mode="json"),
+        "picture_px": cfg.picture_px,
+    }
+    inputs = getattr(cfg, cfg.source).inputs()
+    stage = StageFolder.open(out, "maps", config=config, inputs=inputs, seed=seed, resume=resume)
+    product = out / "boxes_3d.json"
+    if stage.is_complete:
+        return product
+    box_map = load_map(cfg, seed=seed)
+    write_boxes(product, box_map)
+    write_bytes(out / "map.png", png_bytes(draw_overview(box_map, size_px=cfg.picture_px)))
+    write_json(out / "roi_polygon.json", covered_ground(box_map).model_dump())
+    dropped = {str(k): int(v) for k, v in box_map.header.get("dropped_objects", {}).items()}
+    num_objects = int(box_map.header.get("num_objects", len(box_map)))
+    tally = Tally(num_input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
+    outputs = [product, out / "roi_polygon.json", out / "map.png"]
+    stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
+    return product

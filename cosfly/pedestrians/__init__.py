@@ -1,0 +1,1 @@
+"""Step 3: walks over the free ground."""

@@ -1,0 +1,236 @@
+"""Where people can walk on a map, and which cells serve as the ends of a walk (sec:step3).
+
+Grid, projection, inflation and connectivity of the pedestrian stage; the arithmetic on cells is in grid.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from cosfly.errors import NoPathError
+from cosfly.grid import (
+    HUMAN_HEIGHT_M,
+    RESOLUTION_M,
+    OccupancyGrid,
+    blocks_walking,
+    connected_parts,
+    empty_grid,
+    inflate,
+    occupancy,
+    roi_mask,
+    surface,
+)
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.roi import Roi
+
+log = logging.getLogger(__name__)
+
+GROUND_Z_M = 0.0  # tab:ped_params
+PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where people may walk.
+
+    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one cell
+    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, small components.
+    """
+
+    grid: OccupancyGrid
+    inflated: OccupancyGrid
+    parts: np.ndarray
+    is_in_roi: np.ndarray | None = None
+    counts: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def walkable(self) -> np.ndarray:
+        """(ny, nx) bool."""
+        return self.parts > 0
+
+    @cached_property
+    def row_ends(self) -> np.ndarray:
+        """(ny,) int64: how many walkable cells there are up to the end of each row."""
+        return np.cumsum(np.count_nonzero(self.walkable, axis=1))
+
+
+class Clock:
+    """Adds up the seconds of the stage's steps by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str) -> Iterator[None]:
+        start_s = time.perf_counter()
+        yield
+        self.add(step, time.perf_counter() - start_s)
+
+    def add(self, step: str, seconds: float) -> None:
+        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+
+
+def find_ground(
+    box_map: BoxMap,
+    roi: Roi | None = None,
+    *,
+    resolution_m: float = RESOLUTION_M,
+    human_height_m: float = HUMAN_HEIGHT_M,
+    safety_radius_m: float = 0.5,
+    surfaces: Literal["anywhere", "surfaces", "paved"] = "surfaces",
+    min_component_cells: int = 4000,
+    where: str | Path = "map",
+    roi_where: str | Path = "region of interest",
+    clock: Clock | None = None,
+) -> Ground:
+    """Find the ground that walks may use.
+
+    Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never cuts a
+    corner cannot pass between two cells that touch by a corner only, so an 8-connected component may hold several parts; both
+    ends of a walk are to be drawn from one part, and then a route always exists.
+
+    Args:
+        surfaces: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only. What lies outside a
+            city model's data has no obstacles either: without ground boxes below, nobody could tell it from a square.
+        where, roi_where: the files to name in an error.
+    Raises:
+        NoPathError: no cell is walkable, or no component is large enough.
+    """
+    clock = clock or Clock()
+    with clock("grid"):
+        empty = empty_grid(box_map, resolution_m)
+    with clock("project"):
+        grid = occupancy(box_map, height_m=human_height_m, ground_z_m=GROUND_Z_M, like=empty)
+        has_surface = _surface(box_map, surfaces, grid)
+        is_in_roi = None if roi is None else roi_mask(grid, roi)
+    with clock("inflate"):
+        inflated = inflate(grid, safety_radius_m)
+        free = ~inflated.occupied
+        num_free = _count(free)
+        for mask in (has_surface, is_in_roi):
+            if mask is not None:
+                free &= mask
+    counts: dict[str, Any] = {
+        "boxes": len(box_map),
+        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=human_height_m, ground_z_m=GROUND_Z_M)),
+        "grid": list(grid.size),
+        "cells": free.size,
+        "cells_occupied": _count(grid.occupied),
+        "cells_inflated": free.size - num_free,
+        "cells_free": num_free,
+        "cells_with_surface": None if has_surface is None else _count(has_surface),
+        "cells_in_roi": None if is_in_roi is None else _count(is_in_roi),
+        "cells_walkable": _count(free),
+    }
+    _check_walkable(counts, where, roi_where)
+    with clock("connectivity"):
+        place = where if roi is None else roi_where
+        parts = _parts_of_large_components(free, min_component_cells, counts, place)
+    return Ground(grid, inflated, parts, is_in_roi, counts)
+
+
+def _count(mask: np.ndarray) -> int:
+    return int(np.count_nonzero(mask))
+
+
+def _surface(box_map: BoxMap, surfaces: str, grid: OccupancyGrid) -> np.ndarray | None:
+    """Tell where there is ground as the settings want it; None for everywhere, also if the map has no ground at all."""
+    if surfaces == "anywhere":
+        return None
+    found = surface(box_map, GROUND_KINDS, like=grid, ground_z_m=GROUND_Z_M)
+    if found is None:
+        log.warning("%s has no ground boxes: people walk wherever nothing stands", box_map.name)
+        return None
+    if surfaces == "surfaces":
+        return found
+    paved = surface(box_map, PAVED_KINDS, like=grid, ground_z_m=GROUND_Z_M)
+    return np.zeros_like(found) if paved is None else paved
+
+
+def _parts_of_large_components(
+    free: np.ndarray, min_component_cells: int, counts: dict[str, Any], where: str | Path
+) -> np.ndarray:
+    """Label what a walk can reach within the large components; adds the component counts."""
+    components, sizes = connected_parts(free, 8)
+    is_large = sizes >= min_component_cells
+    if not is_large.any():
+        raise NoPathError(
+            "no connected walkable area is large enough",
+            where=where,
+            got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1}",
+            expected=f"at least {min_component_cells} cells (min_component_cells)",
+            fix="lower min_component_cells or safety_radius_m, or widen the region of interest",
+        )
+    parts, part_sizes = connected_parts(is_large[components], 4)
+    used = sorted(sizes[is_large].tolist(), reverse=True)
+    counts.update(components=len(sizes) - 1, components_used=len(used), component_sizes_used=used)
+    counts.update(cells_used=sum(used), parts=len(part_sizes) - 1)
+    return parts
+
+
+def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path) -> None:
+    if counts["cells_walkable"]:
+        return
+    if counts["cells_free"] and counts["cells_in_roi"] is None:
+        raise NoPathError(
+            "no free cell lies on the ground that the settings want",
+            where=where,
+            got=f"{counts['cells_free']} free cells, {counts['cells_with_surface']} cells with such ground",
+            fix="set ground to surfaces or anywhere",
+        )
+    if counts["cells_free"]:
+        raise NoPathError(
+            "the region of interest leaves no walkable cell",
+            where=roi_where,
+            got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
+            fix="draw it over free ground of this map, in the map's world metres",
+        )
+    raise NoPathError(
+        "the map leaves no walkable cell",
+        where=where,
+        got=f"{counts['cells_occupied']} of {counts['cells']} cells occupied by {counts['boxes_in_the_way']} boxes",
+        expected="free ground between the boxes",
+        fix="lower safety_radius_m, or check that ground boxes have a ground type (Roads, Sidewalks, Terrain, Ground)",
+    )
+
+
+# --- ends of a walk ---------------------------------------------------------------------------------------------------
+
+
+def sample_start(ground: Ground, rng: np.random.Generator) -> tuple[int, int]:
+    """Draw one walkable cell (x index, y index), every one equally likely."""
+    drawn = int(rng.integers(ground.row_ends[-1]))
+    y = int(np.searchsorted(ground.row_ends, drawn, side="right"))
+    columns = np.flatnonzero(ground.walkable[y])
+    return int(columns[drawn - ground.row_ends[y]]), y  # counted from the row's end: a negative index
+
+
+def sample_goal(
+    parts: np.ndarray, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
+) -> tuple[int, int] | None:
+    """Draw a cell of the start's part at a straight distance within [min_cells, max_cells], every one equally likely.
+
+    Returns:
+        (x index, y index), or None if there is no such cell.
+    """
+    reach = int(max_cells)
+    x, y = start
+    left, low = max(0, x - reach), max(0, y - reach)
+    window = parts[low : y + reach + 1, left : x + reach + 1]
+    squared = (np.arange(window.shape[0])[:, None] + low - y) ** 2 + (np.arange(window.shape[1]) + left - x) ** 2
+    fits = (window == parts[y, x]) & (squared >= min_cells**2) & (squared <= max_cells**2)
+    candidates = np.flatnonzero(fits)
+    if len(candidates) == 0:
+        return None
+    row, column = divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1])
+    return column + left, row + low

@@ -1,0 +1,214 @@
+"""`boxes_3d.json` and `step2_simplified.json`: boxes in the paper's fields (tab:boxes_schema)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosfly.errors import InputError, nearest
+from cosfly.geometry import axis_aligned_half_extents
+from cosfly.products.columns import rounded
+from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.store import check_schema, dump_json, read_json, write_bytes
+
+BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
+
+
+@dataclass(frozen=True)
+class BoxMap:
+    """A map of boxes, the product of stages 1 and 2.
+
+    centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
+    ids: (n,) uint64, unique and stable. `header` holds name, source, axes, ground height, and what a stage adds (passes).
+    """
+
+    centers: np.ndarray
+    half_extents: np.ndarray
+    rotations_deg: np.ndarray
+    kinds: np.ndarray
+    ids: np.ndarray
+    header: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    @property
+    def name(self) -> str:
+        return str(self.header.get("name", "map"))
+
+    @property
+    def mins(self) -> np.ndarray:
+        """(n, 3) low corners of the axis-aligned boxes round the rotated ones."""
+        return self.centers - axis_aligned_half_extents(self.half_extents, self.rotations_deg)
+
+    @property
+    def maxs(self) -> np.ndarray:
+        return self.centers + axis_aligned_half_extents(self.half_extents, self.rotations_deg)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Low and high corner of all boxes, (3,) each."""
+        return self.mins.min(axis=0), self.maxs.max(axis=0)
+
+    def select(self, index: np.ndarray) -> BoxMap:
+        """Give the boxes at an index or mask, header unchanged."""
+        return replace(
+            self,
+            centers=self.centers[index],
+            half_extents=self.half_extents[index],
+            rotations_deg=self.rotations_deg[index],
+            kinds=self.kinds[index],
+            ids=self.ids[index],
+        )
+
+    def counts(self) -> dict[str, int]:
+        """Boxes by kind name, largest first."""
+        numbers, counts = np.unique(self.kinds, return_counts=True)
+        order = sorted(zip(counts.tolist(), numbers.tolist(), strict=True), key=lambda pair: (-pair[0], pair[1]))
+        return {KIND_NAMES[number]: count for count, number in order}
+
+
+def make_box_map(
+    centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: dict | None = None
+) -> BoxMap:
+    """Make a BoxMap from anything array-like; ids default to 1..n."""
+    centers = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    return BoxMap(
+        centers,
+        np.asarray(half_extents, dtype=np.float64).reshape(-1, 3),
+        np.asarray(rotations_deg, dtype=np.float64).reshape(-1, 3),
+        np.asarray(kinds, dtype=np.uint8).reshape(-1),
+        np.arange(1, len(centers) + 1, dtype=np.uint64)
+        if ids is None
+        else np.asarray(ids, dtype=np.uint64).reshape(-1),
+        dict(header or {}),
+    )
+
+
+def check_boxes(box_map: BoxMap, where: str | Path) -> None:
+    """Check what every map must hold, whoever made it.
+
+    Raises:
+        InputError: NaN, a negative extent, an unknown kind or a repeated id; names the box and the field.
+    """
+    for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
+        bad = np.flatnonzero(~np.isfinite(getattr(box_map, name)).all(axis=1))
+        if len(bad):
+            row = int(bad[0])
+            raise InputError(
+                "a box is not finite", where=f"{where}: box {box_map.ids[row]}: {field_name}",
+                got=str(getattr(box_map, name)[row].tolist()), expected="finite numbers",
+            )  # fmt: skip
+    bad = np.flatnonzero((box_map.half_extents < 0).any(axis=1))
+    if len(bad):
+        row = int(bad[0])
+        raise InputError(
+            "a box has a negative extent", where=f"{where}: box {box_map.ids[row]}: extent",
+            got=str(box_map.half_extents[row].tolist()), expected="half sizes of at least 0 m",
+        )  # fmt: skip
+    unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
+    if unknown:
+        raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected="0 to 28")
+    ids, counts = np.unique(box_map.ids, return_counts=True)
+    if (counts > 1).any():
+        raise InputError("a box id occurs more than once", where=where, got=str(ids[counts > 1][0]))
+
+
+def write_boxes(path: Path, box_map: BoxMap) -> None:
+    """Write boxes in the paper's fields (tab:boxes_schema), one box a line."""
+    check_boxes(box_map, path)
+    columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
+    box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
+    mins, maxs = box_map.mins, box_map.maxs
+    low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
+    header = {
+        "schema": BOXES_SCHEMA,
+        "schema_version": BOXES_VERSION,
+        **box_map.header,
+        "axes": "right-handed, metres, x east, y north, z up; degrees",
+        "bounds": {"min": rounded(low), "max": rounded(high)},
+        "num_boxes": len(box_map),
+        "counts": box_map.counts(),
+    }
+    lines = []
+    for i in range(len(box_map)):
+        kind = KIND_NAMES[int(box_map.kinds[i])]
+        lines.append(
+            dump_json(
+                {
+                    "type": kind,
+                    "semantic_id": int(box_map.kinds[i]),
+                    "color": KIND_COLORS[kind],
+                    "id": int(box_map.ids[i]),
+                    "center": rounded(box_map.centers[i]),
+                    "extent": rounded(box_map.half_extents[i]),
+                    "rotation": rounded(box_map.rotations_deg[i]),
+                    "min": rounded(mins[i]),
+                    "max": rounded(maxs[i]),
+                }
+            )
+        )
+    text = dump_json(header, indent=1)[:-2] + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
+    write_bytes(path, text.encode())
+
+
+def read_boxes(path: Path) -> BoxMap:
+    """Read `boxes_3d.json` or `step2_simplified.json`; also a bare list of boxes, as the paper's exporter writes.
+
+    Raises:
+        InputError: names the file, the box and the field.
+    """
+    value = read_json(path, what="map")
+    header: dict[str, Any] = {"name": path.stem}
+    records: Any = value
+    if not isinstance(value, list):
+        header = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path)
+        records = header.pop("boxes", None)
+        if not isinstance(records, list):
+            raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
+    if not records:
+        raise InputError("the map holds no boxes", where=path, fix="check the source, or the stage that made it")
+    kinds, ids = [], []
+    for i, record in enumerate(records):
+        if not isinstance(record, dict):
+            raise InputError("not a box", where=f"{path}: boxes[{i}]", got=type(record).__name__, expected="an object")
+        kind = record.get("type")
+        if kind not in KINDS:
+            hint = nearest(str(kind), KINDS)
+            raise InputError(
+                f"unknown type{hint}",
+                where=f"{path}: boxes[{i}].type",
+                got=repr(kind),
+                expected="a CityObjectLabel name",
+            )
+        kinds.append(KINDS[kind])
+        box_id = record.get("id")
+        if not isinstance(box_id, int) or isinstance(box_id, bool) or not 0 <= box_id < 2**64:
+            raise InputError(
+                "not an id", where=f"{path}: boxes[{i}].id", got=repr(box_id), expected="a non-negative integer"
+            )
+        ids.append(box_id)
+    centers, extents, rotations = (_vectors(records, name, path) for name in ("center", "extent", "rotation"))
+    box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
+    check_boxes(box_map, path)
+    return box_map
+
+
+def _vectors(records: list[dict], name: str, path: Path) -> np.ndarray:
+    """Read one three-vector field of all records, (n, 3)."""
+    try:
+        values = np.array([record[name] for record in records])
+        if values.shape == (len(records), 3) and values.dtype.kind in "fiu":  # not numbers in quotes, not null
+            return values.astype(np.float64)
+    except (KeyError, TypeError, ValueError):
+        pass
+    for i, record in enumerate(records):  # slow, only to name the culprit
+        value = record.get(name)
+        ok = isinstance(value, list) and len(value) == 3 and all(type(v) in (int, float) for v in value)
+        if not ok:
+            raise InputError(
+                "not a vector", where=f"{path}: boxes[{i}].{name}", got=repr(value), expected="three numbers"
+            )
+    raise InputError("not vectors", where=f"{path}: boxes[].{name}", expected="three numbers each")

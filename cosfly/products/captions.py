@@ -1,0 +1,213 @@
+"""Chain-of-Cause captions on disk: the closed action set, the three-field answer, `captions.jsonl`.
+
+Shared by caption (which writes), distill and release (which read). How a decision is judged against the geometry lives in
+caption/truth/actions.py; here is only what an answer must look like.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.store import dump_json, model_lines, storage_errors
+
+# tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
+ACTION_GROUPS: dict[str, tuple[str, ...]] = {
+    "tracking": ("track_straight",),
+    "heading": ("yaw_left_to_follow", "yaw_right_to_follow", "circle_left", "circle_right"),
+    "vertical": ("ascend", "descend"),
+    "translation": ("move_forward", "move_backward", "strafe_left", "strafe_right"),
+    "speed": ("slow_down", "speed_up"),
+    "recovery": ("search_to_reacquire_target", "hover", "break_off", "return_to_home"),
+}
+ACTIONS: tuple[str, ...] = tuple(token for tokens in ACTION_GROUPS.values() for token in tokens)
+_TOKENS = frozenset(ACTIONS)
+
+FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
+MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
+# A Chinese character carries about as much as three Latin letters, so the same thought is a third as long.
+MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
+
+Language = Literal["en", "zh"]
+Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
+CAPTION_VERSION: Literal["1.0"] = "1.0"
+
+
+def normalize_action(text: str) -> str | None:
+    """Give the token for any spelling (spaces, hyphens, case, surrounding quotes), None if it is not in the closed set."""
+    if text in _TOKENS:
+        return text
+    token = re.sub(r"[\s\-_]+", "_", text.strip().strip("\"'`*.。 ").lower())
+    return token if token in _TOKENS else None
+
+
+class Coc(BaseModel):
+    """One Chain-of-Cause answer in one language."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    critical_components: str
+    reasoning_trace: str
+    flight_decision: str
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """A checked answer: `coc` is None when the structure is wrong, for the `reason`; `recovered` names what was mended."""
+
+    coc: Coc | None
+    reason: str | None = None
+    recovered: tuple[str, ...] = ()
+
+
+_FENCE = re.compile(r"```(?:json)?\s*(.*?)```", re.DOTALL | re.IGNORECASE)
+_THINKING = re.compile(r"<think(?:ing)?>.*?</think(?:ing)?>", re.DOTALL | re.IGNORECASE)
+_TRAILING_COMMA = re.compile(r",(\s*[}\]])")
+_DECODER = json.JSONDecoder(strict=False)  # servers return raw control characters inside strings
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+def parse_answer(text: str, language: Language = "en") -> Parsed:
+    """Check the structure of a raw answer (phase 3 of sec:appendix_e).
+
+    Common wrappers are taken off and named in `recovered`: thinking tags, code fences, prose round the object, trailing
+    commas, raw control characters inside strings. Anything else is a failure with a reason word.
+    """
+    recovered: list[str] = []
+    if "<" in text and _THINKING.search(text):
+        text = _THINKING.sub("", text)
+        recovered.append("thinking_tags")
+    fenced = _FENCE.search(text) if "```" in text else None
+    if fenced:
+        text = fenced.group(1)
+        recovered.append("code_fence")
+    value, problem = _load_object(text, recovered)
+    if problem:
+        return Parsed(None, problem, tuple(recovered))
+    assert isinstance(value, dict)
+    if set(value) != set(FIELDS):
+        return Parsed(None, "missing_field" if set(FIELDS) - set(value) else "extra_field", tuple(recovered))
+    if not all(isinstance(value[name], str) for name in FIELDS):
+        return Parsed(None, "field_not_text", tuple(recovered))
+    if any(_CONTROL.search(value[name]) for name in FIELDS):
+        value = {name: _CONTROL.sub("", value[name]) for name in FIELDS}
+        recovered.append("control_characters")
+    cleaned = {name: value[name].strip() for name in FIELDS}
+    minimum = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
+    for name, characters in minimum.items():
+        if len(cleaned[name]) < characters:
+            return Parsed(None, f"{name}_too_short", tuple(recovered))
+    action = normalize_action(cleaned["flight_decision"])
+    if action is None:
+        return Parsed(None, "decision_not_in_closed_set", tuple(recovered))
+    return Parsed(Coc(**{**cleaned, "flight_decision": action}), None, tuple(recovered))
+
+
+def _load_object(text: str, recovered: list[str]) -> tuple[dict | None, str | None]:
+    """Find the one JSON object in a text; gives (object, None) or (None, reason)."""
+    start = text.find("{")
+    if start < 0:
+        return None, "empty" if not text.strip() else "no_json_object"
+    for word in (None, "trailing_comma"):
+        candidate = _TRAILING_COMMA.sub(r"\1", text) if word else text
+        try:
+            start = candidate.find("{")
+            value, end = _DECODER.raw_decode(candidate, start)
+        except (ValueError, RecursionError):
+            continue
+        if word:
+            recovered.append(word)
+        if candidate[:start].strip() or candidate[end:].strip():
+            if "{" in candidate[end:]:
+                return None, "several_json_objects"
+            recovered.append("prose_around")
+        return value, None
+    return None, "broken_json"
+
+
+# --- captions.jsonl ---------------------------------------------------------------------------------------------------
+
+
+class Prompt(BaseModel):
+    """What the teacher was asked in one language, images aside."""
+
+    model_config = ConfigDict(extra="forbid")
+    system: str
+    user: str
+
+
+class Caption(BaseModel):
+    """One line of `captions.jsonl`: one window, its answers, and everything that was found out about them.
+
+    `en` and `zh` are None only when the window was dropped before an answer of the right structure existed.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    schema_version: Literal["1.0"] = CAPTION_VERSION
+    sample_id: str
+    town: str
+    trajectory: str
+    variant: str
+    frame_index: int
+    window: list[int]
+    future: list[int]
+    prompt: dict[str, Prompt]  # language -> prompt
+    prompt_hash: str
+    teacher: dict[str, Any]  # kind: rules | endpoint | vllm, model, settings
+    usage: dict[str, int]  # prompt_tokens, completion_tokens
+    attempts: int
+    en: Coc | None = None
+    zh: Coc | None = None
+    label: str | None  # ground-truth decision from the future geometry; None: geometry cannot tell
+    verdict: Verdict | None = None
+    judge: dict[str, Any] | None = None
+    repair: dict[str, Any] | None = None  # strategy, asks, first_decision
+    checks: dict[str, Any] = {}  # structure, evidence, bilingual: "ok" or a reason
+    status: Literal["accepted", "dropped"]
+    drop_reason: str | None = None
+
+
+def write_captions(path: Path, captions: Iterable[Caption]) -> int:
+    """Write `captions.jsonl` (one line per caption, in the order given) under a temporary name, then rename.
+
+    Streams, so memory stays flat. Returns the number of lines.
+    """
+    return write_caption_lines(path, (dump_json(caption.model_dump(mode="json")) + "\n" for caption in captions))
+
+
+def write_caption_lines(path: Path, lines: Iterable[str]) -> int:
+    """The same for captions that are text already, as `caption_lines` gives them."""
+    partial = path.with_name(f".{path.name}.partial")
+    count = 0
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "w", encoding="utf-8") as file:
+            for line in lines:
+                file.write(line)
+                count += 1
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    return count
+
+
+def read_captions(path: Path) -> Iterator[Caption]:
+    """Yield the captions of `captions.jsonl`.
+
+    Raises:
+        InputError: names the file, the line and the field.
+    """
+    return (caption for _, caption in caption_lines(path))
+
+
+def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
+    """Yield each line of `captions.jsonl` as it stands there, its end included, and what it says; raises as `read_captions`."""
+    return model_lines(path, Caption, what="captions", fix="run cosfly caption first")

@@ -1,0 +1,57 @@
+"""Columns of numbers in JSON: how the products read and write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import InputError
+
+
+def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
+    """Micrometres are enough for a map, and short numbers keep files small."""
+    return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
+
+
+def records(value: dict, name: str, path: Path) -> list[dict]:
+    records = value.get(name)
+    if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
+        raise InputError("not a list of objects", where=f"{path}: {name}")
+    return records
+
+
+def text_id(record: dict, where: str) -> str:
+    if not isinstance(record.get("id"), str):
+        raise InputError("not an id", where=f"{where}.id", got=repr(record.get("id")), expected="text")
+    return record["id"]
+
+
+def column(record: dict, name: str, where: str, length: int | None = None) -> np.ndarray:
+    """Read a list of finite numbers, (n,) float64."""
+    try:
+        column = np.array(record[name], dtype=np.float64)
+    except KeyError:
+        raise InputError("missing", where=f"{where}.{name}", expected="a list of numbers") from None
+    except (TypeError, ValueError):
+        column = np.empty((0, 0))
+    if column.ndim != 1 or len(column) == 0 or not np.isfinite(column).all() or length not in (None, len(column)):
+        wanted = "a list of finite numbers" if length is None else f"{length} finite numbers"
+        raise InputError("not a column", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
+    return column
+
+
+def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
+    """Read a list of vectors of finite numbers, (n, width) float64."""
+    try:
+        matrix = np.array(record.get(name), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty((0, 0))
+    if matrix.ndim != 2 or matrix.shape[1] != width or not np.isfinite(matrix).all():
+        raise InputError(
+            "not a list of vectors",
+            where=f"{where}.{name}",
+            got=repr(record.get(name))[:60],
+            expected=f"{width} finite numbers each",
+        )
+    return matrix

@@ -1,0 +1,110 @@
+"""`inspect.json`, the product of step 6: one record per flight and the funnel. Written by inspection, read by release."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cosfly.errors import InputError
+from cosfly.issues import Issue
+from cosfly.store import check_schema, read_json, write_json
+
+INSPECT_SCHEMA, INSPECT_VERSION = "cosfly.inspect", "1.0"
+
+Result = Literal["accepted", "review", "rejected"]
+RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
+
+
+class FlightInspection(BaseModel):
+    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    town: str
+    trajectory: str
+    variant: str
+    folder: str
+    trace_id: str | None
+    result: Result
+    issues: list[Issue]
+    metrics: dict[str, float | int | None]
+
+    @property
+    def reason(self) -> str | None:
+        """Code of the worst finding, None when the flight is accepted."""
+        return self.issues[0].code if self.result != "accepted" and self.issues else None
+
+
+class TrajectoryFunnel(BaseModel):
+    """planned = sum(dropped) + not_rendered + rendered; rendered = accepted + review + rejected."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    planned: int
+    dropped: dict[str, int]
+    not_rendered: int
+    rendered: int
+    accepted: int
+    review: int
+    rejected: int
+
+    def check(self) -> None:
+        """Assert that nothing was lost on the way."""
+        assert self.planned == sum(self.dropped.values()) + self.not_rendered + self.rendered, self
+        assert self.rendered == self.accepted + self.review + self.rejected, self
+
+
+class FlightFunnel(BaseModel):
+    """inspected = accepted + review + rejected; `reasons` counts the worst finding of those in review or rejected."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    inspected: int
+    accepted: int
+    review: int
+    rejected: int
+    without_trace: int
+    reasons: dict[str, int]
+
+
+class Funnel(BaseModel):
+    """The way from planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    trajectories: TrajectoryFunnel
+    flights: FlightFunnel
+
+
+class Inspection(BaseModel):
+    """The whole file."""
+
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+    settings: dict[str, Any]
+    funnel: Funnel
+    flights: list[FlightInspection]
+
+
+def write_inspection(path: Path, inspection: Inspection) -> None:
+    """Write `inspect.json`."""
+    header = {"schema": INSPECT_SCHEMA, "schema_version": INSPECT_VERSION}
+    write_json(path, {**header, **inspection.model_dump(mode="json")})
+
+
+def read_inspection(path: Path) -> Inspection:
+    """Read `inspect.json`.
+
+    Raises:
+        InputError: names the file and the field.
+    """
+    value = check_schema(read_json(path, what="inspection"), INSPECT_SCHEMA, INSPECT_VERSION, path)
+    body = {key: item for key, item in value.items() if key not in ("schema", "schema_version")}
+    try:
+        return Inspection.model_validate(body)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        field = ".".join(str(part) for part in detail["loc"])
+        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None

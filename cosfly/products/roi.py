@@ -1,0 +1,71 @@
+"""`roi_polygon.json`: where pedestrians may walk. The paper's form, and ours with holes and several outer rings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cosfly.errors import InputError
+from cosfly.store import read_json
+
+
+class RoiPolygon(BaseModel):
+    """One outer ring with holes, world x and y in metres."""
+
+    model_config = ConfigDict(extra="allow")
+    points_world: list[tuple[float, float]]
+    holes: list[list[tuple[float, float]]] = []
+
+
+class Roi(BaseModel):
+    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings."""
+
+    model_config = ConfigDict(extra="allow")
+    description: str = ""
+    closed: bool = True
+    points_world: list[tuple[float, float]] = []
+    holes: list[list[tuple[float, float]]] = []
+    polygons: list[RoiPolygon] = []
+
+    def rings(self) -> list[RoiPolygon]:
+        """All polygons in one form."""
+        own = [RoiPolygon(points_world=self.points_world, holes=self.holes)] if self.points_world else []
+        return own + self.polygons
+
+
+def read_roi(path: Path) -> Roi:
+    """Read a region of interest.
+
+    Raises:
+        InputError: malformed, not closed, or a ring of fewer than three finite points.
+    """
+    value = read_json(path, what="region of interest")
+    try:
+        roi = Roi.model_validate(value)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        place = ".".join(map(str, detail["loc"])) or "top level"
+        what = "not an object" if detail["type"] == "model_type" else detail["msg"]
+        raise InputError(what, where=f"{path}: {place}", got=repr(detail["input"])[:80]) from None
+    if not roi.closed:
+        raise InputError(
+            "the polygon is not closed",
+            where=f"{path}: closed",
+            got="false",
+            expected="true",
+            fix="close it in the editor",
+        )
+    if not roi.rings():
+        raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
+    for number, polygon in enumerate(roi.rings()):
+        for ring in (polygon.points_world, *polygon.holes):
+            if len(ring) < 3 or not np.isfinite(np.array(ring, dtype=np.float64)).all():
+                raise InputError(
+                    "not a ring",
+                    where=f"{path}: polygon {number}",
+                    got=f"{len(ring)} points",
+                    expected="at least three finite points",
+                )
+    return roi

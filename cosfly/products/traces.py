@@ -1,0 +1,87 @@
+"""`drone_trace.json`, the product of step 4: one flight for each walk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.geometry import DT_S
+from cosfly.products.columns import column, records, rounded, text_id
+from cosfly.store import check_schema, read_json, write_json
+
+TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
+
+
+@dataclass(frozen=True)
+class DroneTrace:
+    """One flight, the product of stage 4; n points at the pedestrian's time stamps.
+
+    time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the target.
+    targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
+    clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts.
+    drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are rendered.
+    """
+
+    path_id: str
+    planner: str
+    time_s: np.ndarray
+    positions_m: np.ndarray
+    rotations_deg: np.ndarray
+    targets_m: np.ndarray
+    visibility: np.ndarray
+    clearances_m: np.ndarray
+    metrics: dict = field(default_factory=dict)
+    solver: dict = field(default_factory=dict)
+    drop_reason: str | None = None
+
+    def as_json(self) -> dict:
+        names = ("x", "y", "z")
+        return {
+            "id": self.path_id,
+            "planner": self.planner,
+            "drop_reason": self.drop_reason,
+            "metrics": self.metrics,
+            "solver": self.solver,
+            "t": rounded(self.time_s, 4),
+            "drone": {
+                **{axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate(names)},
+                **{name: rounded(self.rotations_deg[:, k], 4) for k, name in enumerate(("pitch", "yaw", "roll"))},
+            },
+            "target": {axis: rounded(self.targets_m[:, k], 4) for k, axis in enumerate(names)},
+            "visibility": rounded(self.visibility, 4),
+            "clearance": rounded(self.clearances_m, 4),
+        }
+
+    @classmethod
+    def from_json(cls, record: dict, where: str) -> DroneTrace:
+        time_s = column(record, "t", where)
+        groups = {}
+        for group, names in (("drone", ("x", "y", "z", "pitch", "yaw", "roll")), ("target", ("x", "y", "z"))):
+            part = record.get(group)
+            if not isinstance(part, dict):
+                raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
+            groups[group] = np.stack([column(part, name, f"{where}.{group}", len(time_s)) for name in names], axis=1)
+        return cls(
+            text_id(record, where), str(record.get("planner", "")), time_s, groups["drone"][:, :3], groups["drone"][:, 3:],
+            groups["target"], column(record, "visibility", where, len(time_s)),
+            column(record, "clearance", where, len(time_s)), record.get("metrics", {}), record.get("solver", {}), record.get("drop_reason"),
+        )  # fmt: skip
+
+
+def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:
+    """Write `drone_trace.json`; `header` holds the map's name, planner settings and seed."""
+    value = {"schema": TRACE_SCHEMA, "schema_version": TRACE_VERSION, **header, "dt_s": DT_S}
+    write_json(path, {**value, "traces": [t.as_json() for t in traces]}, indent=None)
+
+
+def read_traces(path: Path) -> list[DroneTrace]:
+    """Read `drone_trace.json`.
+
+    Raises:
+        InputError: names the file, the trace and the field.
+    """
+    value = check_schema(read_json(path, what="drone traces"), TRACE_SCHEMA, TRACE_VERSION, path)
+    return [DroneTrace.from_json(r, f"{path}: traces[{i}]") for i, r in enumerate(records(value, "traces", path))]

@@ -1,0 +1,71 @@
+"""`path.json`, the product of step 3: one timed walk for each path id."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.geometry import DT_S
+from cosfly.products.columns import column, matrix, records, rounded, text_id
+from cosfly.store import check_schema, read_json, write_json
+
+# The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
+PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)
+TARGET_HEIGHT_M = 0.9  # hip height over the ground: the box stands on it
+
+PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
+
+
+@dataclass(frozen=True)
+class PedestrianPath:
+    """One walk, the product of stage 3.
+
+    polyline_m: (k, 2) the A* route. time_s: (n,), step DT_S, from 0. positions_m: (n, 3), feet on the ground. speeds_mps: (n,).
+    """
+
+    path_id: str
+    polyline_m: np.ndarray
+    time_s: np.ndarray
+    positions_m: np.ndarray
+    speeds_mps: np.ndarray
+
+    def as_json(self) -> dict:
+        return {
+            "id": self.path_id,
+            "start": rounded(self.polyline_m[0]),
+            "goal": rounded(self.polyline_m[-1]),
+            "length_m": round(float(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1).sum()), 3),
+            "polyline": [rounded(p, 4) for p in self.polyline_m],
+            "t": rounded(self.time_s, 4),
+            **{axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate("xyz")},
+            "speed": rounded(self.speeds_mps, 4),
+        }
+
+    @classmethod
+    def from_json(cls, record: dict, where: str) -> PedestrianPath:
+        columns = {name: column(record, name, where) for name in ("t", "x", "y", "z", "speed")}
+        lengths = {name: len(column) for name, column in columns.items()}
+        if len(set(lengths.values())) != 1:
+            raise InputError("columns of different lengths", where=where, got=str(lengths))
+        polyline = matrix(record, "polyline", 2, where)
+        positions = np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
+        return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"])
+
+
+def write_paths(path: Path, paths: list[PedestrianPath], header: dict) -> None:
+    """Write `path.json`; `header` holds the map's name, seed and whatever the stage wants on record."""
+    value = {"schema": PATHS_SCHEMA, "schema_version": PATHS_VERSION, **header, "dt_s": DT_S}
+    write_json(path, {**value, "paths": [p.as_json() for p in paths]}, indent=None)
+
+
+def read_paths(path: Path) -> list[PedestrianPath]:
+    """Read `path.json`.
+
+    Raises:
+        InputError: names the file, the path and the field.
+    """
+    value = check_schema(read_json(path, what="pedestrian paths"), PATHS_SCHEMA, PATHS_VERSION, path)
+    return [PedestrianPath.from_json(r, f"{path}: paths[{i}]") for i, r in enumerate(records(value, "paths", path))]

@@ -1,0 +1,1 @@
+"""The default renderer: OpenGL without a window."""

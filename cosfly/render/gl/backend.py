@@ -1,0 +1,393 @@
+"""The default renderer: OpenGL without a window (EGL), one pass into colour, z-depth in metres, and kind + instance id.
+
+Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as float32, not taken from the depth buffer.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cosfly.errors import EnvironmentMissing, RenderError
+from cosfly.products.frames import SKY_DEPTH_M
+from cosfly.products.kinds import KINDS
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, Look
+from cosfly.render.gl import meshes
+from cosfly.render.gl import parts as part_tables
+from cosfly.render.gl.body import Body
+from cosfly.render.gl.parts import PART
+from cosfly.render.gl.scene import Scene
+
+log = logging.getLogger(__name__)
+
+DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
+SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
+AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
+LARGEST_SHADOW_AREA_M = 420.0
+MAX_BONES = 6
+EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
+DEPTH_ONLY, MESH_STRIDE = -1, 64
+PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
+
+
+def open_context() -> Any:
+    """Open a GL context without a window.
+
+    Raises:
+        EnvironmentMissing: no moderngl, no EGL or no driver; names the packages.
+    """
+    try:
+        import moderngl
+
+        settings: Any = {"backend": "egl"}  # moderngl's own annotation of this argument is wrong
+
+        return moderngl.create_context(require=330, standalone=True, **settings)
+    except ImportError as error:
+        raise EnvironmentMissing("the package moderngl is missing", got=str(error), fix="pip install cosfly") from None
+    except Exception as error:  # glcontext raises a bare Exception, and OSError where the library is missing
+        raise EnvironmentMissing(
+            "no OpenGL without a window (EGL)",
+            got=str(error),
+            fix=f"apt-get install {DEBIAN_PACKAGES} (these serve the CPU too)",
+        ) from None
+
+
+def gl_report() -> str:
+    """Say what OpenGL there is, one line: backend, vendor, renderer, version.
+
+    Raises:
+        EnvironmentMissing: there is none; names the reason and the packages.
+    """
+    context = open_context()
+    info = context.info
+    context.release()
+    return ", ".join(["EGL", *(str(info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))])
+
+
+def is_missing() -> str | None:
+    """Give the reason that there is no OpenGL here, or None."""
+    try:
+        gl_report()
+    except EnvironmentMissing as error:
+        return str(error)
+    return None
+
+
+def _source(*names: str) -> str:
+    folder = Path(__file__).parent
+    return "#version 330 core\n" + "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+class GlRenderer:
+    """Draws a scene on EGL. One object holds one GL context and belongs to the thread that made it."""
+
+    name = "gl"
+
+    def __init__(self, scene: Scene, width_px: int, height_px: int, look: Look) -> None:
+        self.scene, self.width_px, self.height_px, self.look = scene, width_px, height_px, look
+        self.context = open_context()
+        with self.context:
+            self._make_programs()
+            self._make_targets()
+            self._make_meshes()
+        self.prepare(*_bounds(scene))
+
+    # --- set-up ---
+
+    def _make_programs(self) -> None:
+        make = self.context.program
+        self._materials = [
+            make(
+                _source("part.glsl", "scene.vert.glsl"),
+                _source("light.glsl", "scene.frag.glsl").replace("MATERIAL;", f"{material};"),
+            )
+            for material in range(part_tables.NUM_MATERIALS)
+        ]
+        self._depth_program = make(_source("part.glsl", "depth.vert.glsl"), _source("depth.frag.glsl"))
+        self._sky_program = make(_source("screen.vert.glsl"), _source("light.glsl", "sky.frag.glsl"))
+        self._sky = self.context.vertex_array(self._sky_program, [])
+
+    def _make_targets(self) -> None:
+        size, context = (self.width_px, self.height_px), self.context
+        self._color = context.texture(size, 4)
+        self._depth = context.texture(size, 1, dtype="f4")
+        self._tags = context.texture(size, 1, dtype="u4")
+        self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
+        self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
+        self._shadow.compare_func = "<="
+        self._shadow.repeat_x = self._shadow.repeat_y = False
+        self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
+        self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
+        self._height.repeat_x = self._height.repeat_y = False
+        self._height.filter = (self.context.NEAREST, self.context.NEAREST)  # it is smooth already, and this is faster
+
+    def _make_meshes(self) -> None:
+        """The vertices and triangles of every mesh, and an instance buffer for each; vertex arrays are made when needed."""
+        self._meshes = [
+            (self.context.buffer(mesh.vertices.tobytes()), self.context.buffer(mesh.triangles.tobytes()))
+            for mesh in meshes.all_meshes()
+        ]
+        self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
+        self._groups = _groups(self.scene.parts.records, self.scene.parts.mesh)
+
+    def _array(self, material: int, mesh: int) -> tuple[Any, Any]:
+        """Vertex array and instance buffer of a material (or DEPTH_ONLY) on a mesh."""
+        if (material, mesh) not in self._arrays:
+            program = self._depth_program if material == DEPTH_ONLY else self._materials[material]
+            vertices, triangles = self._meshes[mesh]
+            instances = self.context.buffer(reserve=PART.itemsize, dynamic=True)
+            content = [
+                _attributes(program, vertices, "3f 3f", ("in_position", "in_normal")),
+                _attributes(
+                    program, instances, "3f 3f 4f 4f 1u 1f /i",
+                    ("in_center", "in_half", "in_quaternion", "in_color", "in_tag", "in_bias"),
+                ),
+            ]  # fmt: skip
+            self._arrays[material, mesh] = (
+                self.context.vertex_array(program, content, index_buffer=triangles),
+                instances,
+            )
+        return self._arrays[material, mesh]
+
+    # --- what holds for a whole flight ---
+
+    def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners; once for each flight."""
+        low, high = np.asarray(low_m) - self.scene.origin_m, np.asarray(high_m) - self.scene.origin_m
+        middle = (low + high) / 2.0
+        half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
+        parts = self.scene.parts
+        near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
+        casting = np.flatnonzero(near & (parts.max_px > 1e8))
+        with self.context:
+            self._prepare_shadow(casting, middle, half)
+            self._prepare_openness(casting, middle, half)
+
+    def _prepare_shadow(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
+        sun = self.look.sun_direction()
+        side = np.cross([0.0, 0.0, 1.0], sun)
+        side /= np.linalg.norm(side)
+        axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
+        away = (self.scene.parts.object_centers[casting] - middle) @ sun
+        depth_half = float(
+            (np.abs(away) + self.scene.parts.object_radii[casting]).max(initial=half)
+        )  # towers cast from afar
+        clip_from_world = np.eye(4)
+        clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
+        clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
+        self._draw_depth(self._shadow_target, clip_from_world, casting)
+        to_texture = np.diag([0.5, 0.5, 0.5, 1.0])
+        to_texture[:3, 3] = 0.5
+        for program in self._materials:
+            _set(program, "shadow_from_world", to_texture @ clip_from_world)
+
+    def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
+        """A height map from above, blurred: what stands higher than a point darkens it."""
+        parts = self.scene.parts
+        ground_z = self.scene.ground_z_m - self.scene.origin_m[2]
+        top = float((parts.object_centers[casting, 2] + parts.object_radii[casting]).max(initial=ground_z)) + 1.0
+        depth_m = top - ground_z + 10.0
+        clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
+        clip_from_world[:3, 3] = -middle[0] / half, -middle[1] / half, 2.0 * top / depth_m - 1.0
+        texture = self.context.depth_texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX))
+        target = self.context.framebuffer(depth_attachment=texture)
+        self._draw_depth(target, clip_from_world, casting)
+        share = np.frombuffer(texture.read(alignment=1), np.float32).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX)
+        heights = (top - share * depth_m).astype(np.float32)
+        heights[share >= 1.0] = ground_z
+        heights = np.minimum(heights, ground_z + TALLEST_AMBIENT_M).astype(np.float32)
+        sigma_px = AMBIENT_BLUR_M / (2.0 * half / HEIGHT_SIZE_PX)
+        self._height.write(np.ascontiguousarray(cv2.GaussianBlur(heights, (0, 0), max(sigma_px, 0.5))).tobytes())
+        target.release()
+        texture.release()
+        low = middle[:2] - half
+        for program in self._materials:
+            _set(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
+
+    def _draw_depth(self, target: Any, clip_from_world: np.ndarray, rows: np.ndarray) -> None:
+        target.use()
+        target.clear(depth=1.0)
+        self.context.enable_only(self.context.DEPTH_TEST)
+        _set(self._depth_program, "clip_from_world", clip_from_world)
+        for mesh in range(len(self._meshes)):
+            self._draw(DEPTH_ONLY, mesh, self.scene.parts.records[rows[self.scene.parts.mesh[rows] == mesh]])
+
+    # --- one frame ---
+
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: Body | None) -> Frame:
+        """Draw one frame.
+
+        Args:
+            camera_pose: (4, 4) world_from_camera, OpenCV axes; intrinsic: (3, 3) px; person: who walks there, or None.
+        Raises:
+            RenderError: the pose is not finite.
+        """
+        if not (np.isfinite(camera_pose).all() and np.isfinite(intrinsic).all()):
+            raise RenderError("the camera pose is not finite", got=str(camera_pose.tolist()))
+        eye = camera_pose[:3, 3] - self.scene.origin_m
+        with self.context:
+            self._set_camera(camera_pose[:3, :3], eye, intrinsic)
+            self._set_person(person)
+            rows = self._seen(camera_pose[:3, :3], eye, intrinsic)
+            self._image.use()
+            self._image.clear(depth=1.0)
+            self.context.enable_only(self.context.DEPTH_TEST | self.context.CULL_FACE)
+            self.context.front_face = "cw"  # the image is upside down for GL: row 0 is the top
+            self.context.depth_func = "<="
+            self._shadow.use(0)
+            self._height.use(1)
+            self._draw_scene(rows, person)
+            # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
+            self.context.disable(self.context.CULL_FACE)
+            self._sky.render(vertices=3)
+            return self._read()
+
+    def _set_camera(self, world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray) -> None:
+        lens = np.array([intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]])
+        offset = np.mod(self.scene.origin_m[:2], PATTERN_M)
+        common = {
+            "lens": lens,
+            "image_size": np.array([self.width_px, self.height_px]),
+            "sun_direction": self.look.sun_direction(),
+            "haze_m": self.look.haze_m,
+            "exposure": self.look.exposure,
+            "clip_m": np.array([NEAR_M, FAR_M]),
+            "camera_from_world": world_from_camera.T,
+            "world_from_camera": world_from_camera,
+            "camera_position": eye,
+            "world_offset": offset,
+            "ground_z": self.scene.ground_z_m - self.scene.origin_m[2],
+            "shadow_map": 0,
+            "height_map": 1,
+            "sky_depth_m": SKY_DEPTH_M,
+            "sky_tag": KINDS["Sky"],
+        }
+        for program in (*self._materials, self._sky_program):
+            for name, value in common.items():
+                _set(program, name, value)
+
+    def _set_person(self, person: Body | None) -> None:
+        """Hand the body's shadow to the shader."""
+        bones = np.zeros((MAX_BONES, 2, 4), np.float32)
+        count, center = 0, np.zeros(3)
+        if person is not None:
+            count, center = len(person.bones_m), person.center_m - self.scene.origin_m
+            assert count <= MAX_BONES
+            bones[:count, :, :3] = person.bones_m - self.scene.origin_m
+            bones[:count, 0, 3] = person.bone_radii_m
+        for program in self._materials:
+            if "person_bones" in program:
+                program["person_bones"].write(bones.tobytes())
+            _set(program, "person_num_bones", count)
+            _set(program, "person_center", center)
+
+    def _seen(self, world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray) -> np.ndarray:
+        """Rows of the parts to draw, nearest objects first: in the frustum, large enough, in the right form."""
+        parts = self.scene.parts
+        in_camera = (parts.object_centers - eye.astype(np.float32)) @ world_from_camera.astype(np.float32)
+        x, y, z = in_camera.T
+        radius = parts.object_radii
+        f = float(intrinsic[0, 0])
+        tan_x, tan_y = _largest_tangents(intrinsic, self.width_px, self.height_px)
+        inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
+        inside &= np.abs(x) - z * tan_x < radius * np.sqrt(1.0 + tan_x**2)
+        inside &= np.abs(y) - z * tan_y < radius * np.sqrt(1.0 + tan_y**2)
+        size_px = f * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)
+        inside &= (size_px >= np.maximum(parts.min_px, SMALLEST_PX)) & (size_px < parts.max_px)
+        rows = np.flatnonzero(inside)
+        return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
+
+    def _draw_scene(self, rows: np.ndarray, person: Body | None) -> None:
+        """Draw standing things before the ground, near before far: what is hidden costs nothing."""
+        records, groups = self.scene.parts.records[rows], self._groups[rows]
+        if person is not None:
+            body = person.records.copy()
+            body["center"] = person.centers_m - self.scene.origin_m
+            records = np.concatenate([body, records])
+            groups = np.concatenate([_groups(body, person.mesh), groups])
+        for material in part_tables.DRAW_ORDER:
+            for mesh in range(len(self._meshes)):
+                self._draw(material, mesh, records[groups == material * MESH_STRIDE + mesh])
+
+    def _draw(self, material: int, mesh: int, records: np.ndarray) -> None:
+        if len(records) == 0:
+            return
+        array, instances = self._array(material, mesh)
+        if instances.size < records.nbytes:
+            instances.orphan(2 * records.nbytes)
+        else:
+            instances.orphan()
+        instances.write(records.tobytes())
+        array.render(instances=len(records))
+
+    def _read(self) -> Frame:
+        shape = (self.height_px, self.width_px)
+        color = np.empty((*shape, 4), np.uint8)
+        depth, tag = np.empty(shape, np.float32), np.empty(shape, np.uint32)
+        self._image.read_into(color, components=4, attachment=0)
+        self._image.read_into(depth, components=1, attachment=1, dtype="f4")
+        self._image.read_into(tag, components=1, attachment=2, dtype="u4")
+        return Frame(
+            smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB)),
+            depth,
+            (tag & 0xFF).astype(np.uint8),
+            (tag >> 16).astype(np.uint16),
+        )
+
+    def describe(self) -> dict[str, str]:
+        """Name the device for the record."""
+        return {
+            "renderer": self.name,
+            "device": self.context.info["GL_RENDERER"],
+            "version": self.context.info["GL_VERSION"],
+        }
+
+    def close(self) -> None:
+        self.context.release()
+
+
+def smoothed(rgb: np.ndarray) -> np.ndarray:
+    """Soften the steps of edges in a picture, (h, w, 3) uint8, where brightness jumps; the rest stays as it is."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    steps = cv2.absdiff(gray, cv2.GaussianBlur(gray, (3, 3), 0.8))
+    _, mask = cv2.threshold(steps, EDGE_LEVELS, 255, cv2.THRESH_BINARY)
+    return cv2.copyTo(cv2.GaussianBlur(rgb, (3, 3), EDGE_BLUR_PX), mask, rgb)
+
+
+def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """One number for each material and mesh, (k,)."""
+    return ((records["tag"] >> 8) & 0xFF).astype(np.int64) * MESH_STRIDE + mesh
+
+
+def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    centers = scene.parts.object_centers[:-1] if len(scene.parts) > 1 else scene.parts.object_centers
+    return centers.min(axis=0) + scene.origin_m, centers.max(axis=0) + scene.origin_m
+
+
+def _attributes(program: Any, buffer: Any, layout: str, names: tuple[str, ...]) -> tuple:
+    """Buffer layout for a program: attributes that its compiler left out become padding."""
+    kinds = layout.split()
+    suffix = kinds.pop() if kinds[-1].startswith("/") else ""
+    used = [name in program for name in names]
+    padded = [kind if use else f"{4 * int(kind[:-1])}x" for kind, use in zip(kinds, used, strict=True)]
+    return (buffer, " ".join(padded) + suffix, *(name for name, use in zip(names, used, strict=True) if use))
+
+
+def _largest_tangents(intrinsic: np.ndarray, width_px: int, height_px: int) -> tuple[float, float]:
+    cx, cy = intrinsic[0, 2], intrinsic[1, 2]
+    return max(cx, width_px - cx) / intrinsic[0, 0], max(cy, height_px - cy) / intrinsic[1, 1]
+
+
+def _set(program: Any, name: str, value: Any) -> None:
+    """Set a uniform that the program uses; matrices are given row by row and stored column by column."""
+    if name not in program:
+        return  # the compiler leaves out what a material does not need
+    if isinstance(value, np.ndarray):
+        program[name].write(np.ascontiguousarray(value.T, dtype=np.float32).tobytes())
+    else:
+        program[name].value = value

@@ -1,0 +1,354 @@
+"""What a house, a tree, a car or a lamp looks like: the parts of each kind of box.
+
+Every part stays inside the box it stands for, so that what the planners know of collision and visibility stays true.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cosfly.products.kinds import KINDS
+from cosfly.render.gl import meshes
+from cosfly.render.gl.parts import (  # fmt: skip
+    BARK,
+    BRICK,
+    BUS,
+    CABIN,
+    CAR_PAINT,
+    CLOTH,
+    CONCRETE,
+    FACADE,
+    FAR_PX,
+    FENCE,
+    GRASS,
+    GRAVEL,
+    LAMP,
+    LAYERS,
+    LEAVES,
+    METAL,
+    PLAIN,
+    ROAD,
+    ROAD_LINE,
+    RUBBER,
+    SIDEWALK,
+    SIGNAL,
+    WATER,
+    Boxes,
+    PartBuilder,
+)
+
+EDGE_GAP_M, MOST_EDGED = 0.05, 4000
+
+BUILDING_COLORS = np.array([
+    [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58], [0.42, 0.40, 0.38],
+    [0.70, 0.54, 0.36], [0.50, 0.45, 0.40], [0.62, 0.46, 0.36], [0.78, 0.75, 0.69], [0.38, 0.43, 0.47], [0.52, 0.28, 0.20],
+])  # fmt: skip
+BARK_COLOR = np.array([0.16, 0.11, 0.075])
+CAR_COLORS = np.array([
+    [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26], [0.23, 0.25, 0.27],
+    [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
+])  # fmt: skip
+LEAF_COLORS = np.array(
+    [[0.085, 0.165, 0.035], [0.11, 0.19, 0.045], [0.065, 0.135, 0.035], [0.15, 0.20, 0.05], [0.075, 0.155, 0.055]]
+)
+
+
+def _slab(material: int, color: tuple[float, float, float], kind: str):
+    """A ground surface: the box itself, lengthwise, in its layer."""
+
+    def build(builder: PartBuilder, boxes: Boxes) -> None:
+        boxes = boxes.lengthwise()
+        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color), layer=LAYERS[kind])
+
+    return build
+
+
+def _sidewalks(builder: PartBuilder, boxes: Boxes) -> None:
+    """Pavement; the shader draws a kerb along the open edges, which stand in the seed."""
+    boxes = boxes.lengthwise()
+    boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
+    builder.add(boxes, meshes.BOX, boxes.half, SIDEWALK, np.array([0.36, 0.345, 0.32]), layer=LAYERS["Sidewalks"])
+
+
+def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
+    """Tell beyond which edges no other box of the kind follows.
+
+    Args:
+        height_share: where along the height to look, -1 the bottom, 1 the top; slack_m: how much higher or lower it may be.
+    Returns:
+        (n,) numbers of bits -x, +x, -y, +y; no edge in vast maps, all edges of a box alone.
+    """
+    n, bits = len(boxes), np.zeros(len(boxes))
+    reach = boxes.half + np.array([0.0, 0.0, slack_m])
+    if n > MOST_EDGED:
+        return bits
+    for bit, (axis, side) in enumerate(((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0))):
+        is_open = np.zeros(n, dtype=bool)
+        for share in (-0.9, 0.0, 0.9):
+            local = np.zeros((n, 3))
+            local[:, axis] = side * (boxes.half[:, axis] + EDGE_GAP_M)
+            local[:, 1 - axis] = share * boxes.half[:, 1 - axis]
+            local[:, 2] = height_share * boxes.half[:, 2]
+            probes = boxes.centers + np.einsum("nij,nj->ni", boxes.turns, local)
+            for row, probe in enumerate(probes):
+                inside = np.abs(np.einsum("nji,nj->ni", boxes.turns, probe - boxes.centers)) <= reach
+                is_open[row] |= not inside.all(axis=1).any()
+        bits += np.where(is_open, 2.0**bit, 0.0)
+    return bits
+
+
+def _solid(material: int, color: tuple[float, float, float]):
+    """A standing thing drawn as its box."""
+
+    def build(builder: PartBuilder, boxes: Boxes) -> None:
+        boxes = boxes.lengthwise()
+        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color))
+
+    return build
+
+
+def plain(builder: PartBuilder, boxes: Boxes) -> None:
+    shades = np.array(
+        [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
+    )
+    builder.add(boxes, meshes.BOX, boxes.half, PLAIN, boxes.pick(shades))
+
+
+def _buildings(builder: PartBuilder, boxes: Boxes) -> None:
+    """Houses; the shader makes storeys, windows and a roof whose rim follows the open edges (the seed's whole part)."""
+    colors = boxes.pick(BUILDING_COLORS)
+    edged = replace(boxes, seeds=boxes.seeds * 0.999 + _open_edges(boxes, height_share=0.98, slack_m=0.0))
+    builder.add(edged, meshes.BOX, boxes.half, FACADE, colors)
+
+
+def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
+    """Trees, bushes, hedges and lawns, told apart by the shape of the box."""
+    hx, hy, hz = boxes.half.T
+    wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
+    is_flat = hz < 0.2
+    is_hedge = ~is_flat & (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
+    is_bush = ~is_flat & ~is_hedge & (hz < 1.3)
+    is_trunk = ~(is_flat | is_bush) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
+    is_tree = ~(is_flat | is_hedge | is_bush | is_trunk)
+    leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
+    builder.add(boxes.select(is_flat), meshes.BOX, boxes.half[is_flat], GRASS, leaf[is_flat], layer=LAYERS["RoadLines"])
+    builder.add(boxes.select(is_hedge), meshes.BOX, boxes.half[is_hedge], LEAVES, leaf[is_hedge])
+    _bushes(builder, boxes.select(is_bush), leaf[is_bush])
+    trunks = boxes.select(is_trunk)
+    builder.add(trunks, meshes.CYLINDER, trunks.half, BARK, BARK_COLOR)
+    is_crown = is_tree & _over_a_trunk(boxes, trunks)
+    _crowns(builder, boxes.select(is_crown), leaf[is_crown], np.full(int(is_crown.sum()), -1.0))
+    is_tree &= ~is_crown
+    is_conifer = is_tree & (boxes.chance(5) < 0.18) & (hz > 1.6 * wide)
+    _conifers(builder, boxes.select(is_conifer), leaf[is_conifer])
+    _broadleaves(builder, boxes.select(is_tree & ~is_conifer), leaf[is_tree & ~is_conifer])
+
+
+def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
+    h = boxes.half
+    builder.add(boxes, meshes.BLOB_COARSE, h, LEAVES, leaf, max_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB, h * [0.72, 0.72, 0.98], LEAVES, leaf, min_px=FAR_PX)
+    for side in (-1.0, 1.0):
+        offset = h * [0.42 * side, 0.25 * side, -0.25]
+        builder.add(
+            boxes, meshes.BLOB, h * [0.56, 0.6, 0.72], LEAVES, leaf * (1.0 + 0.12 * side), offset=offset, min_px=FAR_PX
+        )
+
+
+def _over_a_trunk(boxes: Boxes, trunks: Boxes) -> np.ndarray:
+    """Tell which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
+    if len(trunks) == 0:
+        return np.zeros(len(boxes), dtype=bool)
+    gap, nearest = cKDTree(trunks.centers[:, :2]).query(boxes.centers[:, :2])
+    foot = trunks.centers[nearest, 2] - trunks.half[nearest, 2]
+    return (gap < boxes.half[:, :2].max(axis=1) + 1.0) & (boxes.centers[:, 2] - boxes.half[:, 2] > foot + 0.8)
+
+
+def _broadleaves(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
+    """A trunk and a crown over it."""
+    h = boxes.half
+    crown_low = np.where(h[:, 2] > 1.0 * np.maximum(h[:, 0], h[:, 1]), -0.38, -0.55)
+    _trunk(builder, boxes, crown_low + 0.75)
+    _crowns(builder, boxes, leaf, crown_low)
+
+
+def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> None:
+    """Foliage from `crown_low` (n,), in units of the half height, to the top: blobs inside the inscribed ellipsoid."""
+    h = boxes.half
+    crown_half = h * np.stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0], axis=1)
+    crown_center = h * np.stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0], axis=1)
+    builder.add(boxes, meshes.BLOB_COARSE, crown_half, LEAVES, leaf, offset=crown_center, max_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB_FINE, crown_half * 0.74, LEAVES, leaf, offset=crown_center, min_px=FAR_PX)
+    for number in range(7):
+        radius = 0.40 + 0.13 * boxes.chance(10 + number)
+        angle = 2.0 * np.pi * (number / 6.0 + boxes.chance(30)) + 0.5 * boxes.chance(20 + number)
+        lift = np.where(number == 6, 0.9, 0.62 * np.sin(2.6 * number + 6.28 * boxes.chance(31)))
+        flat = np.sqrt(np.maximum(0.0, 1.0 - lift**2))
+        direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), lift], axis=1)
+        offset = crown_center + crown_half * direction * (1.0 - radius)[:, None]
+        shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
+        builder.add(boxes, meshes.BLOB, crown_half * radius[:, None], LEAVES, shade, offset=offset, min_px=FAR_PX)
+
+
+def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
+    h = boxes.half
+    dark = leaf * [0.6, 0.75, 0.85]
+    builder.add(boxes, meshes.CONE, h * [1, 1, 0.92], LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
+    _trunk(builder, boxes, np.full(len(h), -0.5))
+    for low, top, radius in ((-0.78, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
+        size = h * [radius, radius, (top - low) / 2.0]
+        builder.add(boxes, meshes.CONE, size, LEAVES, dark, offset=h * [0, 0, (low + top) / 2.0], min_px=FAR_PX)
+
+
+def _trunk(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
+    """A trunk from the box's bottom to `top` (n,), in units of the half height."""
+    h = boxes.half
+    radius = np.clip(0.075 * np.minimum(h[:, 0], h[:, 1]), 0.05, 0.32)
+    radius = np.minimum(radius, np.minimum(h[:, 0], h[:, 1]))
+    size = np.stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0], axis=1)
+    offset = np.stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0], axis=1)
+    builder.add(boxes, meshes.CYLINDER, size, BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
+
+
+_WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the cylinder's axis along the car's y
+
+
+def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float) -> None:
+    h = boxes.half
+    thick = 0.16 * h[:, 1]
+    size = np.stack([radius, radius, thick], axis=1)
+    for front in (-along, along):
+        for side in (-1.0, 1.0):
+            offset = np.stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]], axis=1)
+            builder.add(boxes, meshes.CYLINDER, size, RUBBER, np.array([0.02, 0.02, 0.022]), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
+
+
+def _cars(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h, paint = boxes.half, boxes.pick(CAR_COLORS)
+    builder.add(boxes, meshes.ROUNDED, h * [1, 0.97, 0.36], CAR_PAINT, paint, offset=h * [0, 0, -0.36])
+    builder.add(boxes, meshes.CABIN, h * [0.56, 0.84, 0.37], CABIN, paint, offset=h * [-0.08, 0, 0.3])
+    builder.add(boxes, meshes.CABIN, h * [0.36, 0.69, 0.19], CAR_PAINT, paint, offset=h * [-0.08, 0, 0.81])
+    _wheels(builder, boxes, np.minimum(0.43 * h[:, 2], 0.2 * h[:, 0]), 0.6)
+
+
+def _trucks(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h, paint = boxes.half, boxes.pick(CAR_COLORS)
+    builder.add(boxes, meshes.BOX, h * [0.7, 1, 0.83], PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17])
+    builder.add(boxes, meshes.ROUNDED, h * [0.27, 0.94, 0.46], CAR_PAINT, paint, offset=h * [0.72, 0, -0.3])
+    builder.add(boxes, meshes.CABIN, h * [0.26, 0.92, 0.3], CABIN, paint, offset=h * [0.68, 0, 0.3])
+    _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.68)
+
+
+def _buses(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h = boxes.half
+    builder.add(boxes, meshes.BOX, h * [1, 1, 0.9], BUS, boxes.pick(CAR_COLORS[3:6]), offset=h * [0, 0, 0.1])
+    _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.62)
+
+
+def _two_wheelers(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h = boxes.half
+    radius = np.minimum(0.4 * h[:, 0], 0.62 * h[:, 2])
+    size = np.stack([radius, radius, np.minimum(0.05, h[:, 1])], axis=1)
+    for front in (-1.0, 1.0):
+        offset = np.stack([front * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]], axis=1)
+        builder.add(boxes, meshes.CYLINDER, size, RUBBER, np.array([0.03, 0.03, 0.03]), offset=offset, turn=_WHEEL_TURN)
+    builder.add(boxes, meshes.ROUNDED, h * [0.5, 0.25, 0.22], CAR_PAINT, boxes.pick(CAR_COLORS), offset=h * [0, 0, 0.1])
+    builder.add(boxes, meshes.BOX, h * [0.06, 0.95, 0.06], METAL, np.array([0.1, 0.1, 0.1]), offset=h * [0.45, 0, 0.9])
+
+
+def _pole(builder: PartBuilder, boxes: Boxes, most_m: float = 0.1) -> None:
+    h = boxes.half
+    radius = np.minimum(np.minimum(h[:, 0], h[:, 1]), most_m)
+    size = np.stack([radius, radius, 0.985 * h[:, 2]], axis=1)
+    builder.add(boxes, meshes.CYLINDER, size, METAL, np.array([0.17, 0.18, 0.18]), offset=h * [0, 0, -0.015])
+
+
+def _poles(builder: PartBuilder, boxes: Boxes) -> None:
+    """A pole; tall ones carry lamps at the ends of an arm where the box is wide enough for one."""
+    boxes = boxes.lengthwise()
+    is_head = boxes.half[:, 2] < boxes.half[:, 0]  # maps that keep arm and head apart from the pole
+    heads = boxes.select(is_head)
+    builder.add(heads, meshes.ROUNDED, heads.half, LAMP, np.array([0.17, 0.17, 0.17]))
+    boxes = boxes.select(~is_head)
+    _pole(builder, boxes)
+    lamps = boxes.select(boxes.half[:, 2] > 1.2)
+    h = lamps.half
+    grey = np.array([0.2, 0.2, 0.2])
+    size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)], axis=1)
+    builder.add(lamps, meshes.BOX, size, METAL, grey, offset=h * [0, 0, 0.96], min_px=FAR_PX)
+    head = np.stack(
+        [np.minimum(0.9 * h[:, 0], 0.35), np.minimum(h[:, 1], 0.16), np.minimum(0.04 * h[:, 2], 0.1)], axis=1
+    )
+    for side in (-1.0, 1.0):
+        offset = np.stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]], axis=1)
+        builder.add(lamps, meshes.ROUNDED, head, LAMP, np.array([0.75, 0.74, 0.68]), offset=offset)
+
+
+def _traffic_lights(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h = boxes.half
+    _pole(builder, boxes)
+    head = np.stack([np.minimum(h[:, 0], 0.22), np.minimum(h[:, 1], 0.2), np.minimum(0.35 * h[:, 2], 0.55)], axis=1)
+    offset = np.stack([h[:, 0] - head[:, 0], 0 * h[:, 1], h[:, 2] - head[:, 2]], axis=1)
+    arm = np.stack([h[:, 0], np.minimum(h[:, 1], 0.05), np.minimum(0.05 * h[:, 2], 0.05)], axis=1)
+    builder.add(boxes, meshes.BOX, arm, METAL, np.array([0.14, 0.14, 0.14]), offset=h * [0, 0, 0.9])
+    builder.add(boxes, meshes.BOX, head, SIGNAL, np.array([0.03, 0.035, 0.03]), offset=offset)
+
+
+def _signs(builder: PartBuilder, boxes: Boxes) -> None:
+    boxes = boxes.lengthwise()
+    h = boxes.half
+    _pole(builder, boxes, 0.04)
+    colors = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
+    size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.03), np.minimum(h[:, 0], 0.5 * h[:, 2])], axis=1)
+    offset = np.stack([0 * h[:, 0], 0 * h[:, 1], h[:, 2] - size[:, 2]], axis=1)
+    builder.add(boxes, meshes.BOX, size, METAL, boxes.pick(colors), offset=offset)
+
+
+def _bystanders(builder: PartBuilder, boxes: Boxes) -> None:
+    """People of the map stand still: trousers, coat, head."""
+    h = boxes.half
+    coats = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
+    builder.add(boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], CLOTH, np.array([0.05, 0.06, 0.09]), offset=h * [0, 0, -0.54])
+    builder.add(boxes, meshes.ROUNDED, h * [0.55, 0.85, 0.36], CLOTH, boxes.pick(coats), offset=h * [0, 0, 0.28])
+    builder.add(
+        boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], CLOTH, np.array([0.5, 0.32, 0.22]), offset=h * [0, 0, 0.82]
+    )
+
+
+BUILDERS = {
+    KINDS[name]: build
+    for name, build in {
+        "Roads": _slab(ROAD, (0.095, 0.095, 0.1), "Roads"),
+        "Sidewalks": _sidewalks,
+        "Terrain": _slab(GRASS, (0.105, 0.14, 0.045), "Terrain"),
+        "Ground": _slab(GRAVEL, (0.30, 0.275, 0.235), "Ground"),
+        "RoadLines": _slab(ROAD_LINE, (0.62, 0.62, 0.6), "RoadLines"),
+        "RailTrack": _slab(GRAVEL, (0.20, 0.18, 0.165), "RailTrack"),
+        "Water": _slab(WATER, (0.03, 0.07, 0.09), "Water"),
+        "Buildings": _buildings,
+        "Walls": _solid(BRICK, (0.42, 0.24, 0.18)),
+        "Fences": _solid(FENCE, (0.30, 0.23, 0.16)),
+        "GuardRail": _solid(METAL, (0.42, 0.43, 0.44)),
+        "Bridge": _solid(CONCRETE, (0.42, 0.41, 0.39)),
+        "Poles": _poles,
+        "TrafficLight": _traffic_lights,
+        "TrafficSigns": _signs,
+        "Vegetation": _vegetation,
+        "Pedestrians": _bystanders,
+        "Car": _cars,
+        "Truck": _trucks,
+        "Bus": _buses,
+        "Train": _buses,
+        "Motorcycle": _two_wheelers,
+        "Bicycle": _two_wheelers,
+        "Rider": _two_wheelers,
+    }.items()
+}

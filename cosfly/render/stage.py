@@ -1,0 +1,270 @@
+"""Stage 5: flights to RGB, depth and instance frames in the playback tree; the clean and the perturbed track.
+
+A renderer is anything that meets `frame.Renderer`; RENDERERS names them. `instance.png` carries the boxes' ids as
+`scene.instance_ids` says, and the person's id is always `scene.PERSON_ID`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from cosfly.chance import rng_for
+from cosfly.config import Config
+from cosfly.errors import ConfigError, InputError
+from cosfly.geometry import intrinsic_matrix
+from cosfly.kernels import obstacle_index
+from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.playback import Camera
+from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.render.contract import Frame, Look, Renderer
+from cosfly.render.flight import FlightPlan, Writing, render_flight
+from cosfly.render.gl.scene import PERSON_ID, SHARED_ID, InstanceIds, Scene, build_scene, instance_ids
+from cosfly.render.person import choose_clothes, walk_of
+from cosfly.render.perturbation import Ground, PerturbationConfig, Perturbed, Poses, perturb
+from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.stage_folder import Resume, StageFolder
+from cosfly.store import CHECKSUMS, atomic_folder, write_json
+
+__all__ = ["RENDERERS", "Frame", "Look", "RenderConfig", "Renderer", "open_renderer", "plan_flight", "run"]
+
+log = logging.getLogger(__name__)
+
+RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer"}
+VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
+IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
+
+
+class RenderConfig(Config):
+    """Camera, tracks and files of the frames."""
+
+    backend: Literal["gl"] = Field("gl", description="renderer; gl is OpenGL without a window, on a GPU or the CPU")
+    width_px: int = Field(1280, ge=16, le=8192, description="image width, px")
+    height_px: int = Field(720, ge=16, le=8192, description="image height, px")
+    fovs_deg: tuple[float, ...] = Field(
+        (110.0, 90.0, 60.0, 30.0),
+        min_length=1,
+        description="horizontal fields of view, degrees; each flight draws one and keeps it, a single value fixes it",
+    )
+    town: str | None = Field(None, description="name of the tree's top folder; null takes the map's name")
+    first_timestamp: int = Field(
+        1_776_000_000, ge=0, description="flight k of the traces becomes trajectory_<first_timestamp + k>"
+    )
+    tracks: tuple[Literal["clean", "perturbed"], ...] = Field(
+        ("clean", "perturbed"), min_length=1, description="which tracks to draw: ORI and aug_001"
+    )
+    perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
+    look: Look = Field(Look(), description="sun and air")
+    modalities: tuple[Literal["rgb", "depth", "instance"], ...] = Field(
+        ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
+    )
+    png_compression: int = Field(1, ge=0, le=9, description="zlib level of the PNG files; 0 for none, 9 is slow")
+    visible_threshold: float = Field(
+        0.1,
+        ge=0,
+        lt=1,
+        description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
+    )
+    encoder_threads: int = Field(2, ge=1, le=64, description="threads that encode and write beside the drawing")
+
+    @field_validator("fovs_deg")
+    @classmethod
+    def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
+        if not all(1.0 <= fov < 170.0 for fov in fovs):
+            raise ValueError("every field of view must lie in [1, 170) degrees")
+        return fovs
+
+    @field_validator("tracks", "modalities")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) != len(names):
+            raise ValueError("a name occurs twice")
+        return names
+
+    @field_validator("town")
+    @classmethod
+    def _town_is_a_name(cls, town: str | None) -> str | None:
+        if town is not None and folder_name(town) != town:
+            raise ValueError("only letters, digits, dot, hyphen and underscore, and no dot in front")
+        return town
+
+
+def folder_name(text: str) -> str:
+    """Make a name for a folder of any text."""
+    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".") or "map"
+
+
+def open_renderer(name: str, scene: Scene, width_px: int, height_px: int, look: Look | None = None) -> Renderer:
+    """Open a renderer of the table for one scene.
+
+    Raises:
+        ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
+    """
+    if name not in RENDERERS:
+        raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
+    module, _, attribute = RENDERERS[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)(scene, width_px, height_px, look or Look())
+
+
+# --- from traces to plans ---------------------------------------------------------------------------------------------
+
+
+def plan_flight(
+    trace: DroneTrace, number: int, track: str, town: str, simplified: BoxMap, cfg: RenderConfig, seed: int
+) -> FlightPlan:
+    """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view and clothes."""
+    shared = rng_for(seed, "render", trace.path_id)
+    fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
+    clothes = choose_clothes(shared)
+    camera = Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
+    planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m)
+    n = len(trace.time_s)
+    if track == "perturbed":
+        rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
+        drawn = perturb(planned, camera, obstacle_index(simplified), Ground(simplified), cfg.perturbation, rng)
+    else:
+        nothing = np.zeros((n, 3))
+        drawn = Perturbed(
+            planned, nothing, nothing, nothing, [{"position": "none", "rotation": "none"} for _ in range(n)]
+        )
+    return FlightPlan(
+        town=town,
+        trajectory=f"trajectory_{cfg.first_timestamp + number}",
+        variant=VARIANTS[track],
+        camera=camera,
+        time_s=trace.time_s,
+        poses=drawn.poses,
+        walk=walk_of(trace.targets_m, trace.time_s),
+        clothes=clothes,
+        is_perturbed=drawn.is_perturbed,
+        drone_offsets_m=drawn.drone_offsets_m,
+        target_offsets_m=drawn.target_offsets_m,
+        rotation_offsets_deg=drawn.rotation_offsets_deg,
+        states=drawn.states,
+        is_original=track == "clean",
+        source={
+            "path_index": number,
+            "scenario_id": trace.path_id,
+            "scenario_name": town,
+            "algorithm": trace.planner,
+        },
+    )
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def run(
+    cfg: RenderConfig,
+    boxes: Path,
+    simplified: Path,
+    traces: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    resume: Resume = "if-same",
+) -> Path:
+    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance) and `drone_trace.json`; writes the playback tree.
+
+    Flights that the planner's prefilter dropped are not drawn; the manifest counts them. Gives the tree's root, `out`.
+
+    Raises:
+        InputError: an input is missing or malformed, or no flight is left to draw. EnvironmentMissing: no renderer here.
+    """
+    inputs = {"boxes": boxes, "simplified": simplified, "traces": traces}
+    config = cfg.model_dump(mode="json", exclude={"encoder_threads"})
+    stage = StageFolder.open(out, "render", config=config, inputs=inputs, seed=seed, resume=resume)
+    if stage.is_complete:
+        return out
+    box_map = read_boxes(boxes)
+    all_traces = read_traces(traces)
+    _check_ids(all_traces, traces)
+    passed = [(number, trace) for number, trace in enumerate(all_traces) if trace.drop_reason is None]
+    if not passed:
+        raise InputError(
+            "no flight to draw", where=traces, got=f"{len(all_traces)} flights, all dropped by the planner",
+            fix="plan again with other settings, or more paths",
+        )  # fmt: skip
+    instances = instance_ids(box_map)
+    if instances.num_shared:
+        log.warning("render: %d boxes share the instance id %d: ids have 16 bits", instances.num_shared, SHARED_ID)
+    town = cfg.town or folder_name(box_map.name)
+    items = [
+        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track)) for number, trace in passed for track in cfg.tracks
+    ]
+    arguments = (cfg, boxes, simplified, traces, out, town, seed, min(workers, len(items)))
+    finished = run_items(stage, items, make_work, arguments, workers=workers, label="render")
+    ids_file = out / town / "instance_ids.json"
+    write_json(ids_file, _ids_record(box_map, instances), indent=None)
+    results = [result for _, result in finished.results()]
+    outputs = [out / result["folder"] / name for result in results for name in ("trajectory.json", CHECKSUMS)]
+    stage.finish(
+        [*outputs, ids_file],
+        finished.tally,
+        town=town,
+        flights=results,
+        num_frames=sum(result["num_frames"] for result in results),
+        num_traces=len(all_traces),
+        num_traces_not_rendered=len(all_traces) - len(passed),
+        num_boxes_sharing_an_id=instances.num_shared,
+    )
+    return out
+
+
+def _check_ids(traces: list[DroneTrace], path: Path) -> None:
+    ids = [trace.path_id for trace in traces]
+    twice = sorted({i for i in ids if ids.count(i) > 1})
+    if twice:
+        raise InputError("two flights have one id", where=path, got=twice[0], expected="unique ids")
+
+
+def _ids_record(box_map: BoxMap, instances: InstanceIds) -> dict:
+    """Which box an id of `instance.png` stands for: rows of (instance id, box id)."""
+    return {
+        "schema": IDS_SCHEMA,
+        "schema_version": IDS_VERSION,
+        "person": PERSON_ID,
+        "shared": SHARED_ID,
+        "num_shared": instances.num_shared,
+        "are_box_ids": instances.are_box_ids,
+        "boxes": [[int(a), int(b)] for a, b in zip(instances.ids, box_map.ids, strict=True) if a != SHARED_ID],
+    }
+
+
+def make_work(
+    cfg: RenderConfig, boxes: Path, simplified: Path, traces: Path, out: Path, town: str, seed: int, num_processes: int
+) -> Work:
+    """Open a renderer in this process and give the function that draws one (trace, track)."""
+    if num_processes > 1:
+        # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
+    renderer = open_renderer(cfg.backend, build_scene(read_boxes(boxes)), cfg.width_px, cfg.height_px, cfg.look)
+    simplified_map, all_traces = read_boxes(simplified), read_traces(traces)
+    writing = Writing(tuple(cfg.modalities), cfg.png_compression, cfg.visible_threshold)
+
+    def work(item: Item) -> Outcome:
+        number, track = item.payload
+        plan = plan_flight(all_traces[number], number, track, town, simplified_map, cfg, seed)
+        folder = out / town / plan.trajectory / plan.variant
+        with atomic_folder(folder) as unfinished:
+            flight = render_flight(renderer, plan, unfinished, writing, cfg.encoder_threads)
+        return Outcome(
+            {
+                "folder": str(folder.relative_to(out)),
+                "num_frames": len(flight),
+                "fov_deg": round(plan.camera.fov_deg, 6),
+                "num_visible": int(flight.target_visible.sum()),
+                "mean_visibility": round(float(flight.visibility.mean()), 6),
+                "num_perturbed": int(flight.is_perturbed.sum()),
+            }
+        )
+
+    return work

@@ -1,0 +1,60 @@
+"""The settings of a whole run: one section for each stage, which stands with the stage."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import Field
+
+from caption.schema import CaptionConfig
+from cosfly.config import Config
+from cosfly.inspection.stage import InspectConfig
+from cosfly.maps.stage import MapsConfig
+from cosfly.pedestrians.stage import PedestriansConfig
+from cosfly.planners.stage import PlanConfig
+from cosfly.render.stage import RenderConfig
+from cosfly.simplify.stage import SimplifyConfig
+from distill.dataset import PrepareConfig
+from distill.evaluate import EvaluateConfig
+from distill.infer import InferConfig
+from distill.train import TrainConfig
+from release.package import ReleaseConfig
+
+
+class DistillConfig(Config):
+    """Settings of the student's four steps."""
+
+    prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
+    train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
+    infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
+    evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
+
+
+class RunConfig(Config):
+    """Everything that `cosfly run` needs; each stage's settings stand with the stage."""
+
+    name: str = Field(
+        "run", pattern=r"^[\w-][\w. -]*$", description="name of the run; `cosfly run` writes to runs/<name>"
+    )
+    seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
+    workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
+    max_failed: int = Field(
+        0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
+    )
+    roi: Path | None = Field(
+        None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
+    )
+    maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
+    simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
+    pedestrians: PedestriansConfig = Field(default_factory=PedestriansConfig, description="step 3")
+    plan: PlanConfig = Field(default_factory=PlanConfig, description="step 4")
+    render: RenderConfig = Field(default_factory=RenderConfig, description="step 5")
+    inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
+    caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
+    release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
+    distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
+
+
+def num_workers(setting: int) -> int:
+    return setting or len(os.sched_getaffinity(0))

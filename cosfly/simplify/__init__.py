@@ -1,0 +1,1 @@
+"""Step 2: fewer boxes that keep the layout of obstacles."""

@@ -1,0 +1,114 @@
+"""What an answer must look like, and captions.jsonl."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly.errors import InputError
+from cosfly.products.captions import (
+    ACTIONS,
+    Caption,
+    Coc,
+    normalize_action,
+    parse_answer,
+    read_captions,
+    write_captions,
+)
+
+GOOD = {
+    "critical_components": "A pedestrian walks ahead on the pavement.",
+    "reasoning_trace": "The person keeps to the middle of the image, so nothing has to change.",
+    "flight_decision": "track_straight",
+}
+TEXT = json.dumps(GOOD)
+
+
+def test_the_set_is_closed_and_has_seventeen_tokens():
+    assert len(ACTIONS) == len(set(ACTIONS)) == 17
+
+
+@pytest.mark.parametrize("text", ["track straight", "Track-Straight", " TRACK_STRAIGHT. ", '"track straight"'])
+def test_spellings(text):
+    assert normalize_action(text) == "track_straight"
+
+
+@given(st.text(max_size=30))
+def test_nothing_else_is_an_action(text):
+    assert normalize_action(text) in (None, *ACTIONS)
+    assert normalize_action(text + " quickly") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "recovered"),
+    [
+        (TEXT, ()),
+        (f"```json\n{TEXT}\n```", ("code_fence",)),
+        (f"Sure! Here it is: {TEXT} Hope it helps.", ("prose_around",)),
+        (f"<think>left {{or}} right?</think>{TEXT}", ("thinking_tags",)),
+        (TEXT[:-1] + ",}", ("trailing_comma",)),
+        (TEXT.replace("walks", "wal\x0fks"), ("control_characters",)),
+        (TEXT.replace("track_straight", "Track straight"), ()),
+    ],
+)
+def test_wrappers_are_taken_off_and_named(text, recovered):
+    parsed = parse_answer(text)
+    assert parsed.coc == Coc(**GOOD)
+    assert parsed.recovered == recovered
+
+
+def changed(**fields):
+    return json.dumps({k: v for k, v in {**GOOD, **fields}.items() if v is not None})
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "empty"),
+        ("I cannot help with that.", "no_json_object"),
+        (TEXT[:-30], "broken_json"),
+        (changed(reasoning_trace=None), "missing_field"),
+        (changed(confidence="high"), "extra_field"),
+        (changed(reasoning_trace=3), "field_not_text"),
+        (changed(critical_components="too short"), "critical_components_too_short"),
+        (changed(reasoning_trace="x" * 29), "reasoning_trace_too_short"),
+        (changed(flight_decision="fly away"), "decision_not_in_closed_set"),
+        (TEXT + TEXT, "several_json_objects"),
+        ("[1, 2]", "no_json_object"),
+    ],
+)
+def test_everything_else_is_a_failure_with_its_reason(text, reason):
+    parsed = parse_answer(text)
+    assert parsed.coc is None
+    assert parsed.reason == reason
+
+
+@given(st.text())
+def test_no_text_breaks_the_parser(text):
+    parsed = parse_answer(text)
+    assert (parsed.coc is None) == (parsed.reason is not None)
+
+
+def a_caption(number):
+    prompt = {"en": {"system": "s", "user": "u"}}
+    return Caption(
+        sample_id=f"t_ORI_frame_{number:05d}", town="T", trajectory="t", variant="ORI", frame_index=number, window=[0, 1, 2, 3, 4],
+        future=[5], prompt=prompt, prompt_hash="h", teacher={"kind": "rules"}, usage={"prompt_tokens": 1}, attempts=1,
+        en=Coc(**GOOD), zh=Coc(**GOOD), label="ascend", verdict="SOFT_CONFLICT", status="accepted",
+    )  # fmt: skip
+
+
+def test_captions_round_trip_and_errors_name_the_line(tmp_path):
+    path = tmp_path / "captions.jsonl"
+    captions = [a_caption(4), a_caption(5)]
+    assert write_captions(path, captions) == 2
+    assert list(read_captions(path)) == captions
+    path.write_text(path.read_text().replace('"status":"accepted"', '"status":"maybe"'))
+    with pytest.raises(InputError, match=r"captions\.jsonl:1: status"):
+        list(read_captions(path))
+    path.write_text("{")
+    with pytest.raises(InputError, match=":1: not valid JSON"):
+        list(read_captions(path))
+    with pytest.raises(InputError, match="run cosfly caption"):
+        list(read_captions(tmp_path / "nowhere.jsonl"))

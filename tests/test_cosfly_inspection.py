@@ -1,0 +1,401 @@
+"""Inspection: clean flights pass, every planted defect is found and named, and the funnel adds up."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly.errors import InputError
+from cosfly.inspection import stage as qc
+from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region, png_problem, region_box
+from cosfly.issues import Issue, Report
+from cosfly.products.frames import frame_name
+from cosfly.products.inspection import read_inspection
+from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.traces import DroneTrace, write_traces
+from cosfly.store import read_json, sha256_file, write_checksums
+from specimens import make_playback_tree
+
+NUM_POINTS = 10
+
+
+def plan_of(folder: Path) -> DroneTrace:
+    """The plan that a specimen flight was flown from."""
+    flight = read_flight(folder)
+    n = len(flight)
+    return DroneTrace(
+        flight.source["scenario_id"], "muco", flight.time_s, flight.positions_m, flight.rotations_deg, flight.targets_m,
+        np.full(n, 0.9), np.full(n, 5.0),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def specimen(tmp_path_factory) -> Path:
+    """A clean tree with checksums, and its plans; copied before anything is broken."""
+    root = tmp_path_factory.mktemp("specimen")
+    tree = make_playback_tree(root / "tree", num_flights=2, num_points=NUM_POINTS, width_px=192, height_px=108)
+    for folder in find_flights(tree):
+        files = [p for p in folder.rglob("*") if p.is_file()]
+        write_checksums(folder, {p.relative_to(folder).as_posix(): sha256_file(p) for p in files})
+    plans = [plan_of(folder) for folder in find_flights(tree) if folder.name == "ORI"]
+    write_traces(root / "drone_trace.json", plans, {})
+    return root
+
+
+@pytest.fixture
+def workplace(specimen, tmp_path) -> Path:
+    shutil.copytree(specimen, tmp_path / "w")
+    return tmp_path / "w"
+
+
+# The specimen's drone is jerkier than a planned one, so the plan's rules get their own tests below.
+CFG = qc.InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
+
+
+def inspect(workplace: Path, cfg: qc.InspectConfig = CFG, out: str = "out", **more):
+    return read_inspection(qc.run(cfg, workplace / "drone_trace.json", workplace / "tree", workplace / out, **more))
+
+
+def first_flight(workplace: Path, variant: str = "ORI") -> Path:
+    return next(f for f in find_flights(workplace / "tree") if f.name == variant)
+
+
+def codes_of(inspection, folder: Path) -> dict[str, str]:
+    """code -> severity of the findings of one flight."""
+    name = "/".join(folder.parts[-3:])
+    flight = next(f for f in inspection.flights if f.folder == name)
+    return {issue.code: issue.severity for issue in flight.issues}
+
+
+def test_clean_flights_are_accepted(workplace):
+    found = inspect(workplace)
+    assert [f.result for f in found.flights] == ["accepted"] * 4, [f.issues for f in found.flights]
+    assert found.funnel.trajectories.model_dump() == {
+        "planned": 2, "dropped": {}, "not_rendered": 0, "rendered": 2, "accepted": 2, "review": 0, "rejected": 0,
+    }  # fmt: skip
+    metrics = found.flights[0].metrics
+    flight = read_flight(first_flight(workplace))
+    assert metrics["visibility_mean"] == pytest.approx(flight.visibility.mean(), abs=1e-4)
+    assert metrics["num_frames_checked"] == NUM_POINTS
+    assert 0.5 < metrics["track_quality"] <= 1.0  # the specimen's person fills its box
+
+
+def test_smoothness_numbers_are_those_of_a_circle():
+    """Uniform motion on a circle has |a| = v^2 / r and |j| = v^3 / r^2; here v = 2, r = 20."""
+    angle = np.arange(400) * 0.5 * 2.0 / 20.0
+    positions = np.stack([20 * np.cos(angle), 20 * np.sin(angle), np.full(400, 20.0)], axis=1)
+    trace = DroneTrace(
+        "p", "muco", np.arange(400) * 0.5, positions, np.zeros((400, 3)), positions, np.full(400, 0.8), np.ones(400)
+    )
+    metrics: dict = {}
+    qc.check_plan(trace, qc.InspectConfig(), Report(), metrics)
+    assert metrics["accel_rms_mps2"] == pytest.approx(0.2, rel=0.01)
+    assert metrics["jerk_rms_mps3"] == pytest.approx(0.02, rel=0.01)
+    assert metrics["smoothness"] == pytest.approx(np.exp(-0.5 * (0.2 / 5 + 0.02 / 10)), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "severity"),
+    [
+        ({"positions": 3.0}, "acceleration", "error"),
+        ({"positions": 3.0}, "jerk", "error"),
+        ({"positions": 1.0}, "smoothness", "warning"),
+        ({"visibility": 0.39}, "five_ray_visibility", "error"),
+        ({"clearance": -0.1}, "collision", "error"),
+        ({"drop_reason": "low_visibility"}, "prefiltered", "error"),
+    ],
+)
+def test_plan_rules(change, code, severity):
+    n = 40
+    positions = np.zeros((n, 3))
+    positions[:, 0] = np.arange(n) + change.get("positions", 0.0) * (np.arange(n) % 2)  # a zigzag along the way
+    trace = DroneTrace(
+        "p", "muco", np.arange(n) * 0.5, positions, np.zeros((n, 3)), positions, np.full(n, change.get("visibility", 0.9)),
+        np.full(n, change.get("clearance", 1.0)), drop_reason=change.get("drop_reason"),
+    )  # fmt: skip
+    report = Report()
+    qc.check_plan(trace, qc.InspectConfig(), report, {})
+    assert {issue.code: issue.severity for issue in report.issues}.get(code) == severity
+    off = qc.InspectConfig(
+        accel_rms_max_mps2=1e6, jerk_rms_max_mps3=1e6, smoothness_min=0, five_ray_mean_min=0, clearance_min_m=-9
+    )
+    report = Report()
+    qc.check_plan(trace, off, report, {})
+    assert {issue.code for issue in report.issues} <= {"prefiltered"}
+
+
+# --- planted defects --------------------------------------------------------------------------------------------------
+
+
+def edit(folder: Path, change) -> None:
+    path = folder / "trajectory.json"
+    value = read_json(path)
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def edit_image(path: Path, change) -> None:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    cv2.imwrite(str(path), change(image))
+
+
+def edit_depth(path: Path, change) -> None:
+    np.save(path, change(np.load(path)))
+
+
+def flip_byte(path: Path, position: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[position] ^= 0x10
+    path.write_bytes(data)
+
+
+def without_person(image: np.ndarray) -> np.ndarray:
+    image = image.copy()
+    image[image[..., 2] == 12] = 0
+    return image
+
+
+def at_point(key, name, value, index=3):
+    def change(trajectory):
+        trajectory["points"][index][key][name] = value
+
+    return change
+
+
+def far_away(image):
+    image = image.copy()
+    image[:] = (image + 5) % 1000
+    return image.astype(np.float32)
+
+
+FRAME = frame_name(3)
+DEFECTS = {
+    "missing_file": lambda f: (f / FRAME / "rgb.png").unlink(),
+    "wrong_format": lambda f: cv2.imwrite(str(f / FRAME / "rgb.png"), np.full((20, 30, 3), 9, np.uint8)),
+    "wrong_format of depth": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d.astype(np.float64)),
+    "wrong_format of cut depth": lambda f: (f / FRAME / "depth.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr'"),
+    "broken_image": lambda f: flip_byte(f / FRAME / "rgb.png", 200),
+    "broken_image cut": lambda f: (f / FRAME / "rgb.png").write_bytes((f / FRAME / "rgb.png").read_bytes()[:-40]),
+    "broken_annotation": lambda f: (f / FRAME / "meta.json").write_text("{"),
+    "checksum": lambda f: flip_byte(f / FRAME / "meta.json", 30),
+    "depth_range": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(d > 14, np.nan, d).astype("f4")),
+    "depth_range above": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d + np.float32(1000)),
+    "depth_disagrees": lambda f: edit_depth(f / FRAME / "depth.npy", far_away),
+    "mask_disagrees": lambda f: edit_image(f / FRAME / "instance.png", without_person),
+    "blank_frame": lambda f: edit_image(f / FRAME / "rgb.png", lambda image: image * 0 + 90),
+    "frozen_frame": lambda f: shutil.copy(f / frame_name(2) / "rgb.png", f / FRAME / "rgb.png"),
+    "pose_differs": lambda f: edit(f, at_point("drone_pose", "yaw", 12.0)),
+    "projection_differs": lambda f: edit(f, at_point("target", "image_uv", [1.0, 2.0])),
+    "target_missing": lambda f: edit(f, at_point("target", "world_location", None)),
+    "layout": lambda f: edit(f, lambda t: t.update(schema_version="6.0.0")),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_planted_defect_rejects_that_flight_alone(workplace, defect):
+    broken = first_flight(workplace)
+    DEFECTS[defect](broken)
+    found = inspect(workplace)
+    code = defect.split()[0]
+    assert codes_of(found, broken).get(code) == "error", codes_of(found, broken)
+    assert [f.result for f in found.flights].count("accepted") == 3
+    assert found.funnel.flights.rejected == found.funnel.trajectories.rejected == 1
+    issue = next(i for f in found.flights for i in f.issues if i.code == code)
+    assert "frame_00003" in issue.where or "points[3]" in issue.where or code == "layout"
+    assert str(workplace) not in issue.where  # a report can be handed on
+
+
+def test_teleport_of_drone_and_person(workplace):
+    flight = read_flight(first_flight(workplace))
+    for name, shift_m in (("positions_m", 30.0), ("targets_m", 9.0)):
+        moved = getattr(flight, name).copy()
+        moved[5:, 0] += shift_m
+        report = Report()
+        qc.check_motion(replace(flight, **{name: moved}), qc.InspectConfig(), report)
+        assert [(i.code, "points[5]" in i.where) for i in report.issues] == [("teleport", True)]
+
+
+def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace):
+    broken = first_flight(workplace)
+    edit(broken, at_point("drone_pose", "x", "oops"))
+    found = inspect(workplace)
+    flight = next(f for f in found.flights if f.folder.endswith(f"{broken.parent.name}/ORI"))
+    assert flight.result == "rejected"
+    assert flight.reason == "unreadable"
+    assert "points[3].drone_pose.x" in flight.issues[0].got
+    manifest = read_json(workplace / "out" / "manifest.json")
+    assert manifest["counts"] == {"input": 4, "kept": 3, "dropped": {}, "failed": {"input": 1}}
+    assert "trajectory.json" in (workplace / "out" / "failures.jsonl").read_text()
+    assert found.funnel.trajectories.rejected == 1  # counted with its twin's trajectory
+
+
+def test_what_a_person_must_decide_goes_to_review(workplace):
+    flight = first_flight(workplace)
+    shutil.copytree(flight / frame_name(0), flight / frame_name(99))
+    edit(first_flight(workplace, "aug_001"), lambda t: t["source"].update(scenario_id="another"))
+    found = inspect(workplace, CFG.model_copy(update={"check_checksums": False}))
+    assert codes_of(found, flight)["stray_frame"] == "warning"
+    assert codes_of(found, first_flight(workplace, "aug_001"))["no_trace"] == "warning"
+    assert [f.result for f in found.flights].count("review") == 2
+
+
+def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
+    plans = [plan_of(f) for f in find_flights(workplace / "tree") if f.name == "ORI"]
+    extra = [
+        replace(plans[0], path_id="low", drop_reason="five_ray_visibility"),
+        replace(plans[0], path_id="rough", drop_reason="smoothness"),
+        replace(plans[0], path_id="lost"),
+    ]
+    write_traces(workplace / "drone_trace.json", plans + extra, {})
+    funnel = inspect(workplace).funnel.trajectories
+    assert (funnel.planned, funnel.rendered, funnel.not_rendered) == (5, 2, 1)
+    assert funnel.dropped == {"five_ray_visibility": 1, "smoothness": 1}
+
+
+def test_pixels_can_be_sampled_or_left_out(workplace):
+    broken = first_flight(workplace)
+    flip_byte(broken / FRAME / "rgb.png", 200)
+    (broken / "checksums.sha256").unlink()
+    nothing = inspect(workplace, CFG.model_copy(update={"check_pixels": "none"}), "none")
+    assert "broken_image" not in codes_of(nothing, broken)
+    assert codes_of(nothing, broken)["no_checksums"] == "note"
+    some = inspect(workplace, CFG.model_copy(update={"check_pixels": "sample", "pixel_sample": 4}), "some")
+    assert some.flights[0].metrics["num_frames_checked"] == (3 if "broken_image" in codes_of(some, broken) else 4)
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+
+
+def test_png_problem_finds_every_flipped_byte():
+    _, data = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8))
+    image = data.tobytes()
+    assert png_problem(image) is None
+    for position in range(len(image)):
+        broken = bytearray(image)
+        broken[position] ^= 1
+        assert png_problem(bytes(broken)) is not None, position
+    for length in range(len(image)):
+        assert png_problem(image[:length]) is not None
+
+
+boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))
+
+
+@given(boxes, boxes)
+def test_box_iou_counts_pixels(one, two):
+    """Oracle: integer boxes as sets of pixels."""
+    sets = [{(x, y) for x in range(int(b[0]), int(b[2])) for y in range(int(b[1]), int(b[3]))} for b in (one, two)]
+    union = len(sets[0] | sets[1])
+    assert box_iou(one, two) == pytest.approx(len(sets[0] & sets[1]) / union if union else 0.0)
+
+
+def test_the_region_is_the_one_at_the_target():
+    kinds = np.zeros((20, 20), np.uint8)
+    kinds[2:5, 2:4] = 12
+    kinds[10:18, 12:15] = 12
+    region = pedestrian_region(kinds, np.array([11.0, 9.0, 16.0, 19.0]))
+    assert region_box(region).tolist() == [12, 10, 15, 18]
+    assert pedestrian_region(kinds, np.array([6.0, 6.0, 9.0, 9.0])) is None
+
+
+@given(st.lists(st.integers(), max_size=30), st.integers(1, 40))
+def test_a_sample_has_both_ends_and_its_size(indices, count):
+    chosen = choose_frames(indices, "sample", count)
+    assert len(chosen) == min(count, len(indices))
+    if indices and count > 1:
+        assert (chosen[0], chosen[-1]) == (indices[0], indices[-1])
+    assert choose_frames(indices, "none", count) == []
+
+
+def test_reports_sort_and_merge():
+    report = Report()
+    report.add("note", "z", "b", 1, "2")
+    report.error("y", "c", 1, "2")
+    report.error("y", "d", 1, "2")
+    assert not report.is_ok
+    assert [(i.code, i.where, i.count) for i in report.merged()] == [("y", "c", 2), ("z", "b", 1)]
+    assert str(report).splitlines()[-1] == "NOT OK: 2 errors, 0 warnings, 1 note"
+    assert isinstance(report.merged()[0], Issue)
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_same_bytes_with_one_and_two_workers(workplace):
+    inspect(workplace, out="one")
+    inspect(workplace, out="two", workers=2)
+    for name in ("inspect.json", "report.html"):
+        assert (workplace / "one" / name).read_bytes() == (workplace / "two" / name).read_bytes()
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from cosfly.inspection import stage as qc
+root = Path(sys.argv[1])
+slow, original = float(sys.argv[2]), qc.inspect_flight
+def delayed(*args):
+    time.sleep(slow)
+    return original(*args)
+qc.inspect_flight = delayed
+cfg = qc.InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
+qc.run(cfg, root / "drone_trace.json", root / "tree", root / "killed")
+"""
+
+
+def test_kill_and_resume_gives_the_same_bytes(workplace):
+    journal = workplace / "killed" / "items.jsonl"
+    child = subprocess.Popen([sys.executable, "-c", KILLED, str(workplace), "0.5"])
+    deadline = time.monotonic() + 60
+    while not (journal.exists() and journal.read_bytes().count(b"\n") >= 1) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert not (workplace / "killed" / "inspect.json").exists()
+    assert journal.read_bytes().count(b"\n") >= 1
+    inspect(workplace, out="killed")
+    inspect(workplace, out="calm")
+    for name in ("inspect.json", "report.html"):
+        assert (workplace / "killed" / name).read_bytes() == (workplace / "calm" / name).read_bytes()
+
+
+def test_the_page_stands_alone_and_shows_every_flight(workplace):
+    flight = first_flight(workplace)
+    edit(flight, lambda t: t["source"].update(scenario_id="<b>&"))
+    found = inspect(workplace)
+    page = (workplace / "out" / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"(?:src|href)=\"(?!data:)|<script|@import|url\(", page)
+    assert page.count("data:image/jpeg;base64,") == 3 * len(found.flights)
+    assert "<b>&amp;" not in page
+    assert "&lt;b&gt;&amp;" in page
+    for record in found.flights:
+        assert record.trajectory in page
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "not json", '{"schema": "cosfly.inspect", "schema_version": "1.0"}'])
+def test_a_wrong_inspect_file_is_one_clear_error(tmp_path, text):
+    (tmp_path / "inspect.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_inspection(tmp_path / "inspect.json")
+    assert "inspect.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_write_flight_is_used_so_round_trips_hold(workplace):
+    folder = first_flight(workplace)
+    write_flight(folder, read_flight(folder))
+    assert inspect(workplace, CFG.model_copy(update={"check_checksums": False})).funnel.flights.accepted == 4

@@ -1,0 +1,154 @@
+"""Products of stages 1-4: round trips, and every error names file and field."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from cosfly.errors import InputError
+from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.products.roi import read_roi
+from cosfly.products.traces import DroneTrace, read_traces, write_traces
+from cosfly.products.walks import PedestrianPath, read_paths, write_paths
+
+
+def some_boxes(n=3, seed=0):
+    rng = np.random.default_rng(seed)
+    return make_box_map(
+        rng.uniform(-100, 100, (n, 3)), rng.uniform(0, 5, (n, 3)), rng.uniform(-180, 180, (n, 3)),
+        rng.integers(1, 28, n), header={"name": "T", "ground_z_m": 0.0},
+    )  # fmt: skip
+
+
+@given(st.integers(1, 20), st.integers(0, 5))
+def test_boxes_round_trip(tmp_path_factory, n, seed):
+    path = tmp_path_factory.mktemp("boxes") / "boxes_3d.json"
+    boxes = some_boxes(n, seed)
+    write_boxes(path, boxes)
+    back = read_boxes(path)
+    for name in ("centers", "half_extents", "rotations_deg"):
+        assert_allclose(getattr(back, name), getattr(boxes, name), atol=1e-6)
+    assert back.kinds.tolist() == boxes.kinds.tolist()
+    assert back.ids.tolist() == boxes.ids.tolist()
+    assert back.name == "T"
+    first = path.read_bytes()
+    write_boxes(path, back)
+    assert path.read_bytes() == first  # idempotent
+
+
+def test_the_papers_bare_list_loads(tmp_path):
+    path = tmp_path / "boxes.json"
+    write_boxes(path, some_boxes())
+    path.write_text(json.dumps(json.loads(path.read_text())["boxes"]))
+    assert len(read_boxes(path)) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: v["boxes"][1].update(extent=[1, -2, 1]), r"box 2: extent.*-2"),
+        (lambda v: v["boxes"][1].update(center=[1, "x", 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].update(center=[1, "2", 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].update(center=[1, None, 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].pop("rotation"), r"boxes\[1\].rotation"),
+        (lambda v: v["boxes"][1].update(type="Building"), r"boxes\[1\].type.*did you mean 'Buildings'"),
+        (lambda v: v["boxes"][1].update(id=-1), r"boxes\[1\].id"),
+        (lambda v: v["boxes"][1].update(id=1), r"more than once"),
+        (lambda v: v.update(boxes=[]), r"no boxes"),
+        (lambda v: v.update(boxes={}), r"boxes.*dict"),
+        (lambda v: v.update(schema_version="2.0"), r"schema_version.*2\.0"),
+        (lambda v: v.update(schema="other"), r"schema.*other"),
+        (lambda v: v["boxes"].append(3), r"boxes\[3\].*int"),
+    ],
+)
+def test_bad_maps_are_named(tmp_path, change, words):
+    path = tmp_path / "boxes_3d.json"
+    write_boxes(path, some_boxes())
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=words) as caught:
+        read_boxes(path)
+    assert "boxes_3d.json" in str(caught.value)
+
+
+def test_nan_in_a_map(tmp_path):
+    path = tmp_path / "boxes_3d.json"
+    write_boxes(path, some_boxes())
+    path.write_text(path.read_text().replace('"center":[', '"center":[NaN,', 1))
+    with pytest.raises(InputError, match=r"boxes_3d\.json: boxes\[0\]\.center\[0\]: .*got NaN"):
+        read_boxes(path)
+    boxes = some_boxes()
+    boxes.centers[2, 1] = np.inf
+    with pytest.raises(InputError, match="box 3: center:"):
+        write_boxes(tmp_path / "x.json", boxes)
+
+
+def test_roi_forms(tmp_path):
+    path = tmp_path / "roi_polygon.json"
+    square = [[0, 0], [10, 0], [10, 10]]
+    path.write_text(json.dumps({"description": "d", "closed": True, "points_world": square}))
+    assert len(read_roi(path).rings()) == 1
+    path.write_text(json.dumps({"polygons": [{"points_world": square, "holes": [square]}, {"points_world": square}]}))
+    assert [len(p.holes) for p in read_roi(path).rings()] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({"closed": False, "points_world": [[0, 0], [1, 0], [1, 1]]}, "not closed"),
+        ({"closed": True, "points_world": []}, "no polygon"),
+        ({"closed": True, "points_world": [[0, 0], [1, 0]]}, "not a ring"),
+        ({"closed": True, "points_world": [[0, 0], [1, 0], ["a", 1]]}, "points_world.2.0"),
+        ([], "top level: not an object"),
+    ],
+)
+def test_bad_rois(tmp_path, value, words):
+    path = tmp_path / "roi_polygon.json"
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=words):
+        read_roi(path)
+
+
+def a_path(n=4):
+    t = np.arange(n) * 0.5
+    return PedestrianPath("path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n))
+
+
+def a_trace(n=4):
+    t = np.arange(n) * 0.5
+    m = np.stack([t, t + 1, t + 20], axis=1)
+    return DroneTrace("path_00000", "muco", t, m, m, m, np.ones(n), np.full(n, 5.0), {"a": 1.0}, {"b": 2}, None)
+
+
+@pytest.mark.parametrize(
+    ("write", "read", "make", "group"),
+    [(write_paths, read_paths, a_path, "paths"), (write_traces, read_traces, a_trace, "traces")],
+)
+def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
+    path = tmp_path / "p.json"
+    write(path, [make()], {"map": "T", "seed": 0})
+    back = read(path)[0]
+    for name, value in vars(make()).items():
+        if isinstance(value, np.ndarray):
+            assert_allclose(getattr(back, name), value)
+        else:
+            assert getattr(back, name) == value
+    value = json.loads(path.read_text())
+    value[group][0]["t"][1] = "x"
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
+        read(path)
+
+
+def test_columns_of_different_lengths(tmp_path):
+    path = tmp_path / "p.json"
+    write_paths(path, [a_path()], {})
+    value = json.loads(path.read_text())
+    value["paths"][0]["x"].pop()
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match="different lengths"):
+        read_paths(path)
