@@ -15,11 +15,11 @@ from pydantic import Field, model_validator
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.config import Config
+from cosfly.frame_views import DEPTH_RANGE_M, View
 from cosfly.products.captions import Verdict
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
-Modality = Literal["rgb", "depth", "segmentation"]
 
 
 # --- windows ----------------------------------------------------------------------------------------------------------
@@ -113,14 +113,14 @@ class WindowConfig(Config):
 
 
 class ImageConfig(Config):
-    modalities: tuple[Modality, ...] = Field(
+    modalities: tuple[View, ...] = Field(
         ("rgb", "depth", "segmentation"), min_length=1, description="pictures of each observed frame"
     )
     layout: Literal["separate", "tiled"] = Field(
-        "separate", description="separate: one image per modality; tiled: one image per frame, side by side"
+        "separate", description="separate: one image per view; tiled: one image per frame, side by side"
     )
-    max_side_px: int = Field(640, ge=28, description="longest side of one modality's picture")
-    depth_range_m: float = Field(100.0, gt=0, description="depth at the dark end of the pseudo-colour")
+    max_side_px: int = Field(640, ge=28, description="longest side of one view's picture")
+    depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
     encoding: Literal["jpeg", "png"] = Field("jpeg", description="encoding of the pictures in a request")
     jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality")
     cache_frames: int = Field(256, ge=8, description="encoded frames kept in memory for the windows that share them")

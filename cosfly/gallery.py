@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.products.frames import SKY_DEPTH_M, read_depth, read_instance, read_rgb
-from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.frame_views import VIEW_FILES, read_view
+from cosfly.products.frames import read_rgb
 from cosfly.products.playback import Flight, find_flights, read_flight
 from cosfly.store import write_bytes
 
@@ -57,26 +57,6 @@ def preview_gif(tree: Path, out_gif: Path) -> None:
 # --- pieces -----------------------------------------------------------------------------------------------------------
 
 
-def depth_colors(depth: np.ndarray) -> np.ndarray:
-    """Depth, (h, w) m, as a picture, (h, w, 3) RGB: near is bright, far is dark on a logarithmic scale, sky black."""
-    share = np.log(np.clip(depth, 2.0, 200.0) / 2.0) / np.log(100.0)
-    colors = cv2.cvtColor(
-        cv2.applyColorMap(((1.0 - share) * 255.0).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
-    )
-    colors[(depth >= SKY_DEPTH_M) | (depth <= 0.0)] = 0
-    return colors
-
-
-def mask_colors(kinds: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Kinds and instance ids, (h, w), as a picture: CARLA's colours, a little lighter or darker by instance."""
-    palette = np.zeros((256, 3))
-    for kind, name in KIND_NAMES.items():
-        palette[kind] = [int(KIND_COLORS[name][i : i + 2], 16) for i in (1, 3, 5)]
-    shade = 0.8 + 0.4 * ((ids.astype(np.uint32) * 40503 % 1024) / 1023.0)
-    shade[kinds == KINDS["Pedestrians"]] = 1.0
-    return np.clip(palette[kinds] * shade[..., None], 0, 255).astype(np.uint8)
-
-
 def _spread(n: int, num: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, n - 1, min(n, num)).round()})
 
@@ -97,15 +77,11 @@ def _row(flight: Flight) -> np.ndarray:
         tiles.append(_labelled(_tile(picture), f"t = {flight.time_s[i]:.1f} s"))
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
     middle = flight.frame_folder(frames[len(frames) // 2])
-    for name in ("depth.npy", "instance.png"):
-        if not (middle / name).is_file():
-            tiles.append(_labelled(np.zeros_like(tiles[0]), f"no {name}"))
-        elif name == "depth.npy":
-            tiles.append(_labelled(_tile(depth_colors(read_depth(middle))), "depth"))
+    for view in ("depth", "segmentation"):
+        if (middle / VIEW_FILES[view]).is_file():
+            tiles.append(_labelled(_tile(read_view(middle, view)), view))
         else:
-            kinds, ids = read_instance(middle)
-            picture = cv2.resize(mask_colors(kinds, ids), TILE_PX, interpolation=cv2.INTER_NEAREST)
-            tiles.append(_labelled(picture, "instances"))
+            tiles.append(_labelled(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
     text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {flight.camera.fov_deg:.0f} deg   {visible}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from cosfly.errors import InputError
-from cosfly.products.frames import read_depth, read_instance
-from cosfly.products.kinds import KIND_COLORS, KINDS
+from cosfly.frame_views import VIEW_FILES, read_view
+from cosfly.products.frames import read_depth
 from cosfly.store import inside
 from distill.dataset import Sample
 from distill.student import IMAGE_TOKEN, Student
 
 IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy
-DEPTH_NEAR_M, DEPTH_FAR_M = 1.0, 200.0  # range of the grey ramp; a ratio of distances is a step of grey
 
 
 @dataclass(frozen=True)
@@ -55,21 +53,15 @@ def messages_of(sample: Sample) -> list[dict[str, Any]]:
 
 
 def load_image(path: Path) -> Image.Image:
-    """Load one image of a frame as RGB; depth becomes a logarithmic grey ramp (near is bright), instance the class palette.
+    """Load one image of a frame as its teacher saw it, RGB.
 
     Raises:
-        InputError: missing or not an image.
+        InputError: missing, not an image, or no file of a frame.
     """
-    if path.name == "depth.npy":
-        return Image.fromarray(_depth_picture(read_depth(path.parent)))
-    if path.name == "instance.png":
-        kinds, _ = read_instance(path.parent)
-        return Image.fromarray(_palette()[kinds])
-    try:
-        with Image.open(path) as image:
-            return image.convert("RGB")
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError("cannot read the image", where=path, got=str(error), fix="check --data") from None
+    view = next((view for view, name in VIEW_FILES.items() if name == path.name), None)
+    if view is None:
+        raise InputError("not a picture of a frame", where=path, expected=" | ".join(VIEW_FILES.values()))
+    return Image.fromarray(read_view(path.parent, view))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -82,23 +74,6 @@ def image_size(path: Path) -> tuple[int, int]:
             return image.height, image.width
     except (OSError, UnidentifiedImageError) as error:
         raise InputError("cannot read the image", where=path, got=str(error), fix="check --data") from None
-
-
-def _depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    clipped = np.clip(
-        np.where(depth_m > 0, depth_m, DEPTH_FAR_M), DEPTH_NEAR_M, DEPTH_FAR_M
-    )  # 0 is invalid: as far away
-    grey = 1.0 - np.log(clipped / DEPTH_NEAR_M) / np.log(DEPTH_FAR_M / DEPTH_NEAR_M)
-    return np.repeat((grey * 255 + 0.5).astype(np.uint8)[..., None], 3, axis=2)
-
-
-@cache
-def _palette() -> np.ndarray:
-    """(256, 3) uint8: the colour of each semantic kind, black where there is none."""
-    palette = np.zeros((256, 3), np.uint8)
-    for name, number in KINDS.items():
-        palette[number] = [int(KIND_COLORS[name][i : i + 2], 16) for i in (1, 3, 5)]
-    return palette
 
 
 # --- tokens -----------------------------------------------------------------------------------------------------------

@@ -15,14 +15,13 @@ from teacher_server import TeacherServer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig
-from caption.teachers.images import FrameEncoder, depth_colors, segmentation_colors
+from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import answer_schema, make_question, mirror_schema, question_messages, system_prompt
 from caption.truth.facts import measure_facts
 from caption.windows import current_frames, iterate_samples
 from cosfly.products.captions import ACTIONS
-from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight, write_flight
-from specimens import PERSON_ID, make_flight, make_playback_tree
+from specimens import make_flight, make_playback_tree
 
 NO_IMAGES = WindowConfig(require_images=False)
 
@@ -199,7 +198,7 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
     assert facts.box_width_px == (None,) * 5
     assert facts.offset_x_px[-1] is not None  # from image_uv
     question = make_question(sample.observed, facts, ImageConfig())
-    assert question.modalities == ("rgb", "segmentation")
+    assert question.views == ("rgb", "segmentation")
     _, digests = question_messages(question, FrameEncoder(ImageConfig()))
     assert len(digests) == 10
     path = run(CaptionConfig(), root, tmp_path / "out")
@@ -219,22 +218,6 @@ def test_pictures_are_bounded_and_encoded_once_per_frame(tree, layout, num_image
     assert url.startswith("data:image/png;base64,")
     image = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (18, width_px, 3)
-
-
-def test_depth_colors_near_is_bright_and_sky_is_dark():
-    depth = np.array([[0.5, 50.0, 99.9, 1000.0, 0.0]], dtype=np.float32)
-    brightness = depth_colors(depth, 100.0).sum(axis=2)[0]
-    assert brightness[0] > brightness[1] > brightness[2]
-    assert brightness[3] == brightness[4] <= brightness[2]
-
-
-def test_only_the_pedestrian_is_vivid():
-    kinds = np.array([[KINDS["Buildings"], KINDS["Pedestrians"], KINDS["Sky"]]], dtype=np.uint8)
-    ids = np.array([[3, PERSON_ID, 0]], dtype=np.uint16)
-    colors = segmentation_colors(kinds, ids)[0].astype(int)
-    spread = colors.max(axis=1) - colors.min(axis=1)
-    assert spread[1] > 200
-    assert max(spread[0], spread[2]) < 80
 
 
 def test_perturbation_is_taken_off_the_future_only():

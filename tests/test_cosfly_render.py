@@ -558,9 +558,3 @@ def test_gallery(finished, tmp_path):
 def test_gallery_of_nothing(tmp_path):
     with pytest.raises(InputError, match="not a playback tree"):
         gallery.contact_sheet(tmp_path, tmp_path / "sheet.png")
-
-
-def test_depth_colors_mark_sky_and_invalid():
-    colors = gallery.depth_colors(np.array([[1000.0, 0.0, 3.0, 150.0]], np.float32))
-    assert (colors[0, :2] == 0).all()
-    assert colors[0, 2].sum() > colors[0, 3].sum() > 0

@@ -438,7 +438,7 @@ def test_an_unreadable_image_fails_its_batch_and_is_counted(place, tmp_path):
     counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
     assert counts["input"] == len(predictions) == 6
     assert counts["failed"]["input"] == sum(p.reason == "failed_input" for p in predictions) == 2
-    assert "cannot read the image" in (tmp_path / "out" / "failures.jsonl").read_text()
+    assert "not an image" in (tmp_path / "out" / "failures.jsonl").read_text()
 
 
 def test_predictions_with_odd_line_separators_survive(place, tmp_path):

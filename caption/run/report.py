@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from caption.schema import BudgetConfig
-from cosfly.errors import InputError
+from cosfly.frame_views import thumbnail
 from cosfly.products.captions import ACTIONS, Caption, Coc
-from cosfly.products.frames import frame_name, read_rgb
+from cosfly.products.frames import frame_name
 from cosfly.store import write_bytes
 
 PICTURE_WIDTH_PX = 240
@@ -275,17 +272,7 @@ def _card(caption: Caption, folders: Mapping[str, Path]) -> str:
 
 
 def _picture(folder: Path | None, index: int) -> str:
-    shown = None
-    if folder is not None:
-        try:
-            rgb = read_rgb(folder / frame_name(index))
-        except InputError:
-            pass
-        else:
-            size = (PICTURE_WIDTH_PX, max(1, round(PICTURE_WIDTH_PX * rgb.shape[0] / rgb.shape[1])))
-            small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-            done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])
-            shown = base64.b64encode(data.tobytes()).decode("ascii") if done else None
+    shown = None if folder is None else thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75)
     image = (
         f'<img alt="frame {index}" src="data:image/jpeg;base64,{shown}">'
         if shown

@@ -18,12 +18,12 @@ import httpx
 import numpy as np
 
 from caption.schema import CaptionConfig, ObservedWindow
-from caption.teachers.images import MODALITY_FILES
 from caption.teachers.prompts import answer_schema, make_question, system_prompt
 from caption.truth.facts import measure_facts
 from cosfly.chat.client import RETRIED_STATUS, ChatClient
 from cosfly.chat.protocol import response_format
 from cosfly.errors import TeacherError
+from cosfly.frame_views import VIEW_FILES
 from cosfly.products.captions import parse_answer
 from cosfly.store import parse_json
 
@@ -290,7 +290,7 @@ def largest_messages(cfg: CaptionConfig, pictures: list[dict]) -> list[dict]:
         visible=np.ones(count, bool),
         visibility=np.full(count, 0.5),
         frame_folders=tuple(Path(f"frame_{i:05d}") for i in range(count)),
-        frame_files=tuple(frozenset(MODALITY_FILES.values()) for _ in range(count)),
+        frame_files=tuple(frozenset(VIEW_FILES.values()) for _ in range(count)),
     )
     question = make_question(window, measure_facts(window), cfg.image)
     content = [*pictures, {"type": "text", "text": question.prompts["en"].user}]

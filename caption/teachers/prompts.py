@@ -13,16 +13,17 @@ from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 
-from caption.schema import ImageConfig, Modality, ObservedWindow
-from caption.teachers.images import EncodedImage, FrameEncoder, available_modalities
+from caption.schema import ImageConfig, ObservedWindow
+from caption.teachers.images import EncodedImage, FrameEncoder, available_views
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
+from cosfly.frame_views import View
 from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, Prompt
 from cosfly.store import dump_json
 
 PROMPTS = Path(__file__).with_name("prompts")
 
-_MODALITY_WORDS: dict[Language, dict[Modality, str]] = {
+_VIEW_WORDS: dict[Language, dict[View, str]] = {
     "en": {
         "rgb": "RGB",
         "depth": "depth in pseudo-colour (bright is near, dark is far)",
@@ -44,7 +45,7 @@ class Question:
     window: ObservedWindow
     facts: Facts
     prompts: dict[Language, Prompt]
-    modalities: tuple[Modality, ...]
+    views: tuple[View, ...]
     decision: str | None = None
     rejected: str | None = None
     ask: int = 0
@@ -77,16 +78,14 @@ def anchored_prompt(decision: str) -> str:
     return system_prompt("en") + "\n" + read_prompt("anchored_en").substitute(decision=decision, decision_words=words)
 
 
-def build_prompts(
-    window: ObservedWindow, facts: Facts, modalities: tuple[Modality, ...], layout: str
-) -> dict[Language, Prompt]:
+def build_prompts(window: ObservedWindow, facts: Facts, views: tuple[View, ...], layout: str) -> dict[Language, Prompt]:
     """Write the prompts of both languages from one window."""
     numbers = _numbers(window, facts)
     languages: tuple[Language, Language] = ("en", "zh")
     return {
         language: Prompt(
             system=system_prompt(language),
-            user=_user_prompt(numbers, window, facts, _images_sentence(modalities, layout, language), language),
+            user=_user_prompt(numbers, window, facts, _images_sentence(views, layout, language), language),
         )
         for language in languages
     }
@@ -157,10 +156,10 @@ def _filled(name: str) -> str:
 
 
 @cache
-def _images_sentence(modalities: tuple[Modality, ...], layout: str, language: Language) -> str:
-    if not modalities:
+def _images_sentence(views: tuple[View, ...], layout: str, language: Language) -> str:
+    if not views:
         return {"en": "No images are given.", "zh": "未提供图像。"}[language]
-    words = [_MODALITY_WORDS[language][modality] for modality in modalities]
+    words = [_VIEW_WORDS[language][view] for view in views]
     if language == "zh":
         listed = "、".join(words)
         return f"每帧一张图像，从左到右为：{listed}。" if layout == "tiled" else f"每帧依次给出：{listed}。"
@@ -199,10 +198,10 @@ def question_messages(question: Question, encoder: FrameEncoder) -> tuple[list[d
     """
     content: list[dict] = []
     digests: list[str] = []
-    if question.modalities:
+    if question.views:
         for number, folder in enumerate(question.window.frame_folders):
             content.append({"type": "text", "text": f"t{number}:"})
-            for image in encoder.encode(folder, question.modalities):
+            for image in encoder.encode(folder, question.views):
                 content.append(_image_part(image))
                 digests.append(image.digest)
     content.append({"type": "text", "text": question.prompts["en"].user})
@@ -225,5 +224,5 @@ def mirror_messages(english: Coc) -> list[dict]:
 
 def make_question(window: ObservedWindow, facts: Facts, image: ImageConfig) -> Question:
     """Make the free question of a window."""
-    modalities = available_modalities(window, image.modalities)
-    return Question(window, facts, build_prompts(window, facts, modalities, image.layout), modalities)
+    views = available_views(window, image.modalities)
+    return Question(window, facts, build_prompts(window, facts, views, image.layout), views)

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
-from caption.schema import BudgetConfig, ImageConfig, Modality, Reply
+from caption.schema import BudgetConfig, ImageConfig, Reply
 from caption.teachers.answers import AnswerBook
 from caption.teachers.budget import Budget
 from caption.teachers.images import FrameEncoder
@@ -23,6 +23,7 @@ from caption.teachers.rules import MODEL, write_answers
 from cosfly.chance import rng_for
 from cosfly.chat.client import KEY_VARIABLE, ChatClient, EndpointConfig, NoAnswer
 from cosfly.chat.protocol import answer_key, base_url, shown_url, with_image_ids
+from cosfly.frame_views import View
 from cosfly.products.captions import Coc
 from cosfly.store import dump_json
 
@@ -120,7 +121,7 @@ class SharedFrames:
     def __init__(self, cfg: ImageConfig) -> None:
         self.encoder = FrameEncoder(cfg)
         self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
-        self._underway: dict[tuple[Path, tuple[Modality, ...]], asyncio.Future] = {}
+        self._underway: dict[tuple[Path, tuple[View, ...]], asyncio.Future] = {}
 
     async def messages(self, question: Question) -> tuple[list[dict], list[str]]:
         """Give the chat messages of a question and the digests of its pictures.
@@ -128,14 +129,14 @@ class SharedFrames:
         Raises:
             InputError, RenderError: a picture cannot be read or encoded.
         """
-        if question.modalities:
-            frames = [(folder, question.modalities) for folder in question.window.frame_folders]
+        if question.views:
+            frames = [(folder, question.views) for folder in question.window.frame_folders]
             missing = [frame for frame in frames if not self.encoder.holds(*frame)]
             if missing:
                 await asyncio.gather(*(self._encode(frame) for frame in missing))
         return question_messages(question, self.encoder)
 
-    async def _encode(self, frame: tuple[Path, tuple[Modality, ...]]) -> None:
+    async def _encode(self, frame: tuple[Path, tuple[View, ...]]) -> None:
         underway = self._underway.get(frame)
         if underway is None:
             loop = asyncio.get_running_loop()

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from cosfly.errors import InputError
+from cosfly.frame_views import thumbnail
 from cosfly.issues import Issue
-from cosfly.products.frames import read_rgb
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
 from cosfly.products.playback import Flight
 from cosfly.store import write_bytes
@@ -75,18 +72,7 @@ def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> dict[st
         name: [None if np.isnan(v) else round(float(v), 3) for v in values.tolist()] for name, values in curves.items()
     }
     middle, last = len(flight) // 2, len(flight) - 1
-    return {**numbers, "pictures": [_thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)]}
-
-
-def _thumbnail(frame: Path, width_px: int) -> str | None:
-    try:
-        rgb = read_rgb(frame)
-    except InputError:
-        return None
-    size = (width_px, max(1, round(width_px * rgb.shape[0] / rgb.shape[1])))
-    small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return base64.b64encode(data.tobytes()).decode("ascii")
+    return {**numbers, "pictures": [thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)]}
 
 
 def write_report(path: Path, inspection: Inspection, views: dict[str, dict[str, Any]]) -> None:

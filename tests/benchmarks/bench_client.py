@@ -29,10 +29,11 @@ from caption.run.asking import Asking
 from caption.run.flights import allot, named_flights
 from caption.run.stage import open_stage
 from caption.schema import CaptionConfig
-from caption.teachers.images import MODALITY_FILES, FrameEncoder
+from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.chat import client
 from cosfly.chat.protocol import encode_body
+from cosfly.frame_views import VIEW_FILES
 from cosfly.products.frames import SKY_DEPTH_M
 from specimens import make_playback_tree
 
@@ -157,12 +158,12 @@ def _make_tree(root: Path, num_windows: int) -> Path:
             frame.mkdir(parents=True, exist_ok=True)
             coarse = rng.integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
             rgb = cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-            cv2.imwrite(str(frame / MODALITY_FILES["rgb"]), rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            cv2.imwrite(str(frame / VIEW_FILES["rgb"]), rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
             depth_m = np.broadcast_to(rows, (HEIGHT, WIDTH)) + rng.integers(0, 5)
-            np.save(frame / MODALITY_FILES["depth"], np.where(rows < 5.0, SKY_DEPTH_M, depth_m).astype(np.float32))
+            np.save(frame / VIEW_FILES["depth"], np.where(rows < 5.0, SKY_DEPTH_M, depth_m).astype(np.float32))
             tags = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
             tags[..., 2] = np.repeat(np.repeat(rng.integers(1, 25, (9, 16)), 40, axis=0), 40, axis=1)
-            cv2.imwrite(str(frame / MODALITY_FILES["segmentation"]), tags, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            cv2.imwrite(str(frame / VIEW_FILES["segmentation"]), tags, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return root
 
 

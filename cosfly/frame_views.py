@@ -1,0 +1,101 @@
+"""Frames as pictures for a model or a person: one look for teachers, students, contact sheets and reports."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.products.frames import SKY_DEPTH_M, read_depth, read_instance, read_rgb
+from cosfly.products.kinds import KINDS
+
+View = Literal["rgb", "depth", "segmentation"]
+VIEW_FILES: dict[View, str] = {"rgb": "rgb.png", "depth": "depth.npy", "segmentation": "instance.png"}
+DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; flights keep their target within a third of it
+PEDESTRIAN_RGB = (255, 40, 40)
+NUM_SHADES = 24
+
+
+def read_view(
+    frame: Path, view: View, *, max_side_px: int | None = None, depth_range_m: float = DEPTH_RANGE_M
+) -> np.ndarray:
+    """Read one view of a frame folder as a picture, (h, w, 3) uint8 RGB.
+
+    Args:
+        max_side_px: scale down to this longest side; None keeps the size.
+    Raises:
+        InputError: the view's file is missing or damaged.
+    """
+    if view == "rgb":
+        return _bounded(read_rgb(frame), max_side_px)
+    if view == "depth":
+        return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
+    kinds, ids = read_instance(frame)
+    return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
+
+
+def depth_colors(depth_m: np.ndarray, range_m: float = DEPTH_RANGE_M) -> np.ndarray:
+    """Colour z-depth (h, w) with inferno reversed: near is bright, `range_m` and the sky are black; (h, w, 3) RGB.
+
+    The scale is fixed, not stretched per frame, so that the same colour is the same distance in every frame.
+    """
+    share = np.clip(np.where(depth_m >= SKY_DEPTH_M, range_m, depth_m) / range_m, 0.0, 1.0)
+    share = np.where(depth_m <= 0.0, 1.0, share)  # 0.0 means invalid, not near
+    reversed_level = np.round(255.0 * (1.0 - share)).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(reversed_level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
+def segmentation_colors(kinds: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """Colour classes in muted, fixed tones and pedestrians in red; kinds (h, w), ids (h, w) -> (h, w, 3) RGB."""
+    # Neighbouring instances of one class differ a little, so that single buildings can be told apart.
+    shades = (ids % NUM_SHADES) * 37 % NUM_SHADES
+    rows = np.minimum(kinds, len(KINDS) - 1) * np.uint16(NUM_SHADES) + shades
+    return np.take(_PALETTE, rows, axis=0)
+
+
+def encode_picture(rgb: np.ndarray, encoding: Literal["jpeg", "png"], jpeg_quality: int) -> bytes:
+    """Encode a picture, (h, w, 3) uint8 RGB."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if encoding == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    done, data = cv2.imencode(f".{encoding}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
+    assert done, "OpenCV encodes any 8-bit picture"
+    return data.tobytes()
+
+
+def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
+    """Give `rgb.png` of a frame folder as a small JPEG in base64, for a page; None where it cannot be read."""
+    try:
+        rgb = read_rgb(frame)
+    except InputError:
+        return None
+    size = (width_px, max(1, round(width_px * rgb.shape[0] / rgb.shape[1])))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")
+
+
+def _palette() -> np.ndarray:
+    """Muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3): hues by golden-angle steps, low saturation, so that only the
+    pedestrians are vivid.
+    """
+    hues = (np.arange(len(KINDS)) * 111) % 180
+    hsv = np.stack([hues, np.full(len(KINDS), 70), np.full(len(KINDS), 150)], axis=-1).astype(np.uint8)
+    tones = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0].astype(np.int64)
+    shades = np.arange(NUM_SHADES) - NUM_SHADES // 2
+    colors = np.clip(tones[:, None] + shades[:, None], 0, 255).astype(np.uint8)
+    colors[KINDS["Pedestrians"]] = PEDESTRIAN_RGB
+    return colors.reshape(-1, 3)
+
+
+_PALETTE = _palette()
+
+
+def _bounded(image: np.ndarray, max_side_px: int | None, *, nearest: bool = False) -> np.ndarray:
+    height, width = image.shape[:2]
+    if max_side_px is None or max_side_px >= max(height, width):
+        return image
+    scale = max_side_px / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA)
