@@ -66,12 +66,15 @@ def _disk(folder: Path) -> Check:
 
 
 def _gl() -> Check:
-    from cosfly.render.gl.backend import gl_report
+    from cosfly.products.boxes import make_box_map
+    from cosfly.render.stage import open_renderer
 
     try:
-        return Check("GL (renderer)", "ok", gl_report())
+        renderer = open_renderer("gl", make_box_map([], [], [], []), 16, 16)
     except EnvironmentMissing as error:
         return Check("GL (renderer)", "missing", str(error))
+    renderer.close()
+    return Check("GL (renderer)", "ok", renderer.device)
 
 
 def _gpu() -> Check:

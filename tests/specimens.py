@@ -13,11 +13,21 @@ import cv2
 import numpy as np
 
 from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
-from cosfly.products.frames import SKY_DEPTH_M, frame_name
+from cosfly.products.frames import (
+    SKY_DEPTH_M,
+    Camera,
+    CameraMeta,
+    FrameMeta,
+    PerturbationMeta,
+    TargetMeta,
+    TreeAngles,
+    TreePose,
+    TreePosition,
+    frame_name,
+)
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import Camera, Flight, write_flight
+from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.store import write_json
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
 FIRST_SECOND = 1_776_047_127
@@ -263,11 +273,38 @@ def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
     # OpenCV writes B, G, R: id high byte, id low byte, semantic tag.
     coded = np.stack([(instance >> 8).astype(np.uint8), (instance & 255).astype(np.uint8), semantic], axis=-1)
     cv2.imwrite(str(folder / "instance.png"), coded)
-    meta = {
-        "schema": "cosfly.frame",
-        "schema_version": "1.0",
-        "index": i,
-        "visibility": float(flight.visibility[i]),
-        "target_id": PERSON_ID,
-    }
-    write_json(folder / "meta.json", meta)
+    (folder / "meta.json").write_bytes(_meta(flight, i, int((instance == PERSON_ID).sum())).to_bytes())
+
+
+def _meta(flight: Flight, i: int, num_pixels: int) -> FrameMeta:
+    nowhere = TreePosition.of(np.zeros(3))
+    target = TargetMeta(
+        world_location=TreePosition.of(flight.targets_m[i]),
+        half_extents_m=PERSON_HALF_EXTENTS_M,
+        instance_id=PERSON_ID,
+        semantic_id=KINDS["Pedestrians"],
+        image_uv=None,
+        bbox_2d=None,
+        depth_m=float(flight.target_depth_m[i]),
+        in_view=bool(flight.target_in_view[i]),
+        visible=bool(flight.target_visible[i]),
+        visibility=float(flight.visibility[i]),
+        num_pixels=num_pixels,
+    )
+    return FrameMeta(
+        index=i,
+        time_s=float(flight.time_s[i]),
+        town=flight.town,
+        trajectory=flight.trajectory,
+        variant=flight.variant,
+        camera=CameraMeta.of(flight.camera, 0.3, SKY_DEPTH_M),
+        drone_pose=TreePose.of(flight.positions_m[i], flight.rotations_deg[i]),
+        target=target,
+        perturbation=PerturbationMeta(
+            position="none",
+            rotation="none",
+            drone_position=nowhere,
+            target_position=nowhere,
+            drone_rotation=TreeAngles.of(np.zeros(3)),
+        ),
+    )

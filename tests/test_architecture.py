@@ -92,6 +92,13 @@ def test_imports_point_one_way(name):
 
 
 @pytest.mark.parametrize("name", sorted(SOURCES))
+def test_what_opengl_draws_with_stays_behind_its_renderer(name):
+    """Meshes, shaders and the figure are one renderer's own: callers and other renderers know the contract only."""
+    own = "cosfly.render.gl"
+    assert name.startswith(own) or not [module for module in imports(name) if module.startswith(own)]
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
 def test_heavy_packages_are_imported_where_they_are_used(name):
     top = {n.split(".")[0] for n in imports(name, top_level_only=True)}
     assert not top & HEAVY

@@ -25,24 +25,45 @@ from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matric
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products import playback
 from cosfly.products.boxes import make_box_map, write_boxes
-from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import Camera, Look, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import Camera, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
-from cosfly.render.gl import backend as gl_backend
+from cosfly.render.contract import (
+    GROUND_PLANE_HALF_M,
+    MAX_BOX_ID,
+    PERSON_ID,
+    SHARED_ID,
+    Frame,
+    PosedPerson,
+    instance_ids,
+)
 from cosfly.render.gl import meshes as unit_meshes
-from cosfly.render.gl.scene import GROUND_PLANE_HALF_M, MAX_BOX_ID, PERSON_ID, SHARED_ID, build_scene, instance_ids
-from cosfly.render.person import choose_clothes, pose_person, walk_of
-from cosfly.render.perturbation import Ground, PerturbationConfig, Poses, in_frame, perturb
-from cosfly.render.stage import Frame, RenderConfig, open_renderer, plan_flight, run
+from cosfly.render.gl.figure import make_body
+from cosfly.render.gl.scene import build_scene
+from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
+from cosfly.render.stage import RenderConfig, open_renderer, run, script_flight
 from cosfly.store import read_checksums, sha256_file
 
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street"}
-needs_gl = pytest.mark.skipif(gl_backend.is_missing() is not None, reason=str(gl_backend.is_missing()))
+
+
+def without_gl() -> str:
+    """The reason that there is no OpenGL here, or nothing."""
+    try:
+        open_renderer("gl", make_box_map([], [], [], []), 16, 16).close()
+    except EnvironmentMissing as error:
+        return str(error)
+    return ""
+
+
+NO_GL = without_gl()
+needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
 
 
 def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
@@ -159,7 +180,7 @@ def test_ground_plane_is_below_every_slab():
 @settings(max_examples=25, deadline=None)
 def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, swing, x, z):
     hip = np.array([x, 3.0, z + 0.9])
-    body = pose_person(hip, heading, phase, swing, choose_clothes(np.random.default_rng(0)))
+    body = make_body(PosedPerson(hip, heading, phase, swing, choose_clothes(np.random.default_rng(0))))
     points = []
     for k in range(len(body.mesh)):
         local = ALL_MESHES[body.mesh[k]].vertices[:, :3] * body.records["half"][k]
@@ -173,13 +194,13 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
     assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
 
 
-def test_walk_follows_motion_and_keeps_the_heading_when_standing():
+def test_gait_follows_motion_and_keeps_the_heading_when_standing():
     targets = np.array([[0, 0, 0.9], [0, 1, 0.9], [0, 2, 0.9], [0, 2, 0.9], [0, 2, 0.9]], dtype=float)
-    walk = walk_of(targets, np.arange(5) * 0.5)
-    np.testing.assert_allclose(walk.headings_rad, np.pi / 2)
-    assert walk.swings[-1] == 0.0
-    assert (np.diff(walk.phases_rad)[:2] > 0).all()
-    assert np.diff(walk.phases_rad)[-1] == 0.0
+    gait = gait_of(targets, np.arange(5) * 0.5)
+    np.testing.assert_allclose(gait.headings_rad, np.pi / 2)
+    assert gait.swings[-1] == 0.0
+    assert (np.diff(gait.phases_rad)[:2] > 0).all()
+    assert np.diff(gait.phases_rad)[-1] == 0.0
 
 
 # --- the target in the picture ----------------------------------------------------------------------------------------
@@ -272,7 +293,7 @@ def planned(n: int = 200) -> Poses:
 
 def perturbed(cfg: PerturbationConfig, n: int = 200, box_map=None, seed: int = 0):
     box_map = box_map or street()
-    return perturb(planned(n), CAMERA, obstacle_index(box_map), Ground(box_map), cfg, np.random.default_rng(seed))
+    return perturb(planned(n), CAMERA, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
@@ -349,11 +370,11 @@ def test_a_walled_in_person_is_not_moved():
 
 
 def test_ground_height_finds_the_pavement():
-    ground = Ground(street())
-    assert ground.height_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
-    assert ground.height_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
-    assert ground.height_m(500.0, 500.0, 0.4) == 0.4
-    assert ground.height_m(0.0, -9.0, 20.0) == 20.0
+    surroundings = Surroundings(street())
+    assert surroundings.ground_z_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
+    assert surroundings.ground_z_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
+    assert surroundings.ground_z_m(500.0, 500.0, 0.4) == 0.4
+    assert surroundings.ground_z_m(0.0, -9.0, 20.0) == 20.0
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -377,7 +398,7 @@ def test_bad_settings_are_named(data, word):
 
 def test_unknown_renderer():
     with pytest.raises(ConfigError, match="unknown renderer"):
-        open_renderer("crayon", build_scene(street()), 32, 18)
+        open_renderer("crayon", street(), 32, 18)
 
 
 def test_missing_gl_names_the_packages(monkeypatch):
@@ -388,7 +409,7 @@ def test_missing_gl_names_the_packages(monkeypatch):
 
     monkeypatch.setattr(moderngl, "create_context", fail)
     with pytest.raises(EnvironmentMissing, match="libegl1 libgl1 libgl1-mesa-dri") as caught:
-        gl_backend.gl_report()
+        open_renderer("gl", street(), 32, 18)
     assert caught.value.fatal
     assert "libEGL" in str(caught.value)
 
@@ -446,12 +467,13 @@ def test_frames_hold_what_their_annotation_says(finished):
             depth, meta = read_depth(frame), read_meta(frame)
             assert read_rgb(frame).shape == (90, 160, 3)
             assert depth.shape == kinds.shape == (90, 160)
-            assert (meta["index"], meta["variant"]) == (i, folder.name)
-            assert meta["target"]["num_pixels"] == int((ids == PERSON_ID).sum()) > 0
-            assert meta["target"]["visible"] == bool(flight.target_visible[i])
-            assert meta["target"]["visibility"] == pytest.approx(flight.visibility[i], abs=1e-6)
-            assert meta["drone_pose"]["y"] == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
-            assert meta["camera"]["intrinsic"] == flight.camera.intrinsic.tolist()
+            assert (meta.index, meta.variant) == (i, folder.name)
+            assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
+            assert meta.target.visible == bool(flight.target_visible[i])
+            assert meta.target.visibility == pytest.approx(flight.visibility[i], abs=1e-6)
+            assert meta.drone_pose.y == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
+            assert meta.look == Look(), "sun and air of the picture"
+            assert meta.camera.intrinsic == flight.camera.intrinsic.tolist()
             u, v = flight.target_uv[i]
             x0, y0, x1, y1 = flight.target_bbox[i]
             assert x0 <= u <= x1
@@ -527,13 +549,13 @@ def test_no_flight_to_draw(tmp_path):
         run(RenderConfig(), *inputs, tmp_path / "out")
 
 
-def test_plans_depend_on_the_seed_only():
-    cfg = RenderConfig(width_px=160, height_px=90)
-    fovs = {plan_flight(circling(3), 0, "clean", "T", street(), cfg, seed).camera.fov_deg for seed in range(30)}
+def test_scripts_depend_on_the_seed_only():
+    cfg, around = RenderConfig(width_px=160, height_px=90), Surroundings(street())
+    fovs = {script_flight(circling(3), 0, "clean", "T", around, cfg, seed).camera.fov_deg for seed in range(30)}
     assert {round(fov) for fov in fovs} == {110, 90, 60, 30}
-    a, b = (plan_flight(circling(9), 0, "perturbed", "T", street(), cfg, 3) for _ in range(2))
+    a, b = (script_flight(circling(9), 0, "perturbed", "T", around, cfg, 3) for _ in range(2))
     np.testing.assert_array_equal(a.poses.positions_m, b.poses.positions_m)
-    fixed = plan_flight(circling(3), 4, "clean", "T", street(), RenderConfig(fovs_deg=(60.0,)), 1)
+    fixed = script_flight(circling(3), 4, "clean", "T", around, RenderConfig(fovs_deg=(60.0,)), 1)
     assert fixed.camera.fov_deg == pytest.approx(60.0)
     assert fixed.trajectory == "trajectory_1776000004"
 

@@ -16,13 +16,20 @@ import pytest
 from cosfly.errors import EnvironmentMissing
 from cosfly.geometry import intrinsic_matrix, look_at, rotation_matrices, world_from_camera
 from cosfly.products.boxes import BoxMap, make_box_map
-from cosfly.products.frames import SKY_DEPTH_M
+from cosfly.products.frames import SKY_DEPTH_M, Camera
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import Camera
 from cosfly.render.camera import rendered_visibility, view_target
-from cosfly.render.contract import FAR_M, NEAR_M
-from cosfly.render.gl.scene import GROUND_PLANE_DROP_M, GROUND_PLANE_HALF_M, NO_INSTANCE, PERSON_ID, build_scene
-from cosfly.render.person import choose_clothes, pose_person
+from cosfly.render.contract import (
+    FAR_M,
+    GROUND_PLANE_DROP_M,
+    GROUND_PLANE_HALF_M,
+    NEAR_M,
+    NO_INSTANCE,
+    PERSON_ID,
+    PosedPerson,
+    ground_z_m,
+)
+from cosfly.render.person import choose_clothes
 from cosfly.render.stage import RENDERERS, open_renderer
 
 SIZE = (320, 180)
@@ -94,7 +101,7 @@ def renderer_name(request):
 
 def opened(name: str, box_map: BoxMap):
     try:
-        return open_renderer(name, build_scene(box_map), *SIZE)
+        return open_renderer(name, box_map, *SIZE)
     except EnvironmentMissing as error:
         pytest.skip(str(error))
 
@@ -117,7 +124,7 @@ VIEWS = [
 def test_depth_and_ids_agree_with_computed_rays(renderer, eye, target, fov_deg):
     pose, intrinsic = pose_towards(eye, target), intrinsic_matrix(*SIZE, fov_deg)
     frame = renderer.render(pose, intrinsic, None)
-    depth, kinds, ids = traced(street(), renderer.scene.ground_z_m, pose, intrinsic)
+    depth, kinds, ids = traced(street(), ground_z_m(street()), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids)
     assert inner.mean() > 0.5
     near = inner & (depth < 60.0)
@@ -137,7 +144,7 @@ def test_depth_is_exact_far_from_the_world_origin(renderer_name):
         intrinsic_matrix(*SIZE, 60.0),
     )
     frame = renderer.render(pose, intrinsic, None)
-    depth, _, ids = traced(street(offset), renderer.scene.ground_z_m, pose, intrinsic)
+    depth, _, ids = traced(street(offset), ground_z_m(street(offset)), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids) & (depth < 60.0)
     renderer.close()
     assert np.abs(frame.depth - depth)[inner].max() < DEPTH_TOLERANCE_M
@@ -164,8 +171,8 @@ def test_types_ranges_and_sky(renderer):
 
 def test_the_person_is_drawn_in_the_projected_box(renderer):
     pose, camera = pose_towards((-4.0, -12.0, 6.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
-    body = pose_person(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
-    frame = renderer.render(pose, camera.intrinsic, body)
+    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    frame = renderer.render(pose, camera.intrinsic, walker)
     view = view_target(HIP, pose, camera)
     person = frame.ids == PERSON_ID
     assert (frame.kinds[person] == KINDS["Pedestrians"]).all()
@@ -181,7 +188,7 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert score > 0.98
     assert num_px == person.sum()
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
-    hidden = renderer.render(behind, camera.intrinsic, body)
+    hidden = renderer.render(behind, camera.intrinsic, walker)
     assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0)
 
 
@@ -205,13 +212,13 @@ def test_another_process_gives_the_same_picture(renderer_name):
 
 
 def _digest(renderer) -> str:
-    body = pose_person(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
-    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), body)
+    person = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), person)
     return hashlib.sha256(b"".join(a.tobytes() for a in (frame.rgb, frame.depth, frame.kinds, frame.ids))).hexdigest()
 
 
 def _digest_in_process(name: str) -> str:
-    return _digest(open_renderer(name, build_scene(street()), *SIZE))
+    return _digest(open_renderer(name, street(), *SIZE))
 
 
 def test_the_checker_of_this_file_can_fail():

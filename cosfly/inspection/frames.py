@@ -131,10 +131,10 @@ def _check_meta(flight: Flight, i: int, report: Report) -> None:
     try:
         meta = read_meta(flight.frame_folder(i))
     except InputError as error:
-        report.error("broken_annotation", where, error.got, "a JSON object")
+        report.error("broken_annotation", where, error.got, "a frame annotation")
         return
-    if meta.get("index", i) != i:
-        report.error("broken_annotation", f"{where}: index", meta["index"], str(i))
+    if meta.index != i:
+        report.error("broken_annotation", f"{where}: index", meta.index, str(i))
 
 
 def check_checksums(flight: Flight, report: Report) -> None:

@@ -1,18 +1,211 @@
-"""The files of one frame folder of the playback tree: rgb.png, depth.npy, instance.png, meta.json."""
+"""The files of one frame folder of the playback tree: rgb.png, depth.npy, instance.png, meta.json, and what `meta.json` holds.
+
+Axes inside the tree are CARLA's (left-handed); `.of(...)` of the groups below takes the project's right-handed values.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.store import read_json
+from cosfly.geometry import mirror_positions, mirror_rotations
+from cosfly.store import check_schema, dump_json, read_json
 
 FRAMES_DIR = "frames_playback"
 FRAME_FILES = ("rgb.png", "depth.npy", "instance.png", "meta.json")
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
+META_SCHEMA, META_VERSION = "cosfly.frame", "1.0"
+XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
+
+COORDINATES = {
+    "frame": "carla",
+    "handedness": "left",
+    "position": "metres, x forward (east), y right (south), z up",
+    "rotation": "degrees; yaw clockwise seen from above, pitch nose-up, roll right-side-down",
+    "camera": "pose of the camera; image x right, y down; depth along the optical axis",
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera of square pixels; `intrinsic` is (3, 3)."""
+
+    width_px: int
+    height_px: int
+    intrinsic: np.ndarray
+
+    @property
+    def focal_px(self) -> float:
+        return float(self.intrinsic[0, 0])
+
+    @property
+    def fov_deg(self) -> float:
+        """Horizontal field of view."""
+        return float(np.degrees(2.0 * np.arctan(self.width_px / (2.0 * self.focal_px))))
+
+
+class Look(Config):
+    """Sun and air, the same for every frame of a run."""
+
+    sun_azimuth_deg: float = Field(
+        235.0, ge=0, le=360, description="direction towards the sun, counter-clockwise from east"
+    )
+    sun_elevation_deg: float = Field(42.0, ge=5, le=85, description="height of the sun above the horizon, degrees")
+    haze_m: float = Field(520.0, gt=1, description="distance at which haze hides two thirds of what stands there, m")
+    exposure: float = Field(0.82, gt=0, le=10, description="brightness of the picture, a factor; 1 is neutral")
+
+    def sun_direction(self) -> np.ndarray:
+        """Unit vector towards the sun, (3,)."""
+        azimuth, elevation = np.radians([self.sun_azimuth_deg, self.sun_elevation_deg])
+        return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+
+
+# --- meta.json --------------------------------------------------------------------------------------------------------
+
+
+class _Group(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TreePosition(_Group):
+    """A place or a shift in the tree's axes, m."""
+
+    x: float
+    y: float
+    z: float
+
+    @classmethod
+    def of(cls, position_m: np.ndarray) -> TreePosition:
+        return cls(**_tree_position(position_m))
+
+
+class TreeAngles(_Group):
+    """A turn in the tree's axes, degrees."""
+
+    pitch: float
+    yaw: float
+    roll: float
+
+    @classmethod
+    def of(cls, rotation_deg: np.ndarray) -> TreeAngles:
+        return cls(**_tree_angles(rotation_deg))
+
+
+class TreePose(_Group):
+    """The camera's pose in the tree's axes, m and degrees."""
+
+    x: float
+    y: float
+    z: float
+    pitch: float
+    yaw: float
+    roll: float
+
+    @classmethod
+    def of(cls, position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
+        return cls(**_tree_position(position_m), **_tree_angles(rotation_deg))
+
+
+def _tree_position(position_m: np.ndarray) -> dict[str, float]:
+    return dict(zip(XYZ, (mirror_positions(position_m) + 0.0).tolist(), strict=True))  # + 0.0: no minus zero
+
+
+def _tree_angles(rotation_deg: np.ndarray) -> dict[str, float]:
+    return dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True))
+
+
+class CameraMeta(_Group):
+    """The camera that drew a frame; intrinsic 3x3 px, clip planes in m."""
+
+    width: int
+    height: int
+    fov_deg: float
+    focal_length_px: float
+    intrinsic: list[list[float]]
+    near_m: float
+    far_m: float
+
+    @classmethod
+    def of(cls, camera: Camera, near_m: float, far_m: float) -> CameraMeta:
+        return cls(
+            width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
+            focal_length_px=camera.focal_px, intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
+        )  # fmt: skip
+
+
+class TargetMeta(_Group):
+    """The person in a frame: hip point, box and how much of it is seen; px where nothing else is said, null where there is none."""
+
+    world_location: TreePosition
+    half_extents_m: tuple[float, float, float]
+    instance_id: int
+    semantic_id: int
+    image_uv: list[float] | None
+    bbox_2d: list[float] | None
+    depth_m: float
+    in_view: bool
+    visible: bool
+    visibility: float
+    num_pixels: int
+
+
+class PerturbationMeta(_Group):
+    """What was done to a frame: none | applied | the reason for falling back, and the offsets."""
+
+    position: str
+    rotation: str
+    drone_position: TreePosition
+    target_position: TreePosition
+    drone_rotation: TreeAngles
+
+
+class FrameMeta(_Group):
+    """`meta.json`: what a loader needs to know of one frame without opening anything else."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    schema_name: str = Field(META_SCHEMA, alias="schema")
+    schema_version: str = META_VERSION
+    coordinates: dict[str, str] = COORDINATES
+    index: int
+    time_s: float
+    town: str
+    trajectory: str
+    variant: str
+    camera: CameraMeta
+    drone_pose: TreePose
+    target: TargetMeta
+    perturbation: PerturbationMeta
+    look: Look | None = None  # null in trees of before it stood here
+
+    def to_bytes(self) -> bytes:
+        """The content of the file."""
+        return (dump_json(self.model_dump(by_alias=True), indent=1) + "\n").encode()
+
+
+def read_meta(frame: Path) -> FrameMeta:
+    """Read `meta.json` of a frame folder.
+
+    Raises:
+        InputError: missing, or not such a file; names the field.
+    """
+    path = frame / "meta.json"
+    value = check_schema(read_json(path, what="frame annotation"), META_SCHEMA, META_VERSION, path)
+    try:
+        return FrameMeta.model_validate(value)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        field = ".".join(str(part) for part in detail["loc"])
+        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
+
+
+# --- the files --------------------------------------------------------------------------------------------------------
 
 
 def frame_name(index: int) -> str:
@@ -51,14 +244,6 @@ def read_depth(frame: Path) -> np.ndarray:
     if depth.ndim != 2 or depth.dtype != np.float32:
         raise InputError("not a depth image", where=path, got=f"{depth.dtype} {depth.shape}", expected="float32 (h, w)")
     return depth
-
-
-def read_meta(frame: Path) -> dict:
-    """Read `meta.json` of a frame folder."""
-    meta = read_json(frame / "meta.json", what="frame annotation")
-    if not isinstance(meta, dict):
-        raise InputError("not an annotation", where=frame / "meta.json", got=type(meta).__name__, expected="an object")
-    return meta
 
 
 def _read_png(path: Path) -> np.ndarray:

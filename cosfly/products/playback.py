@@ -5,8 +5,8 @@
         trajectory.json
         frames_playback/frame_00000/{rgb.png, depth.npy, instance.png, meta.json}
 
-Axes inside the tree are CARLA's (left-handed); reader and writer convert here, and everything else in the project sees the
-right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a read-write round trip.
+Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything else in the
+project sees the right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a read-write round trip.
 """
 
 from __future__ import annotations
@@ -21,39 +21,13 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import DT_S, mirror_positions, mirror_rotations
-from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, frame_name
+from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
 from cosfly.store import read_json, write_json
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
 
-XYZ, ANGLES, BBOX = ("x", "y", "z"), ("pitch", "yaw", "roll"), ("xmin", "ymin", "xmax", "ymax")
-
-COORDINATES = {
-    "frame": "carla",
-    "handedness": "left",
-    "position": "metres, x forward (east), y right (south), z up",
-    "rotation": "degrees; yaw clockwise seen from above, pitch nose-up, roll right-side-down",
-    "camera": "pose of the camera; image x right, y down; depth along the optical axis",
-}
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera of square pixels; `intrinsic` is (3, 3)."""
-
-    width_px: int
-    height_px: int
-    intrinsic: np.ndarray
-
-    @property
-    def focal_px(self) -> float:
-        return float(self.intrinsic[0, 0])
-
-    @property
-    def fov_deg(self) -> float:
-        """Horizontal field of view."""
-        return float(np.degrees(2.0 * np.arctan(self.width_px / (2.0 * self.focal_px))))
+BBOX = ("xmin", "ymin", "xmax", "ymax")
 
 
 @dataclass(frozen=True)
@@ -375,8 +349,8 @@ def write_flight(folder: Path, flight: Flight) -> None:
             **point.get("timing", {}),
             "trace_timestamp": float(flight.time_s[i]),
         }
-        pose = dict(zip(("x", "y", "z"), positions[i].tolist(), strict=True))
-        pose.update(zip(("pitch", "yaw", "roll"), rotations[i].tolist(), strict=True))
+        pose = dict(zip(XYZ, positions[i].tolist(), strict=True))
+        pose.update(zip(ANGLES, rotations[i].tolist(), strict=True))
         point["drone_pose"] = {**point.get("drone_pose", {}), **pose}
         following = positions[i + 1].tolist() if i + 1 < len(points) else None
         point["nav_waypoint"] = {**point.get("nav_waypoint", {}), "t1_world": following}

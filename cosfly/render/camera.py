@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosfly.geometry import box_corners, project
-from cosfly.products.playback import Camera
+from cosfly.products.frames import Camera
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.render.contract import NEAR_M, Frame
-from cosfly.render.gl.scene import PERSON_ID
+from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly

@@ -1,4 +1,11 @@
-"""What every renderer gives and takes: the frame, the look of the scene, the protocol."""
+"""What every renderer gives and takes: a map of boxes and a look in, one frame for each camera and posed person out.
+
+Any renderer draws the same things in the same places, so that depth, kinds and ids do not depend on who draws:
+
+- every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
+- a ground plane of Terrain under everything (`ground_plane`), and sky where nothing stands between NEAR_M and FAR_M;
+- of coplanar surfaces the one of the higher layer (`layers_of`).
+"""
 
 from __future__ import annotations
 
@@ -6,12 +13,25 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydantic import Field
 
-from cosfly.config import Config
-from cosfly.render.gl.body import Body
+from cosfly.errors import RenderError
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import GROUND_KINDS, KINDS
 
 NEAR_M, FAR_M = 0.3, 1000.0  # clip planes (sec:step5)
+
+# Instance ids of the 16 bits that instance.png has: 0 is nobody (sky, ground plane).
+PERSON_ID, SHARED_ID, MAX_BOX_ID = 65535, 65534, 65533
+NO_INSTANCE = 0
+
+GROUND_PLANE_HALF_M = 1500.0
+GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that the two never fight for a pixel
+
+# A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written. The ground plane's layer is 0.
+LAYER_STEP = 1e-4
+LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
+STANDING_LAYER = 7
+LAWN_HALF_M = 0.2  # vegetation of a smaller half height is a lawn; it lies in the layer of road lines
 
 
 @dataclass(frozen=True)
@@ -28,37 +48,113 @@ class Frame:
     ids: np.ndarray
 
 
-class Look(Config):
-    """Sun and air, the same for every frame of a run."""
+@dataclass(frozen=True)
+class Clothes:
+    """Linear RGB of what one person wears, (3,) each."""
 
-    sun_azimuth_deg: float = Field(
-        235.0, ge=0, le=360, description="direction towards the sun, counter-clockwise from east"
-    )
-    sun_elevation_deg: float = Field(42.0, ge=5, le=85, description="height of the sun above the horizon, degrees")
-    haze_m: float = Field(520.0, gt=1, description="distance at which haze hides two thirds of what stands there, m")
-    exposure: float = Field(0.82, gt=0, le=10, description="brightness of the picture, a factor; 1 is neutral")
+    shirt: np.ndarray
+    trousers: np.ndarray
+    hair: np.ndarray
+    skin: np.ndarray
+    shoes: np.ndarray
 
-    def sun_direction(self) -> np.ndarray:
-        """Unit vector towards the sun, (3,)."""
-        azimuth, elevation = np.radians([self.sun_azimuth_deg, self.sun_elevation_deg])
-        return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+
+@dataclass(frozen=True)
+class PosedPerson:
+    """One person of 1.8 m in one moment. hip_m (3,) world, the middle of the target's box, whose bottom the feet stand on;
+    phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
+    """
+
+    hip_m: np.ndarray
+    heading_rad: float
+    phase_rad: float
+    swing: float
+    clothes: Clothes
 
 
 class Renderer(Protocol):
-    """Draws frames of one scene. Made by `open_renderer`; used from one thread."""
+    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look)` opens one; used from one thread.
 
-    name: str
+    device: what draws, one line. Opening raises EnvironmentMissing where a package or driver is not there.
+    """
+
+    device: str
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
         """Get ready for a flight within these corners, (3,) each: shadows and the like."""
 
-    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: Body | None) -> Frame:
-        """Draw one frame from world_from_camera (4, 4) through K (3, 3)."""
-        ...
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+        """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 
-    def describe(self) -> dict[str, str]:
-        """Say what draws: for the manifest."""
+        Raises:
+            RenderError: the pose is not finite.
+        """
         ...
 
     def close(self) -> None:
         """Give the device back."""
+
+
+# --- the same for all -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class InstanceIds:
+    """Which 16-bit id each box got. `ids` (n,) uint16 in the map's order; `num_shared` boxes share SHARED_ID."""
+
+    ids: np.ndarray
+    num_shared: int
+    are_box_ids: bool
+
+
+def instance_ids(box_map: BoxMap) -> InstanceIds:
+    """Give every box its id for `instance.png`.
+
+    The boxes' own ids are used if all of them lie in 1..MAX_BOX_ID. Otherwise ids are counted from 1, first through the boxes
+    that are not vegetation, then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
+    """
+    n = len(box_map)
+    if n == 0 or (box_map.ids.min() >= 1 and box_map.ids.max() <= MAX_BOX_ID):
+        return InstanceIds(box_map.ids.astype(np.uint16), 0, True)
+    order = np.argsort(box_map.kinds == KINDS["Vegetation"], kind="stable")
+    ids = np.empty(n, dtype=np.uint16)
+    ids[order] = np.minimum(np.arange(1, n + 1), SHARED_ID)
+    return InstanceIds(ids, max(0, n - MAX_BOX_ID), False)
+
+
+def scene_origin(box_map: BoxMap) -> np.ndarray:
+    """A whole-metre place in the middle of a map, (3,) world: what a GPU computes in float32 is best relative to it."""
+    low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
+    return np.round((low + high) / 2.0)
+
+
+def ground_z_m(box_map: BoxMap) -> float:
+    """Height of the ground: the map's own figure where it has one, but never above a slab that covers it."""
+    tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
+    if len(tops):
+        return float(tops.min())
+    given = box_map.header.get("ground_z_m")
+    if isinstance(given, int | float):
+        return float(given)
+    return float(box_map.mins[:, 2].min()) if len(box_map) else 0.0
+
+
+def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half sizes, (3,) each, world, of the flat box of Terrain under everything; its id is NO_INSTANCE."""
+    x, y, _ = scene_origin(box_map)
+    center = np.array([x, y, ground_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
+    return center, np.array([GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5])
+
+
+def layers_of(box_map: BoxMap) -> np.ndarray:
+    """The layer of each box, (n,)."""
+    table = np.full(256, STANDING_LAYER)
+    table[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
+    is_lawn = (box_map.kinds == KINDS["Vegetation"]) & (box_map.half_extents[:, 2] < LAWN_HALF_M)
+    return np.where(is_lawn, LAYERS["RoadLines"], table[box_map.kinds])
+
+
+def check_pose(camera_pose: np.ndarray, intrinsic: np.ndarray) -> None:
+    """Raise RenderError where a camera is not finite."""
+    if not (np.isfinite(camera_pose).all() and np.isfinite(intrinsic).all()):
+        raise RenderError("the camera pose is not finite", got=str(camera_pose.tolist()))

@@ -12,26 +12,35 @@ import cv2
 import numpy as np
 
 from cosfly.errors import RenderError
-from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
-from cosfly.products.frames import frame_name
+from cosfly.geometry import world_from_camera
+from cosfly.products.frames import (  # fmt: skip
+    Camera,
+    CameraMeta,
+    FrameMeta,
+    Look,
+    PerturbationMeta,
+    TargetMeta,
+    TreeAngles,
+    TreePose,
+    TreePosition,
+    frame_name,
+)
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import COORDINATES, Camera, Flight, write_flight
+from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import TargetView, rendered_visibility, view_target
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, Renderer
-from cosfly.render.gl.scene import PERSON_ID
-from cosfly.render.person import Clothes, Walk, pose_person
+from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
+from cosfly.render.person import Gait
 from cosfly.render.perturbation import Poses
 from cosfly.store import dump_json, sha256_bytes, sha256_file, storage_errors, write_checksums
 
-FRAME_SCHEMA, FRAME_VERSION = "cosfly.frame", "1.0"
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight
 FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 
 
 @dataclass(frozen=True)
-class FlightPlan:
+class FlightScript:
     """All that is drawn in one flight, n frames.
 
     states: per frame {"position", "rotation"} of the perturbation; offsets (n, 3) as in Flight. source: who planned it.
@@ -43,7 +52,7 @@ class FlightPlan:
     camera: Camera
     time_s: np.ndarray
     poses: Poses
-    walk: Walk
+    gait: Gait
     clothes: Clothes
     is_perturbed: np.ndarray
     drone_offsets_m: np.ndarray
@@ -51,6 +60,7 @@ class FlightPlan:
     rotation_offsets_deg: np.ndarray
     states: list[dict[str, str]]
     is_original: bool
+    look: Look
     source: dict = field(default_factory=dict)
 
 
@@ -73,7 +83,9 @@ class _Seen:
     is_visible: bool
 
 
-def render_flight(renderer: Renderer, plan: FlightPlan, folder: Path, writing: Writing, num_threads: int = 2) -> Flight:
+def render_flight(
+    renderer: Renderer, script: FlightScript, folder: Path, writing: Writing, num_threads: int = 2
+) -> Flight:
     """Draw a flight into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`, `checksums.sha256`.
 
     Returns:
@@ -81,28 +93,27 @@ def render_flight(renderer: Renderer, plan: FlightPlan, folder: Path, writing: W
     Raises:
         StorageError: a file cannot be written. RenderError: a picture cannot be encoded.
     """
-    places = np.concatenate([plan.poses.positions_m, plan.poses.targets_m])
+    places = np.concatenate([script.poses.positions_m, script.poses.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
     seen: list[_Seen] = []
     digests: dict[str, str] = {}
     pending: list[Future] = []
     with ThreadPoolExecutor(num_threads) as pool:
-        for i in range(len(plan.time_s)):
-            pose = world_from_camera(plan.poses.positions_m[i], plan.poses.rotations_deg[i])
-            target = plan.poses.targets_m[i]
-            walk = plan.walk
-            body = pose_person(target, walk.headings_rad[i], walk.phases_rad[i], walk.swings[i], plan.clothes)
-            frame = renderer.render(pose, plan.camera.intrinsic, body)
-            seen.append(_look(frame, target, pose, plan.camera, writing.visible_threshold))
-            meta = _annotation(plan, i, seen[i])
+        for i in range(len(script.time_s)):
+            pose = world_from_camera(script.poses.positions_m[i], script.poses.rotations_deg[i])
+            target = script.poses.targets_m[i]
+            person = script.gait.posed(i, target, script.clothes)
+            frame = renderer.render(pose, script.camera.intrinsic, person)
+            seen.append(_look(frame, target, pose, script.camera, writing.visible_threshold))
+            meta = _annotation(script, i, seen[i])
             pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, meta, writing))
             while len(pending) >= FRAMES_IN_FLIGHT:
                 digests.update(pending.pop(0).result())
         for future in pending:
             digests.update(future.result())
-    flight = _flight(plan, seen)
+    flight = _flight(script, seen)
     write_flight(folder, flight)
-    _write_text(folder / "perturbation_report.json", dump_json(_report(plan), indent=1) + "\n")
+    _write_text(folder / "perturbation_report.json", dump_json(_report(script), indent=1) + "\n")
     for name in ("trajectory.json", "perturbation_report.json"):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)
@@ -119,7 +130,7 @@ def _look(frame: Frame, target_m: np.ndarray, pose: np.ndarray, camera: Camera, 
 # --- files of one frame -----------------------------------------------------------------------------------------------
 
 
-def _write_frame(folder: Path, name: str, frame: Frame, meta: dict, writing: Writing) -> dict[str, str]:
+def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
     """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
     makers: dict[str, tuple[str, Callable[[], bytes]]] = {
         "rgb": ("rgb.png", lambda: png_bytes(frame.rgb[..., ::-1], writing.png_compression)),
@@ -127,7 +138,7 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: dict, writing: Wri
         "instance": ("instance.png", lambda: png_bytes(instance_bgr(frame), writing.png_compression)),
     }
     contents = {makers[m][0]: makers[m][1]() for m in writing.modalities}
-    contents["meta.json"] = (dump_json(meta, indent=1) + "\n").encode()
+    contents["meta.json"] = meta.to_bytes()
     target = folder / name
     with storage_errors(target):
         target.mkdir(parents=True, exist_ok=True)
@@ -165,100 +176,79 @@ def _write_text(path: Path, text: str) -> None:
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def _annotation(plan: FlightPlan, i: int, seen: _Seen) -> dict:
-    """`meta.json`: what a loader needs to know of one frame without opening anything else. Axes are the tree's (CARLA's)."""
-    camera, view = plan.camera, seen.view
-    position, target = (
-        mirror_positions(plan.poses.positions_m[i]) + 0.0,
-        mirror_positions(plan.poses.targets_m[i]) + 0.0,
+def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
+    return FrameMeta(
+        index=i,
+        time_s=float(script.time_s[i]),
+        town=script.town,
+        trajectory=script.trajectory,
+        variant=script.variant,
+        camera=CameraMeta.of(script.camera, NEAR_M, FAR_M),
+        drone_pose=TreePose.of(script.poses.positions_m[i], script.poses.rotations_deg[i]),
+        target=TargetMeta(
+            world_location=TreePosition.of(script.poses.targets_m[i]),
+            half_extents_m=PERSON_HALF_EXTENTS_M,
+            instance_id=PERSON_ID,
+            semantic_id=KINDS["Pedestrians"],
+            image_uv=_list_or_none(seen.view.uv),
+            bbox_2d=_list_or_none(seen.view.bbox_px),
+            depth_m=seen.view.depth_m,
+            in_view=seen.view.in_view,
+            visible=seen.is_visible,
+            visibility=round(seen.visibility, 6),
+            num_pixels=seen.num_person_px,
+        ),
+        perturbation=PerturbationMeta(
+            **script.states[i],
+            drone_position=TreePosition.of(script.drone_offsets_m[i]),
+            target_position=TreePosition.of(script.target_offsets_m[i]),
+            drone_rotation=TreeAngles.of(script.rotation_offsets_deg[i]),
+        ),
+        look=script.look,
     )
-    rotation = mirror_rotations(plan.poses.rotations_deg[i]) + 0.0
-    return {
-        "schema": FRAME_SCHEMA,
-        "schema_version": FRAME_VERSION,
-        "coordinates": COORDINATES,
-        "index": i,
-        "time_s": float(plan.time_s[i]),
-        "town": plan.town,
-        "trajectory": plan.trajectory,
-        "variant": plan.variant,
-        "camera": {
-            "width": camera.width_px,
-            "height": camera.height_px,
-            "fov_deg": round(camera.fov_deg, 6),
-            "focal_length_px": camera.focal_px,
-            "intrinsic": camera.intrinsic.tolist(),
-            "near_m": NEAR_M,
-            "far_m": FAR_M,
-        },
-        "drone_pose": {**_named("xyz", position), **_named(("pitch", "yaw", "roll"), rotation)},
-        "target": {
-            "world_location": _named("xyz", target),
-            "half_extents_m": list(PERSON_HALF_EXTENTS_M),
-            "instance_id": PERSON_ID,
-            "semantic_id": KINDS["Pedestrians"],
-            "image_uv": _list_or_none(view.uv),
-            "bbox_2d": _list_or_none(view.bbox_px),
-            "depth_m": view.depth_m,
-            "in_view": view.in_view,
-            "visible": seen.is_visible,
-            "visibility": round(seen.visibility, 6),
-            "num_pixels": seen.num_person_px,
-        },
-        "perturbation": {
-            **plan.states[i],
-            "drone_position": _named("xyz", mirror_positions(plan.drone_offsets_m[i]) + 0.0),
-            "target_position": _named("xyz", mirror_positions(plan.target_offsets_m[i]) + 0.0),
-            "drone_rotation": _named(("pitch", "yaw", "roll"), mirror_rotations(plan.rotation_offsets_deg[i]) + 0.0),
-        },
-    }
-
-
-def _named(names: str | tuple[str, ...], values: np.ndarray) -> dict[str, float]:
-    return dict(zip(names, values.tolist(), strict=True))
 
 
 def _list_or_none(values: np.ndarray) -> list[float] | None:
     return None if np.isnan(values).any() else values.tolist()
 
 
-def _report(plan: FlightPlan) -> dict:
+def _report(script: FlightScript) -> dict:
     """`perturbation_report.json`: how often each event happened."""
     counts: dict[str, dict[str, int]] = {"position": {}, "rotation": {}}
-    for state in plan.states:
+    for state in script.states:
         for event, outcome in state.items():
             counts[event][outcome] = counts[event].get(outcome, 0) + 1
     return {
         "schema": REPORT_SCHEMA,
         "schema_version": REPORT_VERSION,
-        "num_frames": len(plan.states),
-        "num_perturbed": int(plan.is_perturbed.sum()),
+        "num_frames": len(script.states),
+        "num_perturbed": int(script.is_perturbed.sum()),
         **{event: dict(sorted(outcomes.items())) for event, outcomes in counts.items()},
     }
 
 
-def _flight(plan: FlightPlan, seen: list[_Seen]) -> Flight:
-    raw_points = [{"perturbation": dict(state)} for state in plan.states]
+def _flight(script: FlightScript, seen: list[_Seen]) -> Flight:
+    raw_points = [{"perturbation": dict(state)} for state in script.states]
     return Flight(
-        town=plan.town,
-        trajectory=plan.trajectory,
-        variant=plan.variant,
-        camera=plan.camera,
-        time_s=plan.time_s,
-        positions_m=plan.poses.positions_m,
-        rotations_deg=plan.poses.rotations_deg,
-        targets_m=plan.poses.targets_m,
+        town=script.town,
+        trajectory=script.trajectory,
+        variant=script.variant,
+        camera=script.camera,
+        time_s=script.time_s,
+        positions_m=script.poses.positions_m,
+        rotations_deg=script.poses.rotations_deg,
+        targets_m=script.poses.targets_m,
         target_in_view=np.array([s.view.in_view for s in seen]),
         target_visible=np.array([s.is_visible for s in seen]),
         target_depth_m=np.array([s.view.depth_m for s in seen]),
         target_uv=np.array([s.view.uv for s in seen]),
         target_bbox=np.array([s.view.bbox_px for s in seen]),
         visibility=np.array([s.visibility for s in seen]),
-        is_perturbed=plan.is_perturbed,
-        drone_offsets_m=plan.drone_offsets_m,
-        rotation_offsets_deg=plan.rotation_offsets_deg,
-        target_offsets_m=plan.target_offsets_m,
-        source=plan.source,
-        is_original=plan.is_original,
+        is_perturbed=script.is_perturbed,
+        drone_offsets_m=script.drone_offsets_m,
+        rotation_offsets_deg=script.rotation_offsets_deg,
+        target_offsets_m=script.target_offsets_m,
+        source=script.source,
+        is_original=script.is_original,
         raw={"points": raw_points},
     )

@@ -15,10 +15,10 @@ from pydantic import Field
 
 from cosfly.config import Config
 from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
-from cosfly.kernels import BoxIndex, signed_distances
+from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import Camera
 from cosfly.products.kinds import GROUND_KINDS
-from cosfly.products.playback import Camera
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
@@ -78,16 +78,17 @@ class Perturbed:
         return np.array(["applied" in state.values() for state in self.states])
 
 
-class Ground:
-    """Height of the ground at a place, from the map's surfaces."""
+class Surroundings:
+    """What a shifted person or drone may touch: the obstacles, and the ground's height from the map's surfaces. Made once for a map."""
 
     def __init__(self, box_map: BoxMap) -> None:
+        self.obstacles = obstacle_index(box_map)
         slabs = box_map.select(np.isin(box_map.kinds, sorted(GROUND_KINDS)))
         self._centers, self._half = slabs.centers, slabs.half_extents
         self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
         self._tops = slabs.maxs[:, 2]
 
-    def height_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
+    def ground_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
         """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
@@ -98,8 +99,7 @@ class Ground:
 def perturb(
     planned: Poses,
     camera: Camera,
-    obstacles: BoxIndex,
-    ground: Ground,
+    surroundings: Surroundings,
     cfg: PerturbationConfig,
     rng: np.random.Generator,
 ) -> Perturbed:
@@ -115,7 +115,7 @@ def perturb(
         drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)
         view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
         if events[0] < cfg.position_probability:
-            _shift(result, planned, i, person_offset, drone_offset, camera, obstacles, ground, cfg)
+            _shift(result, planned, i, person_offset, drone_offset, camera, surroundings, cfg)
         if events[1] < cfg.rotation_probability:
             _turn(result, i, view_offset, camera, cfg)
     return result
@@ -135,19 +135,19 @@ def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, 
 
 def _shift(
     result: Perturbed, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
-    obstacles: BoxIndex, ground: Ground, cfg: PerturbationConfig,
+    surroundings: Surroundings, cfg: PerturbationConfig,
 ) -> None:  # fmt: skip
     """Apply one frame's position event, or note why not."""
     target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
-    target[2] = ground.height_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
+    target[2] = surroundings.ground_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
     drone = planned.positions_m[i] + drone_offset
     # The camera is aimed at the shifted person as it was aimed at the unshifted one.
     aimed = planned.rotations_deg[i].copy()
     aimed[:2] += _aim_deg(drone, target) - _aim_deg(planned.positions_m[i], planned.targets_m[i])
     aimed[1] = wrap_deg(aimed[1])
-    ground_z = ground.height_m(drone[0], drone[1], feet_z)
-    distances, _ = signed_distances(obstacles, np.stack([drone, target, target + HEAD_OFFSET_M]))
+    ground_z = surroundings.ground_z_m(drone[0], drone[1], feet_z)
+    distances, _ = signed_distances(surroundings.obstacles, np.stack([drone, target, target + HEAD_OFFSET_M]))
     if distances[0] < cfg.min_clearance_m or drone[2] < ground_z + cfg.min_clearance_m:
         result.states[i]["position"] = "fallback: drone clearance"
     elif distances[1:].min() < PERSON_HALF_EXTENTS_M[0]:

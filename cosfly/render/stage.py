@@ -1,7 +1,6 @@
 """Stage 5: flights to RGB, depth and instance frames in the playback tree; the clean and the perturbed track.
 
-A renderer is anything that meets `frame.Renderer`; RENDERERS names them. `instance.png` carries the boxes' ids as
-`scene.instance_ids` says, and the person's id is always `scene.PERSON_ID`.
+A renderer is anything that meets `contract.Renderer`; RENDERERS names them.
 """
 
 from __future__ import annotations
@@ -20,20 +19,16 @@ from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
-from cosfly.kernels import obstacle_index
 from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.playback import Camera
+from cosfly.products.frames import Camera, Look
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.render.contract import Frame, Look, Renderer
-from cosfly.render.flight import FlightPlan, Writing, render_flight
-from cosfly.render.gl.scene import PERSON_ID, SHARED_ID, InstanceIds, Scene, build_scene, instance_ids
-from cosfly.render.person import choose_clothes, walk_of
-from cosfly.render.perturbation import Ground, PerturbationConfig, Perturbed, Poses, perturb
+from cosfly.render.contract import PERSON_ID, SHARED_ID, InstanceIds, Renderer, instance_ids
+from cosfly.render.flight import FlightScript, Writing, render_flight
+from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import CHECKSUMS, atomic_folder, write_json
-
-__all__ = ["RENDERERS", "Frame", "Look", "RenderConfig", "Renderer", "open_renderer", "plan_flight", "run"]
 
 log = logging.getLogger(__name__)
 
@@ -101,8 +96,8 @@ def folder_name(text: str) -> str:
     return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".") or "map"
 
 
-def open_renderer(name: str, scene: Scene, width_px: int, height_px: int, look: Look | None = None) -> Renderer:
-    """Open a renderer of the table for one scene.
+def open_renderer(name: str, box_map: BoxMap, width_px: int, height_px: int, look: Look | None = None) -> Renderer:
+    """Open a renderer of the table for one map.
 
     Raises:
         ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
@@ -110,15 +105,15 @@ def open_renderer(name: str, scene: Scene, width_px: int, height_px: int, look: 
     if name not in RENDERERS:
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)(scene, width_px, height_px, look or Look())
+    return getattr(importlib.import_module(module), attribute)(box_map, width_px, height_px, look or Look())
 
 
-# --- from traces to plans ---------------------------------------------------------------------------------------------
+# --- from traces to scripts -------------------------------------------------------------------------------------------
 
 
-def plan_flight(
-    trace: DroneTrace, number: int, track: str, town: str, simplified: BoxMap, cfg: RenderConfig, seed: int
-) -> FlightPlan:
+def script_flight(
+    trace: DroneTrace, number: int, track: str, town: str, surroundings: Surroundings, cfg: RenderConfig, seed: int
+) -> FlightScript:
     """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view and clothes."""
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
@@ -128,20 +123,20 @@ def plan_flight(
     n = len(trace.time_s)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
-        drawn = perturb(planned, camera, obstacle_index(simplified), Ground(simplified), cfg.perturbation, rng)
+        drawn = perturb(planned, camera, surroundings, cfg.perturbation, rng)
     else:
         nothing = np.zeros((n, 3))
         drawn = Perturbed(
             planned, nothing, nothing, nothing, [{"position": "none", "rotation": "none"} for _ in range(n)]
         )
-    return FlightPlan(
+    return FlightScript(
         town=town,
         trajectory=f"trajectory_{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
         camera=camera,
         time_s=trace.time_s,
         poses=drawn.poses,
-        walk=walk_of(trace.targets_m, trace.time_s),
+        gait=gait_of(trace.targets_m, trace.time_s),
         clothes=clothes,
         is_perturbed=drawn.is_perturbed,
         drone_offsets_m=drawn.drone_offsets_m,
@@ -149,6 +144,7 @@ def plan_flight(
         rotation_offsets_deg=drawn.rotation_offsets_deg,
         states=drawn.states,
         is_original=track == "clean",
+        look=cfg.look,
         source={
             "path_index": number,
             "scenario_id": trace.path_id,
@@ -201,7 +197,7 @@ def run(
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track)) for number, trace in passed for track in cfg.tracks
     ]
     arguments = (cfg, boxes, simplified, traces, out, town, seed, min(workers, len(items)))
-    finished = run_items(stage, items, make_work, arguments, workers=workers, label="render")
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, label="render")
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, _ids_record(box_map, instances), indent=None)
     results = [result for _, result in finished.results()]
@@ -239,28 +235,28 @@ def _ids_record(box_map: BoxMap, instances: InstanceIds) -> dict:
     }
 
 
-def make_work(
+def make_worker(
     cfg: RenderConfig, boxes: Path, simplified: Path, traces: Path, out: Path, town: str, seed: int, num_processes: int
 ) -> Work:
     """Open a renderer in this process and give the function that draws one (trace, track)."""
     if num_processes > 1:
         # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
-    renderer = open_renderer(cfg.backend, build_scene(read_boxes(boxes)), cfg.width_px, cfg.height_px, cfg.look)
-    simplified_map, all_traces = read_boxes(simplified), read_traces(traces)
+    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look)
+    surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
     writing = Writing(tuple(cfg.modalities), cfg.png_compression, cfg.visible_threshold)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
-        plan = plan_flight(all_traces[number], number, track, town, simplified_map, cfg, seed)
-        folder = out / town / plan.trajectory / plan.variant
+        script = script_flight(all_traces[number], number, track, town, surroundings, cfg, seed)
+        folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            flight = render_flight(renderer, plan, unfinished, writing, cfg.encoder_threads)
+            flight = render_flight(renderer, script, unfinished, writing, cfg.encoder_threads)
         return Outcome(
             {
                 "folder": str(folder.relative_to(out)),
                 "num_frames": len(flight),
-                "fov_deg": round(plan.camera.fov_deg, 6),
+                "fov_deg": round(script.camera.fov_deg, 6),
                 "num_visible": int(flight.target_visible.sum()),
                 "mean_visibility": round(float(flight.visibility.mean()), 6),
                 "num_perturbed": int(flight.is_perturbed.sum()),

@@ -12,15 +12,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing, RenderError
-from cosfly.products.frames import SKY_DEPTH_M
+from cosfly.errors import EnvironmentMissing
+from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, Look
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
-from cosfly.render.gl.body import Body
+from cosfly.render.gl.figure import Body, make_body
 from cosfly.render.gl.parts import PART
-from cosfly.render.gl.scene import Scene
+from cosfly.render.gl.scene import Scene, build_scene
 
 log = logging.getLogger(__name__)
 
@@ -57,45 +58,25 @@ def open_context() -> Any:
         ) from None
 
 
-def gl_report() -> str:
-    """Say what OpenGL there is, one line: backend, vendor, renderer, version.
-
-    Raises:
-        EnvironmentMissing: there is none; names the reason and the packages.
-    """
-    context = open_context()
-    info = context.info
-    context.release()
-    return ", ".join(["EGL", *(str(info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))])
-
-
-def is_missing() -> str | None:
-    """Give the reason that there is no OpenGL here, or None."""
-    try:
-        gl_report()
-    except EnvironmentMissing as error:
-        return str(error)
-    return None
-
-
 def _source(*names: str) -> str:
     folder = Path(__file__).parent
     return "#version 330 core\n" + "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
 
 class GlRenderer:
-    """Draws a scene on EGL. One object holds one GL context and belongs to the thread that made it."""
+    """Draws a map on EGL. One object holds one GL context and belongs to the thread that made it."""
 
-    name = "gl"
-
-    def __init__(self, scene: Scene, width_px: int, height_px: int, look: Look) -> None:
-        self.scene, self.width_px, self.height_px, self.look = scene, width_px, height_px, look
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
         self.context = open_context()
+        self.device = ", ".join(
+            ["EGL", *(str(self.context.info[f"GL_{n}"]) for n in ("VENDOR", "RENDERER", "VERSION"))]
+        )
+        self.scene, self.width_px, self.height_px, self.look = build_scene(box_map), width_px, height_px, look
         with self.context:
             self._make_programs()
             self._make_targets()
             self._make_meshes()
-        self.prepare(*_bounds(scene))
+        self.prepare(*_bounds(self.scene))
 
     # --- set-up ---
 
@@ -219,20 +200,14 @@ class GlRenderer:
 
     # --- one frame ---
 
-    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: Body | None) -> Frame:
-        """Draw one frame.
-
-        Args:
-            camera_pose: (4, 4) world_from_camera, OpenCV axes; intrinsic: (3, 3) px; person: who walks there, or None.
-        Raises:
-            RenderError: the pose is not finite.
-        """
-        if not (np.isfinite(camera_pose).all() and np.isfinite(intrinsic).all()):
-            raise RenderError("the camera pose is not finite", got=str(camera_pose.tolist()))
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+        """Draw one frame, as the contract says."""
+        check_pose(camera_pose, intrinsic)
+        body = None if person is None else make_body(person)
         eye = camera_pose[:3, 3] - self.scene.origin_m
         with self.context:
             self._set_camera(camera_pose[:3, :3], eye, intrinsic)
-            self._set_person(person)
+            self._set_person(body)
             rows = self._seen(camera_pose[:3, :3], eye, intrinsic)
             self._image.use()
             self._image.clear(depth=1.0)
@@ -241,7 +216,7 @@ class GlRenderer:
             self.context.depth_func = "<="
             self._shadow.use(0)
             self._height.use(1)
-            self._draw_scene(rows, person)
+            self._draw_scene(rows, body)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
@@ -271,15 +246,15 @@ class GlRenderer:
             for name, value in common.items():
                 _set(program, name, value)
 
-    def _set_person(self, person: Body | None) -> None:
+    def _set_person(self, body: Body | None) -> None:
         """Hand the body's shadow to the shader."""
         bones = np.zeros((MAX_BONES, 2, 4), np.float32)
         count, center = 0, np.zeros(3)
-        if person is not None:
-            count, center = len(person.bones_m), person.center_m - self.scene.origin_m
+        if body is not None:
+            count, center = len(body.bones_m), body.center_m - self.scene.origin_m
             assert count <= MAX_BONES
-            bones[:count, :, :3] = person.bones_m - self.scene.origin_m
-            bones[:count, 0, 3] = person.bone_radii_m
+            bones[:count, :, :3] = body.bones_m - self.scene.origin_m
+            bones[:count, 0, 3] = body.bone_radii_m
         for program in self._materials:
             if "person_bones" in program:
                 program["person_bones"].write(bones.tobytes())
@@ -302,14 +277,14 @@ class GlRenderer:
         rows = np.flatnonzero(inside)
         return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
 
-    def _draw_scene(self, rows: np.ndarray, person: Body | None) -> None:
+    def _draw_scene(self, rows: np.ndarray, body: Body | None) -> None:
         """Draw standing things before the ground, near before far: what is hidden costs nothing."""
         records, groups = self.scene.parts.records[rows], self._groups[rows]
-        if person is not None:
-            body = person.records.copy()
-            body["center"] = person.centers_m - self.scene.origin_m
-            records = np.concatenate([body, records])
-            groups = np.concatenate([_groups(body, person.mesh), groups])
+        if body is not None:
+            placed = body.records.copy()
+            placed["center"] = body.centers_m - self.scene.origin_m
+            records = np.concatenate([placed, records])
+            groups = np.concatenate([_groups(placed, body.mesh), groups])
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 self._draw(material, mesh, records[groups == material * MESH_STRIDE + mesh])
@@ -338,14 +313,6 @@ class GlRenderer:
             (tag & 0xFF).astype(np.uint8),
             (tag >> 16).astype(np.uint16),
         )
-
-    def describe(self) -> dict[str, str]:
-        """Name the device for the record."""
-        return {
-            "renderer": self.name,
-            "device": self.context.info["GL_RENDERER"],
-            "version": self.context.info["GL_VERSION"],
-        }
 
     def close(self) -> None:
         self.context.release()

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cosfly.render.contract import LAYER_STEP, STANDING_LAYER
+
 # Materials, the same numbers as in scene.frag.glsl.
 (
     PLAIN, FACADE, ROAD, SIDEWALK, GRASS, LEAVES, BARK, CAR_PAINT, CABIN, RUBBER, METAL, BRICK, WATER, FENCE, ROAD_LINE,
@@ -23,11 +25,6 @@ PART = np.dtype(
 )
 
 FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is drawn in its simple form
-
-# Coplanar surfaces: the higher layer wins. A layer moves the depth *test* by 1e-4 of the distance, never the depth written.
-LAYER_STEP = 1e-4
-LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
-STANDING_LAYER = 7
 
 
 @dataclass(frozen=True)

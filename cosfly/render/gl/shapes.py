@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cosfly.products.kinds import KINDS
+from cosfly.render.contract import LAWN_HALF_M, LAYERS
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import (  # fmt: skip
     BARK,
@@ -26,7 +27,6 @@ from cosfly.render.gl.parts import (  # fmt: skip
     GRASS,
     GRAVEL,
     LAMP,
-    LAYERS,
     LEAVES,
     METAL,
     PLAIN,
@@ -128,13 +128,13 @@ def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
     """Trees, bushes, hedges and lawns, told apart by the shape of the box."""
     hx, hy, hz = boxes.half.T
     wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
-    is_flat = hz < 0.2
-    is_hedge = ~is_flat & (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
-    is_bush = ~is_flat & ~is_hedge & (hz < 1.3)
-    is_trunk = ~(is_flat | is_bush) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
-    is_tree = ~(is_flat | is_hedge | is_bush | is_trunk)
+    is_lawn = hz < LAWN_HALF_M
+    is_hedge = ~is_lawn & (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
+    is_bush = ~is_lawn & ~is_hedge & (hz < 1.3)
+    is_trunk = ~(is_lawn | is_bush) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
+    is_tree = ~(is_lawn | is_hedge | is_bush | is_trunk)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
-    builder.add(boxes.select(is_flat), meshes.BOX, boxes.half[is_flat], GRASS, leaf[is_flat], layer=LAYERS["RoadLines"])
+    builder.add(boxes.select(is_lawn), meshes.BOX, boxes.half[is_lawn], GRASS, leaf[is_lawn], layer=LAYERS["RoadLines"])
     builder.add(boxes.select(is_hedge), meshes.BOX, boxes.half[is_hedge], LEAVES, leaf[is_hedge])
     _bushes(builder, boxes.select(is_bush), leaf[is_bush])
     trunks = boxes.select(is_trunk)
