@@ -1,7 +1,7 @@
 """The ground as cells: which ones a person can stand on, and which of those hang together.
 
 Boxes become occupied cells (Step 3 of the paper), occupied cells grow by a safety radius, a region of interest cuts out
-what is left, and connected parts of it are labelled. Nothing here samples or searches; see pedestrians.py and astar.py.
+what is left, and connected parts of it are labelled. Nothing here samples or searches; see the rooms `pedestrians` and `simplify`.
 Arrays are indexed [y_index, x_index]; cell (x_index, y_index) covers one square of `resolution_m`.
 """
 

@@ -18,8 +18,8 @@ from cosfly.grid import OccupancyGrid
 from cosfly.journal import Journal
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.stage import (
-    Ground,
     PedestriansConfig,
+    WalkableGround,
     make_walk,
     report,
     run,
@@ -61,11 +61,11 @@ def lawn(size_m: float):
     return box_map
 
 
-def ground_of(text: str) -> Ground:
+def ground_of(text: str) -> WalkableGround:
     """Make a ground from rows of part numbers, row 0 first."""
     parts = np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32)
     grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
-    return Ground(grid, grid, parts)
+    return WalkableGround(grid, grid, parts)
 
 
 @pytest.fixture
@@ -151,7 +151,7 @@ def test_the_region_of_interest_bounds_every_walk():
     ground = walkable_ground(town(), PedestriansConfig(), roi)
     assert ground.counts["cells_in_roi"] == 280 * 280 - 80 * 80
     walk = make_walk("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
-    for xy in walk.path.polyline_m:
+    for xy in walk.walk.polyline_m:
         assert (xy > 10).all()
         assert (xy < 150).all()
         assert not ((xy > 60) & (xy < 100)).all()
@@ -217,7 +217,7 @@ def test_no_ground_says_what_to_change(box_map, settings, roi, words):
 def test_a_walk_keeps_every_promise(number):
     cfg = PedestriansConfig()
     ground = walkable_ground(town(), cfg)
-    path = make_walk(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).path
+    path = make_walk(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).walk
     assert 50 <= np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]) <= 100
     np.testing.assert_allclose(path.time_s, np.arange(len(path.time_s)) * DT_S)
     np.testing.assert_allclose(path.positions_m[[0, -1], :2], path.polyline_m[[0, -1]], atol=1e-9)
@@ -235,7 +235,7 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     cfg = PedestriansConfig()
     ground = walkable_ground(town(), cfg)
     texts = [
-        dump_json(make_walk("p", ground, cfg, rng_for(seed, "pedestrians", name)).path.as_json())
+        dump_json(make_walk("p", ground, cfg, rng_for(seed, "pedestrians", name)).walk.as_json())
         for seed, name in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
     ]
     assert texts[0] == texts[1]
@@ -247,7 +247,7 @@ def test_a_start_without_a_goal_is_given_up_and_counted():
     ground = ground_of("\n".join(["1" * 20 + "0" + "2" * 84] * 30))
     cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=40, max_distance_m=50)
     walks = [make_walk("p", ground, cfg, np.random.default_rng(k)) for k in range(100)]
-    assert min(w.path.polyline_m[:, 0].min() for w in walks) > 21
+    assert min(w.walk.polyline_m[:, 0].min() for w in walks) > 21
     assert 0.08 < np.mean([w.retries["no_goal"] > 0 for w in walks]) < 0.32  # 20 of 104 columns
 
 
@@ -261,7 +261,7 @@ def test_a_detour_is_given_up_and_counted():
     ]
 
     def worst(walks):
-        lines = [w.path.polyline_m for w in walks]
+        lines = [w.walk.polyline_m for w in walks]
         return max(
             np.linalg.norm(np.diff(p, axis=0), axis=1).sum() / np.linalg.norm(p[-1] - p[0]) for p in lines
         )  # fmt: skip
@@ -412,9 +412,9 @@ def test_the_report_sums_up_its_lines():
     ground = walkable_ground(town(), cfg)
     walks = [make_walk(f"p{k}", ground, cfg, np.random.default_rng(k)) for k in range(3)]
     retries = [{"no_goal": 0, "detour": 2}, {"no_goal": 1, "detour": 0}, {"no_goal": 0, "detour": 1}]
-    total = report(ground, [w.path for w in walks], retries, {})["total"]
+    total = report(ground, [w.walk for w in walks], retries, {})["total"]
     assert total["retries"] == {"no_goal": 1, "detour": 3}
-    assert total["cells"] == sum(len(w.path.polyline_m) for w in walks)
+    assert total["cells"] == sum(len(w.walk.polyline_m) for w in walks)
     assert total["mean_speed_mps"] == pytest.approx(total["length_m"] / total["duration_s"], abs=1e-4)
 
 

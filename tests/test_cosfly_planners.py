@@ -23,7 +23,7 @@ from cosfly.planners.stage import MucoConfig, PlanConfig
 from cosfly.products.boxes import make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.traces import read_traces
-from cosfly.products.walks import PedestrianPath, write_paths
+from cosfly.products.walks import Walk, write_paths
 
 CFG = PlanConfig()
 
@@ -38,7 +38,7 @@ def walk_along(path_id, corners, speed_mps=1.2):
     time_s = np.arange(0, along[-1] / speed_mps, DT_S)
     xy = np.stack([np.interp(time_s * speed_mps, along, corners[:, k]) for k in (0, 1)], axis=1)
     positions = np.column_stack([xy, np.zeros(len(xy))])
-    return PedestrianPath(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
+    return Walk(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
 
 
 def town_of(*rows):

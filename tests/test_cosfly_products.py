@@ -12,7 +12,7 @@ from cosfly.errors import InputError
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
 from cosfly.products.roi import read_roi
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
-from cosfly.products.walks import PedestrianPath, read_paths, write_paths
+from cosfly.products.walks import Walk, read_paths, write_paths
 
 
 def some_boxes(n=3, seed=0):
@@ -115,7 +115,7 @@ def test_bad_rois(tmp_path, value, words):
 
 def a_path(n=4):
     t = np.arange(n) * 0.5
-    return PedestrianPath("path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n))
+    return Walk("path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n))
 
 
 def a_trace(n=4):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cosfly.grid import OccupancyGrid
-from cosfly.products.walks import PedestrianPath
+from cosfly.products.walks import Walk
 
 LONGER_SIDE_PX = 1600
 STRIP_PX = 64  # legend below the map
@@ -24,7 +24,7 @@ def draw_overview(
     inflated: OccupancyGrid,
     parts: np.ndarray,
     is_in_roi: np.ndarray | None,
-    paths: list[PedestrianPath],
+    paths: list[Walk],
 ) -> bytes:
     """Draw the ground and the walks; a ring is a start, a dot a goal, and north is up.
 

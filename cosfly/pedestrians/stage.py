@@ -9,7 +9,7 @@ means of 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the
 Two guards of ours are on by default, and a setting turns each off: `ground` keeps walks on what the map knows as ground (a city
 model is empty, not free, outside its data), `max_detour` gives up ends that are near each other only across a canal.
 
-This module simplifies no map and knows nothing of drones. How people walk is in walking.py, the picture in pedestrians_overview.py.
+This module simplifies no map and knows nothing of drones. How people walk is in walking.py, the picture in overview.py.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from cosfly.config import Config
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.overview import draw_overview
-from cosfly.pedestrians.walkable import GROUND_Z_M, Clock, Ground, find_ground, sample_goal, sample_start
+from cosfly.pedestrians.walkable import GROUND_Z_M, Clock, WalkableGround, find_ground, sample_goal, sample_start
 from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.roi import Roi, read_roi
-from cosfly.products.walks import PedestrianPath, write_paths
+from cosfly.products.walks import Walk, write_paths
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import write_bytes, write_json
@@ -86,7 +86,7 @@ def walkable_ground(
     where: str | Path = "map",
     roi_where: str | Path = "region of interest",
     clock: Clock | None = None,
-) -> Ground:
+) -> WalkableGround:
     """Find the ground that the settings allow walks on; see walkable.find_ground."""
     return find_ground(
         box_map,
@@ -103,15 +103,15 @@ def walkable_ground(
 
 
 @dataclass(frozen=True)
-class Walk:
-    """A path and what it took: pairs of ends given up by reason, and the seconds of the steps."""
+class MadeWalk:
+    """A walk and what it took: pairs of ends given up by reason, and the seconds of the steps."""
 
-    path: PedestrianPath
+    walk: Walk
     retries: dict[str, int]
     seconds: dict[str, float]
 
 
-def make_walk(path_id: str, ground: Ground, cfg: PedestriansConfig, rng: np.random.Generator) -> Walk:
+def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> MadeWalk:
     """Make one walk: draw its ends, find the route, give it speeds, sample it.
 
     Raises:
@@ -131,11 +131,11 @@ def make_walk(path_id: str, ground: Ground, cfg: PedestriansConfig, rng: np.rand
         )
         time_s, positions_m, sampled_mps = resample(polyline_m, speeds_mps, arrival_times(polyline_m, speeds_mps))
         on_ground = np.column_stack([positions_m, np.full(len(time_s), GROUND_Z_M)])
-    return Walk(PedestrianPath(path_id, polyline_m, time_s, on_ground, sampled_mps), retries, clock.seconds)
+    return MadeWalk(Walk(path_id, polyline_m, time_s, on_ground, sampled_mps), retries, clock.seconds)
 
 
 def _draw_route(
-    path_id: str, ground: Ground, cfg: PedestriansConfig, rng: np.random.Generator, clock: Clock
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, clock: Clock
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Draw ends until a pair serves; gives its route, (k, 2) m, and the pairs given up by reason."""
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
@@ -163,12 +163,12 @@ def _draw_route(
     )
 
 
-def _walker(cfg: PedestriansConfig, seed: int, ground: Ground) -> Work:
+def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Work:
     """Worker factory: gives the function that makes one walk."""
 
     def work(item: Item) -> Outcome:
-        walk = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id))
-        return Outcome({"path": walk.path.as_json(), "retries": walk.retries, "seconds": walk.seconds})
+        made = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id))
+        return Outcome({"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds})
 
     return work
 
@@ -176,7 +176,7 @@ def _walker(cfg: PedestriansConfig, seed: int, ground: Ground) -> Work:
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def report(ground: Ground, paths: list[PedestrianPath], retries: list[dict[str, int]], failed: dict[str, int]) -> dict:
+def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, int]], failed: dict[str, int]) -> dict:
     """Sum up the stage for `pedestrians_report.json`: equal inputs give equal bytes, so times are in the manifest."""
     lines: list[dict[str, Any]] = []
     for path, given_up in zip(paths, retries, strict=True):
@@ -247,7 +247,7 @@ def run(
     items = [Item(f"path_{k:05d}") for k in range(cfg.num_paths)]
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    finished = run_items(stage, items, _walker, (cfg, seed, lean), workers=workers, label="walks")
+    finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, label="walks")
     results = [result for _, result in finished.results()]
     if not results:
         raise NoPathError(
@@ -256,7 +256,7 @@ def run(
             got=f"{finished.tally}; first: {finished.records[0]['message']}",
             fix="change what the first failure names and run again",
         )
-    paths = [PedestrianPath.from_json(result["path"], f"{out}: items.jsonl") for result in results]
+    paths = [Walk.from_json(result["path"], f"{out}: items.jsonl") for result in results]
     for result in results:
         for step, seconds in result["seconds"].items():
             clock.add(step, seconds)

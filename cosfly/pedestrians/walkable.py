@@ -40,7 +40,7 @@ PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground")
 
 
 @dataclass(frozen=True)
-class Ground:
+class WalkableGround:
     """Where people may walk.
 
     grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one cell
@@ -92,7 +92,7 @@ def find_ground(
     where: str | Path = "map",
     roi_where: str | Path = "region of interest",
     clock: Clock | None = None,
-) -> Ground:
+) -> WalkableGround:
     """Find the ground that walks may use.
 
     Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never cuts a
@@ -136,7 +136,7 @@ def find_ground(
     with clock("connectivity"):
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, min_component_cells, counts, place)
-    return Ground(grid, inflated, parts, is_in_roi, counts)
+    return WalkableGround(grid, inflated, parts, is_in_roi, counts)
 
 
 def _count(mask: np.ndarray) -> int:
@@ -207,7 +207,7 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
 # --- ends of a walk ---------------------------------------------------------------------------------------------------
 
 
-def sample_start(ground: Ground, rng: np.random.Generator) -> tuple[int, int]:
+def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int, int]:
     """Draw one walkable cell (x index, y index), every one equally likely."""
     drawn = int(rng.integers(ground.row_ends[-1]))
     y = int(np.searchsorted(ground.row_ends, drawn, side="right"))

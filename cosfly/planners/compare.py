@@ -17,7 +17,7 @@ from cosfly.errors import NoPathError
 from cosfly.planners.stage import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.products.walks import PedestrianPath, read_paths
+from cosfly.products.walks import Walk, read_paths
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import read_json, write_bytes, write_json
@@ -214,7 +214,7 @@ def run(
         outputs.append(out / f"drone_trace_{name}.json")
         write_traces(outputs[-1], traces, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
-    flown: list[PedestrianPath] = [by_id[record["id"]] for record in shared]
+    flown: list[Walk] = [by_id[record["id"]] for record in shared]
     pictures = {
         "compare_overlay.png": draw_overlay(box_map, flown, flights),
         "compare_series.png": draw_series(flown, flights),

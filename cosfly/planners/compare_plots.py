@@ -7,7 +7,7 @@ import numpy as np
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import PedestrianPath
+from cosfly.products.walks import Walk
 from cosfly.topview import add_caption, draw_overview, png_bytes
 
 TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}
@@ -45,7 +45,7 @@ def _legend(picture: np.ndarray, x: float, y: float) -> None:
 # --- from above -------------------------------------------------------------------------------------------------------
 
 
-def draw_overlay(box_map: BoxMap, walks: list[PedestrianPath], flights: dict[str, list[DroneTrace]]) -> bytes:
+def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
     """Draw walks (dark) and the flights of each planner over the map; PNG bytes."""
     tracks = [walk.positions_m[:, :2] for walk in walks]
     tracks += [trace.positions_m[:, :2] for traces in flights.values() for trace in traces]
@@ -76,7 +76,7 @@ def draw_overlay(box_map: BoxMap, walks: list[PedestrianPath], flights: dict[str
 # --- over time --------------------------------------------------------------------------------------------------------
 
 
-def draw_series(walks: list[PedestrianPath], flights: dict[str, list[DroneTrace]]) -> bytes:
+def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
     """Draw altitude above the walk and visibility over time: every flight thin, the mean of those still flying thick."""
     ground = [float(np.median(walk.positions_m[:, 2])) for walk in walks]
     altitudes = {p: [t.positions_m[:, 2] - g for t, g in zip(ts, ground, strict=True)] for p, ts in flights.items()}

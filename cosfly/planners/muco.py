@@ -21,7 +21,7 @@ from cosfly.planners.step import STOP_REASONS, Rules, descend, is_feasible, proj
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the planner signature of cosfly/planners/__init__.py); nothing here is random.
+    """Plan one flight (the signature of `planners.contract`); nothing here is random.
 
     Raises:
         NoPathError: no free trajectory round this walk was found.

@@ -7,7 +7,7 @@ import numpy as np
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import PedestrianPath
+from cosfly.products.walks import Walk
 from cosfly.topview import add_caption, draw_overview, png_bytes
 
 MARGIN_M = 25.0
@@ -20,7 +20,7 @@ SEEN_COLOR, HIDDEN_COLOR = (
 FRAMES_BETWEEN_SIGHTS = 20  # a line of sight every 10 s
 
 
-def draw_flights(box_map: BoxMap, walks: list[PedestrianPath], traces: list[DroneTrace]) -> bytes:
+def draw_flights(box_map: BoxMap, walks: list[Walk], traces: list[DroneTrace]) -> bytes:
     """Draw obstacles, walks (dark) and flights (blue where the target is seen, red where hidden).
 
     Returns:

@@ -27,7 +27,7 @@ from cosfly.flight_metrics import flight_metrics
 from cosfly.geometry import DT_S, look_at
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.products.walks import TARGET_HEIGHT_M, PedestrianPath, read_paths
+from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import write_bytes
@@ -181,7 +181,7 @@ def load_planner(name: str) -> Planner:
     return getattr(importlib.import_module(module), function)
 
 
-def make_scenario(walk: PedestrianPath, obstacles: BoxIndex) -> Scenario:
+def make_scenario(walk: Walk, obstacles: BoxIndex) -> Scenario:
     """Check a walk and give the scenario of it.
 
     Raises:
@@ -216,7 +216,7 @@ def make_scenario(walk: PedestrianPath, obstacles: BoxIndex) -> Scenario:
     return Scenario(walk.path_id, targets, float(np.median(walk.positions_m[:, 2])))
 
 
-def plan_flight(walk: PedestrianPath, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
+def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
     """Plan, measure and check one flight.
 
     Raises:
@@ -295,7 +295,7 @@ def _warm_up(cfg: PlanConfig) -> None:
         np.array([[1.0, 3.0, 15.0]]),
     )  # hides the walk from behind: search runs too
     obstacles = index_boxes(*in_the_way, np.eye(3)[None])
-    plan_flight(PedestrianPath("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0)
+    plan_flight(Walk("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0)
 
 
 def run(
@@ -352,7 +352,7 @@ def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[dict]) -> di
     }
 
 
-def _check_ids(walks: list[PedestrianPath], paths: Path) -> None:
+def _check_ids(walks: list[Walk], paths: Path) -> None:
     if not walks:
         raise InputError("there are no paths", where=f"{paths}: paths", fix="run the pedestrians stage again")
     known: set[str] = set()

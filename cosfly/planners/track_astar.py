@@ -85,7 +85,7 @@ class Horizon(NamedTuple):
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the planner signature of cosfly/planners/__init__.py); nothing here is random.
+    """Plan one flight (the signature of `planners.contract`); nothing here is random.
 
     Raises:
         NoPathError: the grid is too large, or no voxels lead along this walk.

@@ -20,7 +20,7 @@ PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
 
 
 @dataclass(frozen=True)
-class PedestrianPath:
+class Walk:
     """One walk, the product of stage 3.
 
     polyline_m: (k, 2) the A* route. time_s: (n,), step DT_S, from 0. positions_m: (n, 3), feet on the ground. speeds_mps: (n,).
@@ -45,7 +45,7 @@ class PedestrianPath:
         }
 
     @classmethod
-    def from_json(cls, record: dict, where: str) -> PedestrianPath:
+    def from_json(cls, record: dict, where: str) -> Walk:
         columns = {name: column(record, name, where) for name in ("t", "x", "y", "z", "speed")}
         lengths = {name: len(column) for name, column in columns.items()}
         if len(set(lengths.values())) != 1:
@@ -55,17 +55,17 @@ class PedestrianPath:
         return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"])
 
 
-def write_paths(path: Path, paths: list[PedestrianPath], header: dict) -> None:
+def write_paths(path: Path, paths: list[Walk], header: dict) -> None:
     """Write `path.json`; `header` holds the map's name, seed and whatever the stage wants on record."""
     value = {"schema": PATHS_SCHEMA, "schema_version": PATHS_VERSION, **header, "dt_s": DT_S}
     write_json(path, {**value, "paths": [p.as_json() for p in paths]}, indent=None)
 
 
-def read_paths(path: Path) -> list[PedestrianPath]:
+def read_paths(path: Path) -> list[Walk]:
     """Read `path.json`.
 
     Raises:
         InputError: names the file, the path and the field.
     """
     value = check_schema(read_json(path, what="pedestrian paths"), PATHS_SCHEMA, PATHS_VERSION, path)
-    return [PedestrianPath.from_json(r, f"{path}: paths[{i}]") for i, r in enumerate(records(value, "paths", path))]
+    return [Walk.from_json(r, f"{path}: paths[{i}]") for i, r in enumerate(records(value, "paths", path))]

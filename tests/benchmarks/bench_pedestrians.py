@@ -55,7 +55,7 @@ def compare_with_dijkstra(ground, walks) -> list:
     graph = peer_graph(walkable)
     ours, theirs, worst = [], [], 0.0
     for walk in walks[:5]:
-        ends = ground.grid.cells_at(walk.path.polyline_m[[0, -1]])
+        ends = ground.grid.cells_at(walk.walk.polyline_m[[0, -1]])
         ms, cells = scenes.cpu_ms(lambda ends=ends: find_route(walkable, ends[0], ends[1]))
         ours.append(ms)
         source, goal = (int(y * walkable.shape[1] + x) for x, y in ends)

@@ -16,7 +16,7 @@ from cosfly.config import build
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.products.boxes import BoxMap
-from cosfly.products.walks import PedestrianPath
+from cosfly.products.walks import Walk
 from cosfly.simplify.stage import SimplifyConfig, simplify
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -64,19 +64,19 @@ def simplified(raw: BoxMap) -> BoxMap:
     return simplify(raw, SimplifyConfig()).box_map
 
 
-def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianPath]:
+def walks_on(box_map: BoxMap, **settings: Any) -> list[Walk]:
     """20 walks of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
     cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(NUM_WALKS)]
-    return [make_walk(name, ground, cfg, rng_for(SEED, "pedestrians", name)).path for name in names]
+    return [make_walk(name, ground, cfg, rng_for(SEED, "pedestrians", name)).walk for name in names]
 
 
-def moved(walk: PedestrianPath, shift_m: np.ndarray) -> PedestrianPath:
+def moved(walk: Walk, shift_m: np.ndarray) -> Walk:
     return replace(walk, polyline_m=walk.polyline_m + shift_m[:2], positions_m=walk.positions_m + shift_m)
 
 
-def first_points(walk: PedestrianPath, count: int) -> PedestrianPath:
+def first_points(walk: Walk, count: int) -> Walk:
     return replace(
         walk, time_s=walk.time_s[:count], positions_m=walk.positions_m[:count], speeds_mps=walk.speeds_mps[:count]
     )
