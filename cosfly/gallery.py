@@ -14,6 +14,7 @@ from cosfly.frame_views import VIEW_FILES, read_view
 from cosfly.products.frames import read_rgb
 from cosfly.products.playback import Flight, find_flights, read_flight
 from cosfly.store import write_bytes
+from cosfly.topview import draw_text
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
@@ -85,7 +86,7 @@ def _row(flight: Flight) -> np.ndarray:
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
     text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {flight.camera.fov_deg:.0f} deg   {visible}"
-    cv2.putText(strip, text, (8, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (235, 235, 235), 1, cv2.LINE_AA)
+    draw_text(strip, text, 8, 15, 0.45, (235, 235, 235))
     return np.vstack([strip, np.hstack(tiles)])
 
 
@@ -93,7 +94,7 @@ def _heading(num_flights: int, width_px: int) -> np.ndarray:
     strip = np.full((26, width_px, 3), 60, np.uint8)
     shown = "" if num_flights <= MOST_ROWS else f", the first {MOST_ROWS} shown"
     text = f"{num_flights} flights{shown}"
-    cv2.putText(strip, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    draw_text(strip, text, 8, 18, 0.5, (255, 255, 255))
     return strip
 
 
@@ -103,8 +104,7 @@ def _tile(picture: np.ndarray) -> np.ndarray:
 
 def _labelled(tile: np.ndarray, text: str) -> np.ndarray:
     tile = tile.copy()
-    for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(tile, text, (6, TILE_PX[1] - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
+    draw_text(tile, text, 6, TILE_PX[1] - 8, 0.42, (255, 255, 255), halo=(0, 0, 0))
     return tile
 
 

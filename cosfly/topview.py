@@ -1,13 +1,20 @@
-"""Top-down pictures of box maps, for people who check a map before they pay for the stages after it."""
+"""Drawing for people: a map from above, and the lines, dots and words of every overview and plot.
+
+Places on a picture are floats, px from its top left corner, kept to a sixteenth.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
 
 from cosfly.geometry import box_corners
 from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS
+from cosfly.products.kinds import KIND_NAMES
 
 # Softer than CARLA's palette, which is made for masks and not for eyes; RGB. Other kinds: OTHER_COLOR.
 COLORS: dict[str, tuple[int, int, int]] = {
@@ -18,47 +25,95 @@ COLORS: dict[str, tuple[int, int, int]] = {
     "Static": (150, 60, 150),
 }  # fmt: skip
 OTHER_COLOR = (230, 90, 140)
-BACKGROUND = (250, 248, 242)
-TEXT_COLOR = (30, 30, 30)
+PAPER, INK, HALO = (250, 248, 242), (30, 30, 30), (255, 255, 255)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+FRACTION_BITS = 4  # of a place, as OpenCV takes it
+Color = Sequence[float]  # RGB, 0..255
 
 
-def draw_overview(box_map: BoxMap, *, size_px: int = 1200, low_xy=None, high_xy=None) -> np.ndarray:
-    """Draw a map from above, low boxes first, the higher the lighter.
+@dataclass(frozen=True)
+class TopView:
+    """A window of the world on a picture, north up. west_m, north_m: the place of pixel (0, 0). size_px: width, height."""
 
-    Args:
-        size_px: the longer side. low_xy, high_xy: (2,) m, the window; the map's bounds by default.
-    Returns:
-        (height, width, 3) uint8, RGB, north up.
-    """
-    if len(box_map) == 0:
-        raise ValueError("there is nothing to draw")
-    bounds = box_map.bounds()
-    low = np.asarray(bounds[0][:2] if low_xy is None else low_xy, dtype=np.float64) - 2.0
-    high = np.asarray(bounds[1][:2] if high_xy is None else high_xy, dtype=np.float64) + 2.0
-    scale = size_px / (high - low).max()
-    width, height = np.maximum(1, np.ceil((high - low) * scale)).astype(int)
-    picture = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
+    west_m: float
+    north_m: float
+    pixels_per_m: float
+    size_px: tuple[int, int]
+
+    @classmethod
+    def around(cls, points_m: np.ndarray, longer_side_px: int, margin_m: float = 2.0) -> Self:
+        """Show all points, (n, 2 or 3) m, with a margin."""
+        low, high = points_m[:, :2].min(axis=0) - margin_m, points_m[:, :2].max(axis=0) + margin_m
+        scale = longer_side_px / (high - low).max()
+        width, height = np.maximum(1, np.ceil((high - low) * scale)).astype(int).tolist()
+        return cls(float(low[0]), float(high[1]), float(scale), (width, height))
+
+    def pixels(self, points_m: np.ndarray) -> np.ndarray:
+        """Give the places of (n, 2 or 3) m on the picture, (n, 2)."""
+        offsets_m = np.stack([points_m[:, 0] - self.west_m, self.north_m - points_m[:, 1]], axis=1)
+        return _fixed(offsets_m * self.pixels_per_m) / 2**FRACTION_BITS
+
+
+def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
+    """Draw a map from above, low boxes first, the higher the lighter; (height, width, 3) uint8 RGB."""
+    picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     tops = box_map.centers[:, 2] + box_map.half_extents[:, 2]
-    names = {number: name for name, number in KINDS.items()}
     for row in np.argsort(tops, kind="stable"):
         corners = box_corners(
             box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1])
         )
-        footprint = corners[[0, 2, 6, 4], :2]  # box_corners varies z fastest, then y, then x
-        pixels = np.stack([(footprint[:, 0] - low[0]), (high[1] - footprint[:, 1])], axis=1) * scale
-        color = np.array(COLORS.get(names[int(box_map.kinds[row])], OTHER_COLOR), dtype=np.float64)
+        footprint = view.pixels(corners[[0, 2, 6, 4]])  # box_corners varies z fastest, then y, then x
+        color = np.array(COLORS.get(KIND_NAMES[int(box_map.kinds[row])], OTHER_COLOR), dtype=np.float64)
         color += (255 - color) * np.clip(tops[row] / 80.0, 0.0, 0.5)
-        points = np.round(pixels * 16).astype(np.int32)  # four fractional bits
-        cv2.fillPoly(picture, [points], color.tolist(), cv2.LINE_AA, shift=4)
+        draw_area(picture, footprint, color.tolist())
         if tops[row] > 0.5:
-            cv2.polylines(picture, [points], True, (color * 0.6).tolist(), 1, cv2.LINE_AA, shift=4)
+            draw_line(picture, footprint, (color * 0.6).tolist(), closed=True)
     return picture
+
+
+def draw_area(picture: np.ndarray, places: np.ndarray, color: Color) -> None:
+    cv2.fillPoly(picture, [_fixed(places)], color, cv2.LINE_AA, shift=FRACTION_BITS)
+
+
+def draw_line(
+    picture: np.ndarray, places: np.ndarray, color: Color, width: int = 1, *, closed: bool = False, halo: int = 0
+) -> None:
+    """Draw a line through (n, 2) places; halo: width of the white line under it, 0 for none."""
+    points = _fixed(places)
+    if halo:
+        cv2.polylines(picture, [points], closed, HALO, halo, cv2.LINE_AA, shift=FRACTION_BITS)
+    cv2.polylines(picture, [points], closed, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
+
+
+def draw_dot(picture: np.ndarray, place: np.ndarray, radius_px: int, color: Color, width: int = -1) -> None:
+    """Draw a disc round a place, or a ring of some width."""
+    center = _fixed(place).tolist()
+    cv2.circle(picture, center, radius_px << FRACTION_BITS, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
+
+
+def draw_text(
+    picture: np.ndarray,
+    text: str,
+    x: float,
+    y: float,
+    scale: float = 0.55,
+    color: Color = INK,
+    *,
+    align: float = 0.0,
+    halo: Color | None = None,
+) -> int:
+    """Write text with its baseline at y: align 0 begins at x, 0.5 is centred, 1 ends there. Gives the x where it ends."""
+    width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
+    left = round(x - align * width)
+    for ink, thickness in (((halo, 4),) if halo else ()) + ((color, 1),):
+        cv2.putText(picture, text, (left, round(y)), FONT, scale, ink, thickness, cv2.LINE_AA)
+    return left + width
 
 
 def add_caption(picture: np.ndarray, text: str) -> np.ndarray:
     """Give the picture with one line of text in a strip on top."""
-    strip = np.full((36, picture.shape[1], 3), BACKGROUND, dtype=np.uint8)
-    cv2.putText(strip, text, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.6, TEXT_COLOR, 1, cv2.LINE_AA)
+    strip = np.full((36, picture.shape[1], 3), PAPER, dtype=np.uint8)
+    draw_text(strip, text, 10, 25, 0.6)
     return np.vstack([strip, picture])
 
 
@@ -67,3 +122,8 @@ def png_bytes(picture: np.ndarray) -> bytes:
     ok, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
     assert ok, "OpenCV encodes any 8-bit picture"
     return data.tobytes()
+
+
+def _fixed(places: np.ndarray) -> np.ndarray:
+    """Places as whole sixteenths, int32."""
+    return np.round(np.asarray(places, dtype=np.float64) * 2**FRACTION_BITS).astype(np.int32)

@@ -24,7 +24,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.roi import read_roi
 from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
-from cosfly.topview import draw_overview
+from cosfly.topview import TopView, draw_map
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
@@ -562,6 +562,7 @@ def test_the_overview_is_north_up():
     boxes = BoxList()
     boxes.add_span("Terrain", (0, 0), (100, 100), -1, 0)
     boxes.add_span("Water", (60, 80), (100, 100), -1, 0.1)
-    picture = draw_overview(boxes.box_map({}), size_px=104).astype(int)
+    box_map = boxes.box_map({})
+    picture = draw_map(box_map, TopView.around(np.stack(box_map.bounds()), 104)).astype(int)
     assert picture[12, 90, 2] > picture[12, 90, 0] + 50  # blue, top right
     assert picture[90, 90, 1] > picture[90, 90, 2] + 20  # green, bottom right

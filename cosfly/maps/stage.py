@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from cosfly.config import Config
@@ -17,7 +18,7 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.products.boxes import BoxMap, write_boxes
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
-from cosfly.topview import draw_overview, png_bytes
+from cosfly.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,8 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
         return product
     box_map = load_map(cfg, seed=seed)
     write_boxes(product, box_map)
-    write_bytes(out / "map.png", png_bytes(draw_overview(box_map, size_px=cfg.picture_px)))
+    view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
+    write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
     write_json(out / "roi_polygon.json", covered_ground(box_map).model_dump())
     dropped = {str(k): int(v) for k, v in box_map.header.get("dropped_objects", {}).items()}
     num_objects = int(box_map.header.get("num_objects", len(box_map)))

@@ -2,44 +2,23 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from cosfly.planners.overview import draw_walks
 from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import Walk
-from cosfly.topview import add_caption, draw_overview, png_bytes
+from cosfly.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 
 TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}
 COLORS = {"track_astar": (30, 100, 210), "muco": (235, 120, 20)}  # RGB, the paper's blue and orange
-INK, FAINT, PAPER, WALK_COLOR = (40, 40, 45), (215, 215, 215), (252, 251, 248), (20, 20, 30)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-MARGIN_M, SIZE_PX = 20.0, 1400
-FRACTION_BITS = 4
-
-
-def _fixed(points_px: np.ndarray) -> np.ndarray:
-    """Pixels with fractional bits, as OpenCV's lines take them."""
-    return np.round(np.asarray(points_px, dtype=np.float64) * 2**FRACTION_BITS).astype(np.int32)
-
-
-def _line(picture: np.ndarray, points_px: np.ndarray, color, width: int = 1, closed: bool = False) -> None:
-    cv2.polylines(picture, [_fixed(points_px)], closed, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
-
-
-def _text(
-    picture: np.ndarray, text: str, x: float, y: float, scale: float = 0.55, color=INK, align: float = 0.0
-) -> None:
-    """Write text with its baseline at y; align 0 begins at x, 0.5 is centred, 1 ends at x."""
-    width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
-    cv2.putText(picture, text, (round(x - align * width), round(y)), FONT, scale, color, 1, cv2.LINE_AA)
+FAINT = (215, 215, 215)
 
 
 def _legend(picture: np.ndarray, x: float, y: float) -> None:
     for planner, title in TITLES.items():
-        _line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), COLORS[planner], 3)
-        _text(picture, title, x + 42, y)
-        x += 60 + cv2.getTextSize(title, FONT, 0.55, 1)[0][0]
+        draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), COLORS[planner], 3)
+        x = draw_text(picture, title, x + 42, y) + 18
 
 
 # --- from above -------------------------------------------------------------------------------------------------------
@@ -47,27 +26,12 @@ def _legend(picture: np.ndarray, x: float, y: float) -> None:
 
 def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
     """Draw walks (dark) and the flights of each planner over the map; PNG bytes."""
-    tracks = [walk.positions_m[:, :2] for walk in walks]
-    tracks += [trace.positions_m[:, :2] for traces in flights.values() for trace in traces]
-    everything = np.vstack(tracks)
-    low, high = everything.min(axis=0) - MARGIN_M, everything.max(axis=0) + MARGIN_M
-    picture = draw_overview(box_map, size_px=SIZE_PX, low_xy=low, high_xy=high)
-    picture = (0.5 * picture + 0.5 * 255).astype(np.uint8)
-    scale = SIZE_PX / (high - low + 4.0).max()  # draw_overview adds 2 m on every side
-
-    def pixels(points_m: np.ndarray) -> np.ndarray:
-        return np.stack([points_m[:, 0] - low[0] + 2.0, high[1] + 2.0 - points_m[:, 1]], axis=1) * scale
-
-    for walk in walks:
-        line = pixels(walk.positions_m)
-        _line(picture, line, (255, 255, 255), 5)
-        _line(picture, line, WALK_COLOR, 2)
+    picture, view = draw_walks(box_map, walks, [trace for traces in flights.values() for trace in traces])
     for planner, traces in flights.items():
         for trace in traces:
-            line = pixels(trace.positions_m)
-            _line(picture, line, (255, 255, 255), 5)
-            _line(picture, line, COLORS[planner], 2)
-            cv2.circle(picture, tuple(int(v) for v in line[0]), 5, COLORS[planner], -1, cv2.LINE_AA)
+            line = view.pixels(trace.positions_m)
+            draw_line(picture, line, COLORS[planner], 2, halo=5)
+            draw_dot(picture, line[0], 5, COLORS[planner])
     caption = add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark); dots are starts")
     _legend(caption, caption.shape[1] - 320, 25)
     return png_bytes(caption)
@@ -89,8 +53,8 @@ def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> byte
     high = max(10.0 * np.ceil((top + 1.0) / 10.0), 30.0)
     _panel(picture, (90, 60, 1360, 410), "altitude above the walk (m)", (bottom - 2.0, high), end_s, times, altitudes)
     _panel(picture, (90, 480, 1360, 820), "five-ray visibility", (-0.03, 1.05), end_s, times, seen)
-    _text(picture, "time (s)", 725, 866, align=0.5)
-    _text(picture, f"{len(walks)} walks: every flight thin, the mean of those still flying thick", 90, 28, 0.6)
+    draw_text(picture, "time (s)", 725, 866, align=0.5)
+    draw_text(picture, f"{len(walks)} walks: every flight thin, the mean of those still flying thick", 90, 28, 0.6)
     _legend(picture, 1080, 28)
     return png_bytes(picture)
 
@@ -105,21 +69,21 @@ def _panel(picture, frame, title, bounds, end_s, times, values) -> None:
         return np.stack([x, y], axis=1)
 
     for tick in _ticks(*bounds):
-        _line(picture, pixels([0, end_s], [tick, tick]), FAINT)
-        _text(picture, f"{tick:g}", left - 10, pixels([0], [tick])[0, 1] + 5, 0.5, align=1.0)
+        draw_line(picture, pixels([0, end_s], [tick, tick]), FAINT)
+        draw_text(picture, f"{tick:g}", left - 10, pixels([0], [tick])[0, 1] + 5, 0.5, align=1.0)
     for tick in _ticks(0.0, end_s):
-        _line(picture, np.array([pixels([tick], [bounds[0]])[0], pixels([tick], [bounds[1]])[0]]), FAINT)
-        _text(picture, f"{tick:g}", pixels([tick], [bounds[0]])[0, 0], bottom + 20, 0.5, align=0.5)
+        draw_line(picture, np.array([pixels([tick], [bounds[0]])[0], pixels([tick], [bounds[1]])[0]]), FAINT)
+        draw_text(picture, f"{tick:g}", pixels([tick], [bounds[0]])[0, 0], bottom + 20, 0.5, align=0.5)
     for planner, rows in values.items():
         pale = tuple(int(0.35 * c + 0.65 * p) for c, p in zip(COLORS[planner], PAPER, strict=True))
         for t, v in zip(times[planner], rows, strict=True):
-            _line(picture, pixels(t, v), pale)
+            draw_line(picture, pixels(t, v), pale)
     for planner, rows in values.items():
         longest = max(times[planner], key=len)
         mean = [np.mean([row[i] for row in rows if len(row) > i]) for i in range(len(longest))]
-        _line(picture, pixels(longest, mean), COLORS[planner], 3)
-    _line(picture, np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), INK, closed=True)
-    _text(picture, title, left, top - 10)
+        draw_line(picture, pixels(longest, mean), COLORS[planner], 3)
+    draw_line(picture, np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), INK, closed=True)
+    draw_text(picture, title, left, top - 10)
 
 
 def _ticks(low: float, high: float) -> np.ndarray:
@@ -142,21 +106,21 @@ def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
     angles = np.arange(len(names)) * 2.0 * np.pi / len(names) - np.pi / 2.0
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for share in (0.25, 0.5, 0.75, 1.0):
-        _line(picture, middle + radius_px * share * spokes, FAINT, closed=True)
-        _text(picture, f"{share:g}", middle[0] + 6, middle[1] - radius_px * share + 14, 0.42, (130, 130, 130))
+        draw_line(picture, middle + radius_px * share * spokes, FAINT, closed=True)
+        draw_text(picture, f"{share:g}", middle[0] + 6, middle[1] - radius_px * share + 14, 0.42, (130, 130, 130))
     for spoke, name in zip(spokes, names, strict=True):
-        _line(picture, np.array([middle, middle + radius_px * spoke]), FAINT)
+        draw_line(picture, np.array([middle, middle + radius_px * spoke]), FAINT)
         x, y = middle + (radius_px + 22) * spoke
         align = 0.5 if abs(spoke[0]) < 0.1 else float(spoke[0] < 0)
-        _text(picture, name.replace("_", " "), x, y + 5, 0.6, align=align)
+        draw_text(picture, name.replace("_", " "), x, y + 5, 0.6, align=align)
     for planner, scores in axes.items():
         shape = middle + radius_px * spokes * np.clip([[scores[name]] for name in names], 0.0, 1.0)
         filled = picture.copy()
-        cv2.fillPoly(filled, [_fixed(shape)], COLORS[planner], cv2.LINE_AA, shift=FRACTION_BITS)
+        draw_area(filled, shape, COLORS[planner])
         picture[:] = (0.82 * picture + 0.18 * filled).astype(np.uint8)
-        _line(picture, shape, COLORS[planner], 3, closed=True)
+        draw_line(picture, shape, COLORS[planner], 3, closed=True)
     for row, (planner, scores) in enumerate(axes.items()):
         words = ", ".join(f"{name.replace('_', ' ')} {scores[name]:.3f}" for name in names)
-        _line(picture, np.array([[40, 30 + 30 * row], [74, 30 + 30 * row]]), COLORS[planner], 3)
-        _text(picture, f"{TITLES[planner]}: mean {scores['mean']:.3f} ({words})", 84, 35 + 30 * row, 0.5)
+        draw_line(picture, np.array([[40, 30 + 30 * row], [74, 30 + 30 * row]]), COLORS[planner], 3)
+        draw_text(picture, f"{TITLES[planner]}: mean {scores['mean']:.3f} ({words})", 84, 35 + 30 * row, 0.5)
     return png_bytes(picture)

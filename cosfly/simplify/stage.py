@@ -31,7 +31,7 @@ from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.simplify.merge import MergeRule, merge
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
-from cosfly.topview import add_caption, draw_overview, png_bytes
+from cosfly.topview import TopView, add_caption, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
 
@@ -425,11 +425,11 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
 
 def _picture(raw: BoxMap, simplified: BoxMap, facts: dict, size_px: int) -> bytes:
     """Draw obstacles at walking height before and after, side by side."""
-    low, high = raw.bounds()
+    view = TopView.around(np.stack(raw.bounds()), size_px)
     halves = []
     for title, box_map in (("raw", raw), ("simplified", simplified)):
         shown = box_map.select(np.isin(box_map.kinds, SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: what stands below 2 m)"
-        halves.append(add_caption(draw_overview(shown, size_px=size_px, low_xy=low[:2], high_xy=high[:2]), text))
+        halves.append(add_caption(draw_map(shown, view), text))
     return png_bytes(np.hstack(halves))
