@@ -114,23 +114,27 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
     field = ".".join(str(part) for part in detail["loc"]) or "settings"
     if detail["type"] == "extra_forbidden":
         *parents, last = detail["loc"]
-        known = _known(model, parents)
-        hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
+        known, formerly = _known(model, parents)
+        hint = nearest(formerly.get(str(last), str(last)), known) or (
+            f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else ""
+        )
         return f"{field}: unknown setting{hint}"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
     what = "not a group of settings" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
     return f"{field}: {what}{got}"
 
 
-def _known(model: Any, parents: Iterable[Any]) -> list[str]:
-    """Names of the settings of the group at `parents`."""
+def _known(model: Any, parents: Iterable[Any]) -> tuple[list[str], dict[str, str]]:
+    """Names of the settings of the group at `parents`, and what became of former names (`formerly` on a field)."""
     for parent in parents:
         field = getattr(model, "model_fields", {}).get(parent)
         if field is None:
             continue  # the tag of a union, or a position in a list
         kinds = [field.annotation, *get_args(field.annotation)]
         model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-    return list(getattr(model, "model_fields", {}))
+    fields = getattr(model, "model_fields", {})
+    extras = {name: field.json_schema_extra for name, field in fields.items()}
+    return list(fields), {str(extra.get("formerly")): name for name, extra in extras.items() if isinstance(extra, dict)}
 
 
 def shipped(name: str) -> Path:

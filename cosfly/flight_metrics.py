@@ -8,6 +8,9 @@ from cosfly.geometry import DT_S
 
 ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
 
+# Bounds of a flight (sec:step6), for the prefilter of `plan` and again for `inspect`.
+FIVE_RAY_MEAN_MIN, ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3 = 0.40, 5.0, 10.0
+
 
 def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> float:
     """Root mean square of the length of a discrete derivative of a path.
@@ -72,8 +75,8 @@ def flight_metrics(
         "length_m": length_m(positions_m),
         "duration_s": (len(positions_m) - 1) * dt_s,
         "speed_max_mps": speed_max_mps(positions_m, dt_s),
-        "visibility_mean": float(visibility.mean()),
-        "visibility_min": float(visibility.min()),
+        "five_ray_mean": float(visibility.mean()),
+        "five_ray_min": float(visibility.min()),
         "blocked_fraction": float((visibility == 0).mean()),
         "target_distance_mean_m": float(distances.mean()),
         "target_distance_std_m": float(distances.std()),

@@ -8,7 +8,7 @@ from cosfly.errors import ConfigError
 
 
 class Inner(Config):
-    altitude_m: float = Field(20.0, gt=0, description="")
+    altitude_m: float = Field(20.0, gt=0, description="", json_schema_extra={"formerly": "flies_at"})
 
 
 class Outer(Config):
@@ -88,6 +88,11 @@ def test_a_wrong_override_is_not_laid_at_the_files_door(tmp_path):
     file.write_text("seed: 3\n")
     with pytest.raises(ConfigError, match=r"c\.yaml with --set: plan: not a group of settings, got 3"):
         load(Outer, file, ["plan=3"])
+
+
+def test_a_former_name_leads_to_the_present_one():
+    with pytest.raises(ConfigError, match=r"plan\.flies_at: unknown setting \(did you mean 'altitude_m'\?\)"):
+        load(Outer, None, ["plan.flies_at=3"])
 
 
 def test_where_no_name_is_near_the_known_ones_are_listed():

@@ -23,9 +23,9 @@ CFG = PlanConfig()
 
 # tab:appendix_h_tastar_muco_delta and tab:appendix_h_four_axis_scores of the paper.
 PAPER = {
-    "track_astar": {"visibility_mean": 0.979, "length_m": 104.479, "accel_rms_mps2": 0.673, "jerk_rms_mps3": 0.919, "clearance_min_m": 4.029},
-    "muco": {"visibility_mean": 0.894, "length_m": 108.838, "accel_rms_mps2": 0.738, "jerk_rms_mps3": 0.773, "clearance_min_m": 2.754},
-    "spline": {"visibility_mean": 0.618, "length_m": 85.73, "jerk_rms_mps3": 1.433, "clearance_min_m": 1.775},
+    "track_astar": {"five_ray_mean": 0.979, "length_m": 104.479, "accel_rms_mps2": 0.673, "jerk_rms_mps3": 0.919, "clearance_min_m": 4.029},
+    "muco": {"five_ray_mean": 0.894, "length_m": 108.838, "accel_rms_mps2": 0.738, "jerk_rms_mps3": 0.773, "clearance_min_m": 2.754},
+    "spline": {"five_ray_mean": 0.618, "length_m": 85.73, "jerk_rms_mps3": 1.433, "clearance_min_m": 1.775},
 }  # fmt: skip
 SCORES = {
     "track_astar": (0.979, 0.821, 0.521, 0.806, 0.782),
@@ -49,7 +49,7 @@ def test_axis_scores_are_the_papers():
 
 def test_a_planner_that_collides_does_not_set_the_shortest_path_and_is_less_safe():
     means = {name: figures(**row) for name, row in PAPER.items()}
-    means["jerk"] = figures(visibility_mean=0.624, length_m=84.4, jerk_rms_mps3=1.732, collision_fraction=0.002, clearance_min_m=1.137)  # fmt: skip
+    means["jerk"] = figures(five_ray_mean=0.624, length_m=84.4, jerk_rms_mps3=1.732, collision_fraction=0.002, clearance_min_m=1.137)  # fmt: skip
     scores = compare.axis_scores(means)
     assert scores["spline"]["path_efficiency"] == 1.0
     assert scores["jerk"]["path_efficiency"] == pytest.approx(1.016, abs=1e-3)
@@ -71,8 +71,8 @@ def test_deltas_are_the_papers():
 
 
 def test_win_rates_count_strict_wins():
-    first = [figures(visibility_mean=v, length_m=1.0, jerk_rms_mps3=2.0, clearance_min_m=3.0) for v in (0.9, 0.8, 0.7)]
-    second = [figures(visibility_mean=0.8, length_m=2.0, jerk_rms_mps3=1.0, clearance_min_m=3.0) for _ in first]
+    first = [figures(five_ray_mean=v, length_m=1.0, jerk_rms_mps3=2.0, clearance_min_m=3.0) for v in (0.9, 0.8, 0.7)]
+    second = [figures(five_ray_mean=0.8, length_m=2.0, jerk_rms_mps3=1.0, clearance_min_m=3.0) for _ in first]
     second[2]["collision_fraction"] = 0.1
     rates = compare.win_rates(first, second)
     assert {name: row["count"] for name, row in rates.items()} == {
@@ -122,7 +122,7 @@ def test_the_record_is_what_the_flights_are(made):
         traces = read_traces(made / f"drone_trace_{planner}.json")
         assert {trace.planner for trace in traces} == {planner}
         seen = np.mean([trace.visibility.mean() for trace in traces])
-        assert record["means"][planner]["visibility_mean"] == pytest.approx(seen, abs=1e-4)
+        assert record["means"][planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)
         assert record["means"][planner]["blocked_fraction"] == pytest.approx(1 - seen, abs=1e-3)
         assert record["means"][planner]["collision_fraction"] == 0
         assert manifest["timings"][planner]["mean_ms"] > 0

@@ -15,7 +15,8 @@ from scipy.optimize import minimize
 import cosfly.planners.stage as planners
 from cosfly import flight_metrics as metrics
 from cosfly import kernels
-from cosfly.errors import InputError, NoPathError, ResumeError
+from cosfly.config import load
+from cosfly.errors import ConfigError, InputError, NoPathError, ResumeError
 from cosfly.geometry import DT_S, look_at
 from cosfly.planners import loss, muco, start, step
 from cosfly.planners.nearby import nothing_nearby
@@ -312,7 +313,7 @@ def test_the_camera_keeps_the_target_in_view(world):
     assert trace.drop_reason is None
     assert trace.visibility.mean() >= 0.88
     assert trace.metrics["clearance_min_m"] >= 2.5
-    assert trace.metrics["visibility_mean"] == pytest.approx(trace.visibility.mean(), abs=1e-4)
+    assert trace.metrics["five_ray_mean"] == pytest.approx(trace.visibility.mean(), abs=1e-4)
     assert np.isfinite(trace.clearances_m).all()
     pitch, yaw = look_at(trace.positions_m, trace.targets_m)
     np.testing.assert_allclose(trace.rotations_deg, np.degrees(np.stack([pitch, yaw, 0 * yaw], axis=1)))
@@ -398,13 +399,13 @@ def test_hopeless_walks_are_clear_errors(walk, rows, words):
     assert "w" in str(caught.value.where)
 
 
-@pytest.mark.parametrize("name", ["visibility_mean", "accel_rms_mps2", "jerk_rms_mps3"])
+@pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
 def test_the_prefilter_has_three_rules(name):
-    fine = {"visibility_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
+    fine = {"five_ray_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
     assert planners.drop_reason(fine, CFG) is None
-    worse = {**fine, name: fine[name] + (-0.01 if name == "visibility_mean" else 0.01)}
+    worse = {**fine, name: fine[name] + (-0.01 if name == "five_ray_mean" else 0.01)}
     expected = {
-        "visibility_mean": "low_visibility",
+        "five_ray_mean": "low_visibility",
         "accel_rms_mps2": "high_acceleration",
         "jerk_rms_mps3": "high_jerk",
     }
@@ -420,6 +421,11 @@ def test_settings_that_contradict_are_refused():
     ):
         with pytest.raises(ValueError, match=r"may not exceed|ascending|lower one first|Extra inputs"):
             PlanConfig.model_validate(bad)
+
+
+def test_the_former_name_of_the_bound_on_sight_is_known():
+    with pytest.raises(ConfigError, match="did you mean 'five_ray_mean_min'"):
+        load(PlanConfig, None, ["visibility_min=0.3"])
 
 
 def test_every_planner_of_the_table_can_be_loaded():

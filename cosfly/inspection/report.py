@@ -54,7 +54,7 @@ COLUMNS = (
     ("j m/s³", "jerk_rms_mps3", "{:.2f}"),
     ("S", "smoothness", "{:.3f}"),
     ("five-ray", "five_ray_mean", "{:.3f}"),
-    ("rendered", "visibility_mean", "{:.3f}"),
+    ("rendered", "rendered_visibility_mean", "{:.3f}"),
     ("visible", "visible_share", "{:.0%}"),
     ("IoU", "track_quality", "{:.2f}"),
 )

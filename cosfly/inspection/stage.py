@@ -16,7 +16,15 @@ from pydantic import Field
 
 from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.flight_metrics import accel_rms, jerk_rms, length_m, smoothness_score
+from cosfly.flight_metrics import (
+    ACCEL_RMS_MAX_MPS2,
+    FIVE_RAY_MEAN_MIN,
+    JERK_RMS_MAX_MPS3,
+    accel_rms,
+    jerk_rms,
+    length_m,
+    smoothness_score,
+)
 from cosfly.geometry import DT_S, project, world_from_camera, wrap_deg
 from cosfly.inspection.frames import FrameNumbers, check_checksums, check_files, check_pixels, choose_frames, target_box
 from cosfly.inspection.report import draw_flight, write_report
@@ -42,13 +50,18 @@ TIME_TOLERANCE_S = 1e-3
 class InspectConfig(Config):
     """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
 
-    accel_rms_max_mps2: float = Field(5.0, gt=0, description="planned RMS acceleration above this rejects, m/s^2")
-    jerk_rms_max_mps3: float = Field(10.0, gt=0, description="planned RMS jerk above this rejects, m/s^3")
+    accel_rms_max_mps2: float = Field(
+        ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
+    )
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
     smoothness_min: float = Field(
         0.5, ge=0, le=1, description="smoothness score S below this goes to review; 0 turns the rule off"
     )
     five_ray_mean_min: float = Field(
-        0.40, ge=0, le=1, description="mean five-ray visibility of the plan below this rejects; 0 turns the rule off"
+        FIVE_RAY_MEAN_MIN,
+        ge=0,
+        le=1,
+        description="mean five-ray visibility of the plan below this rejects; 0 turns the rule off",
     )
     clearance_min_m: float = Field(0.0, description="a planned point nearer than this to an obstacle rejects, m")
     check_pixels: Literal["all", "sample", "none"] = Field(
@@ -257,7 +270,7 @@ def _rendered_metrics(
         num_frames_checked=frames.num_checked,
         length_m=length_m(flight.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
-        visibility_mean=float(known.mean()) if len(known) else None,
+        rendered_visibility_mean=float(known.mean()) if len(known) else None,
         visible_share=float(flight.target_visible.mean()),
         in_view_share=float(flight.target_in_view.mean()),
         perturbed_share=float(flight.is_perturbed.mean()),

@@ -28,7 +28,7 @@ CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
 # Figures of one flight, in the order of the tables: name, title, digits.
 FIGURES = (
-    ("visibility_mean", "average visibility", 3),
+    ("five_ray_mean", "average visibility", 3),
     ("blocked_fraction", "blocked visibility fraction", 3),
     ("length_m", "path length (m)", 1),
     ("duration_s", "flight time (s)", 1),
@@ -49,7 +49,7 @@ AXES = ("visibility", "path_efficiency", "smoothness", "safety")
 def flight_figures(trace: DroneTrace) -> dict[str, float]:
     """Give the figures of FIGURES of one flight."""
     figures = {name: float(trace.metrics[name]) for name, _, _ in FIGURES if name in trace.metrics}
-    figures["blocked_fraction"] = round(1.0 - figures["visibility_mean"], 4)
+    figures["blocked_fraction"] = round(1.0 - figures["five_ray_mean"], 4)
     figures["collision_fraction"] = round(float((trace.clearances_m < 0).mean()), 4)
     return {name: figures[name] for name, _, _ in FIGURES}
 
@@ -71,7 +71,7 @@ def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float
     for planner, figures in means.items():
         clear = float(np.clip(figures["clearance_min_m"] / CLEARANCE_SCALE_M, 0.0, 1.0))
         axes = {
-            "visibility": figures["visibility_mean"],
+            "visibility": figures["five_ray_mean"],
             "path_efficiency": shortest_m / figures["length_m"] if figures["length_m"] > 0 else 1.0,
             "smoothness": 1.0 / (1.0 + figures["jerk_rms_mps3"]),
             "safety": (1.0 - figures["collision_fraction"]) * clear,
@@ -95,7 +95,7 @@ def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> 
     """Count on how many walks the first planner is strictly better (tab:appendix_h_tastar_muco_win_rates)."""
     pairs = list(zip(first, second, strict=True))
     wins = {
-        "visibility_higher": [a["visibility_mean"] > b["visibility_mean"] for a, b in pairs],
+        "visibility_higher": [a["five_ray_mean"] > b["five_ray_mean"] for a, b in pairs],
         "path_shorter": [a["length_m"] < b["length_m"] for a, b in pairs],
         "jerk_lower": [a["jerk_rms_mps3"] < b["jerk_rms_mps3"] for a, b in pairs],
         "clearance_larger": [a["clearance_min_m"] > b["clearance_min_m"] for a, b in pairs],

@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.errors import InputError, NoPathError
-from cosfly.flight_metrics import flight_metrics
+from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, flight_metrics
 from cosfly.geometry import DT_S, look_at
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
@@ -135,11 +135,14 @@ class PlanConfig(Config):
     heading_smoothing_s: float = Field(
         4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
     )
-    visibility_min: float = Field(
-        0.40, ge=0, le=1, description="drop a flight whose mean five-ray visibility is below this; 0: never"
+    five_ray_mean_min: float = Field(
+        FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a flight whose mean five-ray visibility is below this; 0: never",
+        json_schema_extra={"formerly": "visibility_min"},
+    )  # fmt: skip
+    accel_rms_max_mps2: float = Field(
+        ACCEL_RMS_MAX_MPS2, gt=0, description="drop a flight of greater RMS acceleration, m/s^2"
     )
-    accel_rms_max_mps2: float = Field(5.0, gt=0, description="drop a flight of greater RMS acceleration, m/s^2")
-    jerk_rms_max_mps3: float = Field(10.0, gt=0, description="drop a flight of greater RMS jerk, m/s^3")
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="drop a flight of greater RMS jerk, m/s^3")
     muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
     track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
 
@@ -258,7 +261,7 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
 
 def drop_reason(metrics: dict[str, float], cfg: PlanConfig) -> str | None:
     """Give why the prefilter before rendering rejects a flight, None if it passes (sec:step6)."""
-    if metrics["visibility_mean"] < cfg.visibility_min:
+    if metrics["five_ray_mean"] < cfg.five_ray_mean_min:
         return "low_visibility"
     if metrics["accel_rms_mps2"] > cfg.accel_rms_max_mps2:
         return "high_acceleration"
@@ -344,7 +347,7 @@ def run(
 def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[dict]) -> dict:
     """What the manifest says beyond the counts; planning times stand here and not in the product."""
     times_ms = np.array([1000.0 * record["seconds"] for record in records])
-    names = ("visibility_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
+    names = ("five_ray_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
     return {
         "num_boxes": len(box_map),
         "planning_ms": {"mean": round(float(times_ms.mean()), 1), "max": round(float(times_ms.max()), 1)},
