@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.chat.client import EndpointConfig
-from cosfly.config import Config
+from cosfly.config import MAY_DIFFER, Config
 from cosfly.frame_views import DEPTH_RANGE_M, View
 from cosfly.products.captions import Verdict
 
@@ -191,11 +191,15 @@ class JudgeConfig(Config):
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
     max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
-    concurrency: int = Field(16, ge=1, le=4096, description="most requests in flight")
-    timeout_s: float = Field(120.0, gt=0, description="limit of one request")
-    max_tries: int = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    concurrency: int = Field(16, ge=1, le=4096, json_schema_extra=MAY_DIFFER, description="most requests in flight")
+    timeout_s: float = Field(120.0, gt=0, json_schema_extra=MAY_DIFFER, description="limit of one request")
+    max_tries: int = Field(
+        6, ge=1, json_schema_extra=MAY_DIFFER, description="tries of one request when the server is busy or fails"
+    )
     json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
-    open_flights: int = Field(64, ge=1, description="flights whose judgements are kept in memory")
+    open_flights: int = Field(
+        64, ge=1, json_schema_extra=MAY_DIFFER, description="flights whose judgements are kept in memory"
+    )
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
     @model_validator(mode="after")
@@ -203,6 +207,10 @@ class JudgeConfig(Config):
         if self.url is not None and not self.url.startswith(("http://", "https://")):
             raise ValueError(f"judge.url must begin with http:// or https://, got {self.url!r}")
         return self
+
+    def recorded(self) -> dict[str, Any]:
+        """The address may hold a password, so it is not put on record."""
+        return super().recorded() | {"url": None if self.url is None else "endpoint"}
 
 
 class RepairConfig(Config):
@@ -227,13 +235,19 @@ class CaptionConfig(Config):
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
-    vllm: VllmConfig = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
-    budget: BudgetConfig = Field(BudgetConfig(), description="prices and limits of tokens and money")
+    vllm: VllmConfig = Field(
+        VllmConfig(), json_schema_extra=MAY_DIFFER, description="the engine of teacher vllm:MODEL_DIR"
+    )
+    budget: BudgetConfig = Field(
+        BudgetConfig(), json_schema_extra=MAY_DIFFER, description="prices and limits of tokens and money"
+    )
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
-    limit: int | None = Field(None, ge=1, description="caption at most this many windows; empty takes all")
+    limit: int | None = Field(
+        None, ge=1, json_schema_extra=MAY_DIFFER, description="caption at most this many windows; empty takes all"
+    )
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:
@@ -243,3 +257,13 @@ class CaptionConfig(Config):
                 f"got {self.teacher!r}"
             )
         return self
+
+    @property
+    def teacher_kind(self) -> Literal["rules", "endpoint", "vllm"]:
+        if self.teacher == "rules":
+            return "rules"
+        return "vllm" if self.teacher.startswith("vllm:") else "endpoint"
+
+    def recorded(self) -> dict[str, Any]:
+        """A teacher's address may hold a password, so its kind is put on record."""
+        return super().recorded() | {"teacher": self.teacher_kind}

@@ -7,6 +7,7 @@ CosflyError
 |-- EnvironmentMissing  a package, library, device or GL backend is not there      (fatal)
 |-- StorageError        a disk is full or not writable                             (fatal)
 |-- NoPathError         no endpoints, no route, no feasible flight
+|-- NothingKept         a stage has nothing for the next one
 |-- RenderError         a frame cannot be made or is not what it must be
 |-- TeacherError        an endpoint cannot be reached or does not speak the protocol (fatal)
 `-- VerifyError         a finished product is not what its records say
@@ -90,6 +91,10 @@ class StorageError(CosflyError):
 
 class NoPathError(CosflyError):
     code = "no_path"
+
+
+class NothingKept(CosflyError):
+    code = "nothing_kept"
 
 
 class RenderError(CosflyError):

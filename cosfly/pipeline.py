@@ -8,6 +8,7 @@ import resource
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,70 +23,52 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package
-from cosfly.errors import NoPathError
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.settings import RunConfig, num_workers
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Manifest, Resume, read_manifest
 from cosfly.store import read_json, write_bytes, write_json
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class StageResult:
-    """One row of the closing table."""
-
-    stage: str
-    product: Path
-    manifest: dict
-    was_complete: bool
-
-
-@dataclass(frozen=True)
 class Stage:
-    """One stage of a run: `work` fills `folder` and is safe to call again."""
+    """One stage of a run: `work` makes `product` in the stage's folder and is safe to call again."""
 
     name: str
-    folder: Path
     product: Path
     work: Callable[[], Path]
 
 
+@dataclass(frozen=True)
+class StageResult:
+    """One row of the closing table."""
+
+    stage: Stage
+    manifest: Manifest
+    was_complete: bool
+
+
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
-    """Give the stages of a run in order, with all their paths."""
+    """Give the stages of a run in order; each works in the folder of its name."""
     seed, workers = cfg.seed, num_workers(cfg.workers)
-    spread: dict[str, Any] = {"workers": workers, "resume": resume}
-    names = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
-    to = {name: out / name for name in names}
-    boxes, simplified = to["maps"] / "boxes_3d.json", to["simplify"] / "step2_simplified.json"
-    paths, traces = to["pedestrians"] / "path.json", to["plan"] / "drone_trace.json"
-    tree, inspected = to["render"], to["inspect"] / "inspect.json"
-    captions, published = to["caption"] / "captions.jsonl", to["release"] / "dataset"
-    works: dict[str, tuple[Path, Callable[[], Path]]] = {
-        "maps": (boxes, lambda: cosfly.maps.stage.run(cfg.maps, to["maps"], seed=seed, resume=resume)),
-        "simplify": (simplified, lambda: cosfly.simplify.stage.run(cfg.simplify, boxes, to["simplify"], resume=resume)),
-        "pedestrians": (
-            paths,
-            lambda: cosfly.pedestrians.stage.run(
-                cfg.pedestrians, simplified, to["pedestrians"], seed=seed, roi=cfg.roi, **spread
-            ),
-        ),
-        "plan": (
-            traces,
-            lambda: cosfly.planners.stage.run(cfg.plan, simplified, paths, to["plan"], seed=seed, **spread),
-        ),
-        "render": (
-            tree,
-            lambda: cosfly.render.stage.run(cfg.render, boxes, simplified, traces, tree, seed=seed, **spread),
-        ),
-        "inspect": (inspected, lambda: cosfly.inspection.stage.run(cfg.inspect, traces, tree, to["inspect"], **spread)),
-        "caption": (captions, lambda: caption.run.stage.run(cfg.caption, tree, to["caption"], seed=seed, **spread)),
-        "release": (
-            published,
-            lambda: release.package.run(cfg.release, tree, captions, inspected, to["release"], **spread),
-        ),
-    }
-    return [Stage(name, to[name], *works[name]) for name in names]
+    boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
+    walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
+    inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
+
+    def stage(name: str, product: Path, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
+        return Stage(name, product, partial(run, getattr(cfg, name), *inputs, out / name, resume=resume, **options))
+
+    return [
+        stage("maps", boxes, cosfly.maps.stage.run, seed=seed),
+        stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
+        stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, workers=workers),
+        stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, workers=workers),
+        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, workers=workers),
+        stage("inspect", inspected, cosfly.inspection.stage.run, traces, tree, workers=workers),
+        stage("caption", captions, caption.run.stage.run, tree, seed=seed, workers=workers),
+        stage("release", out / "release/dataset", release.package.run, tree, captions, inspected, workers=workers),
+    ]
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
@@ -98,18 +81,10 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     _save_run(cfg, out)
     results = []
     for number, stage in enumerate(todo, 1):
-        was_complete = (stage.folder / "manifest.json").exists()
+        was_complete = (out / stage.name / "manifest.json").exists()
         log.info("[%d/%d] %s%s", number, len(todo), stage.name, ": already complete" if was_complete else "")
         stage.work()
-        manifest = StageFolder(stage.folder, stage.name, is_complete=True).manifest()
-        if manifest["counts"]["kept"] == 0:
-            raise NoPathError(
-                "the stage kept nothing, so there is nothing for the next one",
-                where=stage.folder,
-                got=str({word: manifest["counts"][word] for word in ("dropped", "failed")}),
-                fix=f"see {stage.folder / 'failures.jsonl'}, change the settings and choose another --out",
-            )
-        results.append(StageResult(stage.name, stage.product, manifest, was_complete))
+        results.append(StageResult(stage, read_manifest(out / stage.name), was_complete))
     tree = out / "render"
     if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
         contact_sheet(tree, out / "contact_sheet.png")
@@ -131,5 +106,8 @@ def _save_summary(results: list[StageResult], out: Path) -> None:
     before = read_json(path).get("peak_memory_mb", 0) if path.exists() else 0
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
-    rows = [{"stage": r.stage, "counts": r.manifest["counts"], "seconds": r.manifest["seconds"]} for r in results]
+    rows = [
+        {"stage": r.stage.name, "counts": r.manifest.counts.model_dump(), "seconds": r.manifest.seconds}
+        for r in results
+    ]
     write_json(path, {"stages": rows, "peak_memory_mb": round(max(before, peak_mb), 1)})

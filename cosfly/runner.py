@@ -22,8 +22,7 @@ from typing import Any
 
 from cosfly.console import progress_bar
 from cosfly.errors import CosflyError, EnvironmentMissing
-from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import dump_json, write_bytes
+from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
 
 log = logging.getLogger(__name__)
 
@@ -51,14 +50,12 @@ Work = Callable[[Item], Outcome]
 class Finished:
     """All outcomes of a stage, in the order of the items."""
 
-    records: list[dict]  # {"id", "status": kept | dropped | failed, "result" | "reason" ...}
+    records: list[ItemRecord]
     tally: Tally
 
-    def results(self) -> Iterator[tuple[str, dict]]:
-        """Yield (item id, result) of the kept items."""
-        for record in self.records:
-            if record["status"] == "kept":
-                yield record["id"], record["result"]
+    @property
+    def kept(self) -> list[Kept]:
+        return [record for record in self.records if isinstance(record, Kept)]
 
 
 def run_items(
@@ -87,17 +84,18 @@ def run_items(
     assert len(set(ids)) == len(ids), "item ids must be unique"
     with stage.journal as journal:
         known = set(ids)
-        records = {r["id"]: r for r in journal.read() if r["id"] in known and r["status"] != "failed"}
+        records: dict[str, ItemRecord] = {}
+        records |= {r.id: r for r in stage.items() if r.id in known and not isinstance(r, Failed)}
         todo = [item for item in items if item.item_id not in records]
         if records:
             log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
         with progress_bar(label or stage.stage, total=len(items), done=len(records)) as advance:
             for record in _outcomes(todo, factory, factory_args, workers):
-                records[record["id"]] = record
-                journal.append(record)
-                if record["status"] == "failed":
-                    named = "" if record["id"] in record["message"] else f"{record['id']}: "
-                    log.error("%s: %s%s", stage.stage, named, record["message"])
+                records[record.id] = record
+                journal.append(record.model_dump())
+                if isinstance(record, Failed):
+                    named = "" if record.id in record.message else f"{record.id}: "
+                    log.error("%s: %s%s", stage.stage, named, record.message)
                 advance(1)
     ordered = [records[item_id] for item_id in ids]
     tally = _tally(stage, ordered)
@@ -112,23 +110,21 @@ def run_items(
     return Finished(ordered, tally)
 
 
-def _tally(stage: StageFolder, records: list[dict]) -> Tally:
-    tally = Tally(num_input=len(records))
-    failures = []
+def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:
+    tally = Tally(input=len(records))
     for record in records:
-        if record["status"] == "kept":
+        if isinstance(record, Kept):
             tally.kept += 1
-        elif record["status"] == "dropped":
-            tally.dropped[record["reason"]] = tally.dropped.get(record["reason"], 0) + 1
+        elif isinstance(record, Dropped):
+            tally.drop(record.reason)
         else:
-            tally.failed[record["code"]] = tally.failed.get(record["code"], 0) + 1
-            failures.append({key: record[key] for key in ("id", "code", "message")})
-    write_bytes(stage.path / "failures.jsonl", "".join(dump_json(f) + "\n" for f in failures).encode())
+            tally.fail(record.code)
+    write_failures(stage.path / "failures.jsonl", [record for record in records if isinstance(record, Failed)])
     tally.check()
     return tally
 
 
-def _outcomes(items: list[Item], factory: Callable, factory_args: tuple, workers: int) -> Iterator[dict]:
+def _outcomes(items: list[Item], factory: Callable, factory_args: tuple, workers: int) -> Iterator[ItemRecord]:
     if workers <= 1 or len(items) <= 1:
         work = factory(*factory_args) if items else None
         for item in items:
@@ -141,12 +137,12 @@ def _outcomes(items: list[Item], factory: Callable, factory_args: tuple, workers
         yield from _pooled([item], factory, factory_args, 1, again)
         if again:
             message = f"{item.item_id}: its worker process died twice; it may need more memory than there is"
-            yield {"id": item.item_id, "status": "failed", "code": "worker_died", "message": message}
+            yield Failed(id=item.item_id, code="worker_died", message=message)
 
 
 def _pooled(
     items: list[Item], factory: Callable, factory_args: tuple, workers: int, suspects: list[Item]
-) -> Iterator[dict]:
+) -> Iterator[ItemRecord]:
     """Run items on a pool; those in flight when a worker died are put into `suspects`, the others run on a new pool."""
     context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
     waiting = list(reversed(items))
@@ -213,13 +209,13 @@ def _start_worker(factory: Callable, factory_args: tuple, logs: Any, level: int)
         _start_error = error  # raised by the first item: an error in an initializer would only break the pool
 
 
-def _attempt_in_worker(item: Item) -> dict:
+def _attempt_in_worker(item: Item) -> ItemRecord:
     if _start_error is not None:
         raise _start_error
     return _attempt(_work, item)
 
 
-def _attempt(work: Work | None, item: Item) -> dict:
+def _attempt(work: Work | None, item: Item) -> ItemRecord:
     """Do one item and give its record. Only a fatal error gets out."""
     assert work is not None
     start_s = time.monotonic()
@@ -228,16 +224,11 @@ def _attempt(work: Work | None, item: Item) -> dict:
     except CosflyError as error:
         if error.fatal:
             raise
-        return {"id": item.item_id, "status": "failed", "code": error.code, "message": str(error)}
+        return Failed(id=item.item_id, code=error.code, message=str(error))
     except Exception as error:  # the item boundary: a bug in one item must not lose the others
         log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
-        return {"id": item.item_id, "status": "failed", "code": "bug", "message": f"{type(error).__name__}: {error}"}
-    record: dict[str, Any] = {
-        "id": item.item_id,
-        "status": "kept" if outcome.drop_reason is None else "dropped",
-        "result": outcome.result,
-    }
-    if outcome.drop_reason is not None:
-        record["reason"] = outcome.drop_reason
-    record["seconds"] = round(time.monotonic() - start_s, 3)
-    return record
+        return Failed(id=item.item_id, code="bug", message=f"{type(error).__name__}: {error}")
+    seconds = round(time.monotonic() - start_s, 3)
+    if outcome.drop_reason is None:
+        return Kept(id=item.item_id, result=outcome.result, seconds=seconds)
+    return Dropped(id=item.item_id, result=outcome.result, reason=outcome.drop_reason, seconds=seconds)

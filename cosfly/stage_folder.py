@@ -1,4 +1,4 @@
-"""The folder of one stage, and the tally of its items.
+"""The folder of one stage and the records in it.
 
 A stage folder tells its own story: `stage.json` is written first (settings, inputs, seed, code version), `items.jsonl` grows
 while items are finished, `failures.jsonl` and `manifest.json` are written last. A manifest means: complete.
@@ -8,15 +8,36 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    field_serializer,
+    model_serializer,
+)
 
 import cosfly
-from cosfly.errors import ResumeError, StorageError, VerifyError
+from cosfly.config import Config
+from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.journal import Journal
-from cosfly.store import check_schema, fingerprint, inside, read_json, remove_partials, sha256_file, write_json
+from cosfly.store import (
+    dump_json,
+    fingerprint,
+    inside,
+    parse_json,
+    read_model,
+    remove_partials,
+    sha256_file,
+    validation_errors,
+    write_bytes,
+    write_model,
+)
 
 log = logging.getLogger(__name__)
 
@@ -25,35 +46,74 @@ Resume = Literal["never", "if-same", "force"]
 STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
 
 
-@dataclass
-class Tally:
-    """What became of a stage's items. kept + dropped + failed + unfinished = input, always."""
+# --- what became of the items -----------------------------------------------------------------------------------------
 
-    num_input: int = 0
+
+class Kept(BaseModel):
+    """A line of `items.jsonl`: the item is done; `result` is the stage's own."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    status: Literal["kept"] = "kept"
+    result: dict[str, Any] = {}
+    seconds: float = 0.0
+
+
+class Dropped(BaseModel):
+    """A line of `items.jsonl`: the item is done, and a rule of the stage leaves it out."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    status: Literal["dropped"] = "dropped"
+    result: dict[str, Any] = {}
+    reason: str
+    seconds: float = 0.0
+
+
+class Failed(BaseModel):
+    """A line of `items.jsonl`, and without its status of `failures.jsonl`: the item will be tried again."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    status: Literal["failed"] = "failed"
+    code: str
+    message: str
+
+
+ItemRecord = Kept | Dropped | Failed
+_ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discriminator="status")])
+
+
+def write_failures(path: Path, failures: Iterable[Failed]) -> None:
+    """Write `failures.jsonl`."""
+    write_bytes(path, "".join(dump_json(f.model_dump(exclude={"status"})) + "\n" for f in failures).encode())
+
+
+class Tally(BaseModel):
+    """What became of a stage's items. kept + dropped + failed = input, always."""
+
+    input: int = 0
     kept: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
-    failed: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = {}
+    failed: dict[str, int] = {}
 
-    @property
-    def num_dropped(self) -> int:
-        return sum(self.dropped.values())
+    def drop(self, reason: str, count: int = 1) -> None:
+        self.dropped[reason] = self.dropped.get(reason, 0) + count
 
-    @property
-    def num_failed(self) -> int:
-        return sum(self.failed.values())
+    def fail(self, code: str, count: int = 1) -> None:
+        self.failed[code] = self.failed.get(code, 0) + count
 
     def check(self) -> None:
         """Assert that nothing was lost: a tally that does not add up is a bug of ours, not of the input."""
-        total = self.kept + self.num_dropped + self.num_failed
-        assert total == self.num_input, f"{total} outcomes for {self.num_input} items: {self}"
+        total = self.kept + sum(self.dropped.values()) + sum(self.failed.values())
+        assert total == self.input, f"{total} outcomes for {self.input} items: {self}"
 
-    def as_dict(self) -> dict:
-        return {
-            "input": self.num_input,
-            "kept": self.kept,
-            "dropped": dict(sorted(self.dropped.items())),
-            "failed": dict(sorted(self.failed.items())),
-        }
+    @field_serializer("dropped", "failed")
+    def _sorted(self, counts: dict[str, int]) -> dict[str, int]:
+        return dict(sorted(counts.items()))
 
     def __str__(self) -> str:
         text = f"{self.kept} kept"
@@ -61,7 +121,66 @@ class Tally:
             if reasons:
                 listed = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
                 text += f", {sum(reasons.values())} {word} ({listed})"
-        return f"{text} of {self.num_input}"
+        return f"{text} of {self.input}"
+
+
+# --- what stands in the folder ----------------------------------------------------------------------------------------
+
+
+class StageInput(BaseModel):
+    """A file or folder that a stage reads."""
+
+    path: str
+    sha256: str
+
+
+class StageRecord(BaseModel):
+    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on."""
+
+    stage: str
+    config: dict[str, Any]
+    seed: int
+    inputs: dict[str, StageInput]
+    code_version: str
+    resumed_with_other: list[str] = []
+
+    @model_serializer(mode="wrap")
+    def _without_empty(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in dump(self).items() if value or name != "resumed_with_other"}
+
+
+class Output(BaseModel):
+    """A file of a finished stage, its path relative to the stage folder."""
+
+    path: str
+    bytes: int
+    sha256: str
+
+
+class Manifest(BaseModel):
+    """`manifest.json`: what a finished stage made. `facts` are what else the stage says of itself."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    stage: str
+    outputs: list[Output]
+    counts: Tally
+    seconds: float
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        return self.model_extra or {}
+
+    @model_serializer(mode="wrap")
+    def _time_last(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        record: dict[str, Any] = dump(self)
+        record["seconds"] = record.pop("seconds")
+        return record
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a complete stage."""
+    return read_model(folder / "manifest.json", Manifest, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
 
 
 class StageFolder:
@@ -77,27 +196,25 @@ class StageFolder:
 
     @classmethod
     def open(
-        cls, out: Path, stage: str, *, config: dict, inputs: dict[str, Path], seed: int, resume: Resume = "if-same"
+        cls, out: Path, stage: str, *, config: Config, inputs: dict[str, Path], seed: int, resume: Resume = "if-same"
     ) -> StageFolder:
         """Start or continue a stage.
 
         Args:
-            config: the stage's resolved settings, JSON-able.
+            config: the stage's settings; those marked MAY_DIFFER are not put on record.
             inputs: name -> file or folder that the stage reads.
             resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed;
                 `force` continues with the finished items in spite of a difference, which stays on record.
         Raises:
             ResumeError: the folder holds work that may not be continued; names what differs.
         """
-        record = {
-            "schema": STAGE_SCHEMA,
-            "schema_version": VERSION,
-            "stage": stage,
-            "config": config,
-            "seed": seed,
-            "inputs": {name: {"path": str(path), "sha256": fingerprint(path)} for name, path in sorted(inputs.items())},
-            "code_version": cosfly.__version__,
-        }
+        record = StageRecord(
+            stage=stage,
+            config=config.recorded(),
+            seed=seed,
+            inputs={name: StageInput(path=str(p), sha256=fingerprint(p)) for name, p in sorted(inputs.items())},
+            code_version=cosfly.__version__,
+        )
         stage_file, manifest_file = out / "stage.json", out / "manifest.json"
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
@@ -106,21 +223,21 @@ class StageFolder:
             for name in ("stage.json", "items.jsonl", "failures.jsonl"):
                 (out / name).unlink(missing_ok=True)
         elif stage_file.exists():
-            _continue(out, record, resume)
+            record = _continue(out, record, resume)
         elif out.is_dir() and any(out.iterdir()):
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )
         is_complete = manifest_file.exists()
         if is_complete:
-            manifest = check_schema(read_json(manifest_file), MANIFEST_SCHEMA, VERSION, manifest_file)
-            if manifest["counts"]["failed"]:
+            manifest = read_manifest(out)
+            if manifest.counts.failed:
                 manifest_file.unlink()  # failed items are tried again; the others stand in the journal
                 is_complete = False
             else:
                 _check_outputs_exist(out, manifest)
         if not is_complete:
-            write_json(stage_file, record)
+            write_model(stage_file, record, schema=STAGE_SCHEMA, version=VERSION)
             remove_partials(out)
         return cls(out, stage, is_complete)
 
@@ -128,41 +245,58 @@ class StageFolder:
     def journal(self) -> Journal:
         return Journal(self.path / "items.jsonl")
 
-    def finish(self, outputs: Iterable[Path], tally: Tally, **extra: Any) -> None:
+    def items(self) -> Iterator[ItemRecord]:
+        """Yield the outcomes in the journal; an item that failed and was tried again has several."""
+        journal = self.journal
+        with validation_errors(journal.path):
+            for record in journal.read():
+                yield _ITEM.validate_python(record)
+
+    def finish(self, outputs: Iterable[Path], tally: Tally, **facts: Any) -> None:
         """Write the manifest: the stage is complete.
 
         Args:
             outputs: files inside the folder; of a folder with many files, give its checksum file.
-            extra: further JSON-able facts for the manifest, for instance counts.
+            facts: further JSON-able facts for the manifest.
+        Raises:
+            NothingKept: no item was kept. What was written stays, without a manifest.
         """
         tally.check()
-        listed = [
-            {"path": str(path.relative_to(self.path)), "bytes": path.stat().st_size, "sha256": sha256_file(path)}
-            for path in sorted(outputs)
-        ]
-        seconds = round(time.monotonic() - self.started_s, 3)
-        manifest = {
-            "schema": MANIFEST_SCHEMA,
-            "schema_version": VERSION,
-            "stage": self.stage,
-            "outputs": listed,
-            "counts": tally.as_dict(),
-            **extra,
-            "seconds": seconds,
-        }
-        write_json(self.path / "manifest.json", manifest)
-        log.info("%s: %s, %.1f s", self.stage, tally, seconds)
+        if not tally.kept:
+            raise self.nothing_kept(tally)
+        manifest = Manifest(
+            stage=self.stage,
+            outputs=[
+                Output(path=str(p.relative_to(self.path)), bytes=p.stat().st_size, sha256=sha256_file(p))
+                for p in sorted(outputs)
+            ],
+            counts=tally,
+            seconds=round(time.monotonic() - self.started_s, 3),
+            **facts,
+        )
+        write_model(self.path / "manifest.json", manifest, schema=MANIFEST_SCHEMA, version=VERSION)
+        log.info("%s: %s, %.1f s", self.stage, tally, manifest.seconds)
 
-    def manifest(self) -> dict:
-        """Read the manifest of a complete stage."""
-        return check_schema(
-            read_json(self.path / "manifest.json"), MANIFEST_SCHEMA, VERSION, self.path / "manifest.json"
+    def nothing_kept(self, tally: Tally, *, expected: str | None = None) -> NothingKept:
+        """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure."""
+        path = self.path / "failures.jsonl"
+        first = path.read_text(encoding="utf-8").partition("\n")[0] if path.exists() else ""
+        return NothingKept(
+            f"{self.stage} kept nothing, so there is nothing to go on with",
+            where=self.path,
+            got=f"{tally}; the first failure: {parse_json(first)['message']}" if first else str(tally),
+            expected=expected,
+            fix="mend what the records in that folder name, or change the settings and choose another --out",
         )
 
+    def manifest(self) -> Manifest:
+        """Read the manifest of this complete stage."""
+        return read_manifest(self.path)
 
-def _continue(out: Path, record: dict, resume: Resume) -> None:
+
+def _continue(out: Path, record: StageRecord, resume: Resume) -> StageRecord:
     """See whether the work that stands in a folder may be continued as `record` says, and note in it what differs."""
-    found = check_schema(read_json(out / "stage.json"), STAGE_SCHEMA, VERSION, out / "stage.json")
+    found = read_model(out / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION)
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
     differences = _differences(found, record)
@@ -174,12 +308,10 @@ def _continue(out: Path, record: dict, resume: Resume) -> None:
             fix="choose another --out, restore the setting, or --resume force to keep the finished items all the same",
         )
     if differences:
-        record["resumed_with_other"] = [*found.get("resumed_with_other", []), *differences]
         (out / "manifest.json").unlink(missing_ok=True)
-    elif "resumed_with_other" in found:
-        record["resumed_with_other"] = found["resumed_with_other"]
-    if found.get("code_version") != record["code_version"]:
-        log.warning("%s: continued by version %s, begun by %s", out, record["code_version"], found.get("code_version"))
+    if found.code_version != record.code_version:
+        log.warning("%s: continued by version %s, begun by %s", out, record.code_version, found.code_version)
+    return record.model_copy(update={"resumed_with_other": [*found.resumed_with_other, *differences]})
 
 
 def _holds_work(out: Path) -> bool:
@@ -194,20 +326,20 @@ def _holds_work(out: Path) -> bool:
     )
 
 
-def _differences(found: dict, wanted: dict) -> list[str]:
+def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
     """Say which settings, inputs or seed differ, one phrase each."""
-    before, after = _flat(found.get("config", {})), _flat(wanted["config"])
+    before, after = _flat(found.config), _flat(wanted.config)
     changed = [
         f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())
         if before.get(key) != after.get(key)
     ]
-    if found.get("seed") != wanted["seed"]:
-        changed.append(f"seed was {found.get('seed')}, is {wanted['seed']}")
-    for name in sorted(found.get("inputs", {}).keys() | wanted["inputs"].keys()):
-        old, new = found.get("inputs", {}).get(name, {}), wanted["inputs"].get(name, {})
-        if old.get("sha256") != new.get("sha256"):
-            changed.append(f"the input {name} ({new.get('path', 'none')}) has changed")
+    if found.seed != wanted.seed:
+        changed.append(f"seed was {found.seed}, is {wanted.seed}")
+    for name in sorted(found.inputs.keys() | wanted.inputs.keys()):
+        old, new = found.inputs.get(name), wanted.inputs.get(name)
+        if old is None or new is None or old.sha256 != new.sha256:
+            changed.append(f"the input {name} ({new.path if new else 'none'}) has changed")
     return changed
 
 
@@ -220,13 +352,13 @@ def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _check_outputs_exist(out: Path, manifest: dict) -> None:
-    for entry in manifest.get("outputs", []):
-        path = inside(out, entry["path"])
-        if not path.is_file() or path.stat().st_size != entry["bytes"]:
+def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
+    for entry in manifest.outputs:
+        path = inside(out, entry.path)
+        if not path.is_file() or path.stat().st_size != entry.bytes:
             raise VerifyError(
                 "the manifest calls this stage complete, but a product is missing or has another size",
                 where=path,
-                expected=f"{entry['bytes']} bytes",
+                expected=f"{entry.bytes} bytes",
                 fix=f"remove {out} and run the stage again",
             )

@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -47,20 +47,31 @@ def _concerns(error: OSError, path: Path) -> bool:
     return error.filename is not None and path.absolute().is_relative_to(Path(os.fsdecode(error.filename)).absolute())
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name and rename it, so that a kill leaves either the old file or the new one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+@contextlib.contextmanager
+def atomic_file(path: Path) -> Iterator[IO[bytes]]:
+    """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or the new."""
+    partial = _partial(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with open(partial, "wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(partial, path)
         except BaseException:
-            partial.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)  # on a full disk it would hold the space that is needed
             raise
+
+
+def _partial(path: Path) -> Path:
+    """Give the temporary name of a file or folder; `remove_partials` knows it."""
+    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    with atomic_file(path) as file:
+        file.write(data)
 
 
 _COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
@@ -129,6 +140,18 @@ def read_json(path: Path, *, what: str = "file") -> Any:
         raise InputError(f"the {what} is not valid JSON", where=path, got=str(error)) from None
 
 
+@contextlib.contextmanager
+def validation_errors(where: str | Path) -> Iterator[None]:
+    """Turn what pydantic says of data that was read into an InputError that names the file and the first wrong field."""
+    try:
+        yield
+    except ValidationError as error:
+        detail = error.errors()[0]
+        field = ".".join(map(str, detail["loc"])) or "top level"
+        what = "not an object" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
+        raise InputError(what, where=f"{where}: {field}", got=repr(detail["input"])[:80]) from None
+
+
 def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Iterator[tuple[str, Model]]:
     """Yield each line of a JSON-lines file as it stands there, its end included, and the model it holds.
 
@@ -144,14 +167,12 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
     with file:
         for number, line in enumerate(file, 1):
             try:
-                yield line, model.model_validate(parse_json(line))
-            except ValidationError as error:
-                detail = error.errors()[0]
-                field = ".".join(str(part) for part in detail["loc"])
-                got = repr(detail["input"])[:80]
-                raise InputError(detail["msg"], where=f"{path}:{number}: {field}", got=got) from None
+                value = parse_json(line)
             except ValueError as error:
                 raise InputError("not valid JSON", where=f"{path}:{number}", got=str(error)) from None
+            with validation_errors(f"{path}:{number}"):
+                content = model.model_validate(value)
+            yield line, content
 
 
 def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
@@ -171,6 +192,22 @@ def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
     if str(found).split(".")[0] != version.split(".")[0]:
         raise InputError("unknown version", where=f"{path}: schema_version", got=repr(found), expected=repr(version))
     return value
+
+
+def read_model(path: Path, model: type[Model], *, schema: str, version: str, what: str = "file") -> Model:
+    """Read a JSON file of the wanted schema and major version.
+
+    Raises:
+        InputError: names the file and the field.
+    """
+    value = check_schema(read_json(path, what=what), schema, version, path)
+    with validation_errors(path):
+        return model.model_validate({key: v for key, v in value.items() if key not in ("schema", "schema_version")})
+
+
+def write_model(path: Path, content: BaseModel, *, schema: str, version: str) -> None:
+    """Write what `read_model` reads."""
+    write_json(path, {"schema": schema, "schema_version": version, **content.model_dump(mode="json")})
 
 
 def sha256_bytes(data: bytes) -> str:
@@ -259,7 +296,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Fill a folder under a temporary name; rename it when the block ends without an error."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = _partial(path)
     with storage_errors(path):
         partial.mkdir(parents=True)
         try:

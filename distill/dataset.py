@@ -226,7 +226,7 @@ def run(
     stage = StageFolder.open(
         out,
         "distill.prepare",
-        config=cfg.model_dump(mode="json"),
+        config=cfg,
         inputs={"captions": captions, "data": data},
         seed=seed,
         resume=resume,
@@ -252,7 +252,7 @@ def run(
     split_of = assign_splits(groups, cfg, seed)
     facts = _write_splits(cfg, captions, data, out, split_of)
     counts = check_no_leak({split: read_split(out, split) for split in SPLITS}, cfg.split_by)
-    tally = Tally(num_input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=dict(excluded))
+    tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=dict(excluded))
     for split in SPLITS:
         facts[split]["groups"] = sum(1 for owner in split_of.values() if owner == split)
         if not counts[split]:

@@ -304,7 +304,7 @@ def run(
         check_encoder(cfg.bertscore, bertscore_model)
         weights = sorted([*bertscore_model.glob("*.safetensors"), *bertscore_model.glob("*.bin")])
         inputs |= {f"bertscore/{path.name}": path for path in (bertscore_model / "config.json", *weights)}
-    stage = StageFolder.open(out, STAGE, config=cfg.model_dump(mode="json"), inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     path = out / "report.json"
     if stage.is_complete:
         return path
@@ -327,6 +327,6 @@ def run(
     write_json(path, report)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
     num_left = len(samples) - len(pairs)
-    tally = Tally(len(samples), len(pairs), {"not_asked": num_left} if num_left else {})
+    tally = Tally(input=len(samples), kept=len(pairs), dropped={"not_asked": num_left} if num_left else {})
     stage.finish([path, out / "evaluation.md"], tally, split=splits[0])
     return path

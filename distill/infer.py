@@ -12,7 +12,7 @@ from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language, parse_answer
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.stage_folder import Failed, Resume, StageFolder, Tally
 from cosfly.store import dump_json, model_lines, write_bytes
 from distill.checkpoint import read_adapter_facts
 from distill.dataset import Sample, read_split, split_path
@@ -148,7 +148,7 @@ def run(
     if adapter is not None:
         facts = read_adapter_facts(adapter, model)
         inputs |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
-    stage = StageFolder.open(out, STAGE, config=cfg.model_dump(mode="json"), inputs=inputs, seed=0, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)
     path = out / PREDICTIONS
     if stage.is_complete:
         return path
@@ -160,19 +160,17 @@ def run(
     items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
     max_pixels = cfg.max_pixels or int(facts.get("max_pixels", DEFAULT_MAX_PIXELS))
     finished = run_items(stage, items, _batch_factory, (cfg, data, model, adapter, max_pixels), label=STAGE)
-    tally = Tally(num_input=len(samples))
+    tally = Tally(input=len(samples))
     records = []
     for record, batch in zip(finished.records, batches, strict=True):
-        if record["status"] == "kept":
-            tally.kept += len(batch)
-            records += record["result"]["predictions"]
+        if isinstance(record, Failed):
+            tally.fail(record.code, len(batch))
+            records += [failed_prediction(s, cfg.split, record.code).model_dump(mode="json") for s in batch]
         else:
-            tally.failed[record["code"]] = tally.failed.get(record["code"], 0) + len(batch)
-            records += [failed_prediction(s, cfg.split, record["code"]).model_dump(mode="json") for s in batch]
+            tally.kept += len(batch)
+            records += record.result["predictions"]
     if not tally.kept:
-        raise InputError(
-            "no sample could be answered", where=out / "failures.jsonl", got=finished.records[0]["message"]
-        )
+        raise stage.nothing_kept(tally)
     write_bytes(path, "".join(dump_json(record) + "\n" for record in records).encode())
     num_parsed = sum(record["coc"] is not None for record in records)
     stage.finish([path], tally, split=cfg.split, parsed=num_parsed, has_adapter=adapter is not None)

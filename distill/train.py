@@ -338,7 +338,7 @@ def run(
     stage = StageFolder.open(
         out,
         STAGE,
-        config=cfg.model_dump(mode="json"),
+        config=cfg,
         inputs={"dataset": dataset, "data": data, **weights},
         seed=seed,
         resume=resume,
@@ -365,7 +365,7 @@ def run(
         write_json(partial / ADAPTER_FACTS, facts)
     stage.finish(
         [path for path in (out / "log.jsonl", *adapter.iterdir()) if path.is_file()],
-        Tally(num_input=len(samples), kept=len(samples)),
+        Tally(input=len(samples), kept=len(samples)),
         steps=len(records),
         first_loss=records[0]["loss"],
         last_loss=records[-1]["loss"],

@@ -234,7 +234,7 @@ def _link(source: Path, target: Path) -> None:
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def make_work(cfg: ReleaseConfig, data: Path, parts: Path) -> Work:
+def make_worker(cfg: ReleaseConfig, data: Path, parts: Path) -> Work:
     """Worker factory: give the function that packages one flight."""
 
     def work(item: Item) -> Outcome:
@@ -257,7 +257,7 @@ def run(
     stage = StageFolder.open(
         out,
         "release",
-        config=cfg.model_dump(mode="json"),
+        config=cfg,
         inputs={"data": data, "captions": captions, "inspect": inspect},
         seed=0,
         resume=resume,
@@ -276,10 +276,10 @@ def run(
         Item(flight.folder, loaded.by_flight.get((flight.town, flight.trajectory, flight.variant), {}))
         for flight in chosen
     ]
-    finished = run_items(stage, items, make_work, (cfg, data, parts), workers=workers, label="release")
-    results = dict(finished.results())
+    finished = run_items(stage, items, make_worker, (cfg, data, parts), workers=workers, label="release")
+    results = {record.id: record.result for record in finished.kept}
     if not results:
-        raise InputError("no flight could be packaged", where=data, fix=f"see {out / 'failures.jsonl'}")
+        raise stage.nothing_kept(finished.tally)
     _check_parts(parts, results)
     history = account(inspection, left_out, loaded, finished)
     with atomic_folder(dataset) as folder:
@@ -306,7 +306,7 @@ def _check_parts(parts: Path, results: dict[str, dict]) -> None:
 
 def account(inspection: Inspection, left_out: dict[str, int], captions: Captions, finished: Finished) -> dict[str, Any]:
     """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
-    results = dict(finished.results())
+    results = {record.id: record.result for record in finished.kept}
     gone = dict(left_out)
     for code, count in finished.tally.failed.items():
         gone[f"failed: {code}"] = count

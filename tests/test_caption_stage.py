@@ -18,7 +18,7 @@ from caption.schema import CaptionConfig
 from caption.truth.actions import label_of, measure
 from caption.truth.glossary import GLOSSARY_FILE, load_glossary
 from caption.windows import iterate_samples
-from cosfly.errors import ConfigError, InputError
+from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
 from specimens import make_playback_tree
@@ -149,7 +149,7 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
 @pytest.mark.parametrize("num_points", [4, 9])
 def test_no_window_at_all_is_one_clear_error(tmp_path, num_points):
     root = make_playback_tree(tmp_path / "tree", 1, num_points, with_images=False)
-    with pytest.raises(InputError, match=r"no window to caption.*too_short 2.*at least 10 frames"):
+    with pytest.raises(NothingKept, match=r"kept nothing.*too_short 2.*at least 10 frames"):
         run(CaptionConfig(), root, tmp_path / "out")
 
 

@@ -13,6 +13,7 @@ from cosfly.cli.options import tell_product
 from cosfly.doctor import Check
 from cosfly.errors import InputError
 from cosfly.settings import RunConfig
+from cosfly.stage_folder import StageFolder, Tally
 from cosfly.store import write_json
 
 
@@ -53,14 +54,6 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, par
         assert part in line
 
 
-def test_a_stage_that_kept_nothing_is_an_error(capfd, tmp_path):
-    write_json(tmp_path / "manifest.json", {"counts": {"kept": 0, "dropped": {"short": 4}, "failed": {}}})
-    with pytest.raises(InputError, match=r"nothing was kept; got .*short.: 4"):
-        tell_product(tmp_path / "product", tmp_path, RunConfig())
-    write_json(tmp_path / "manifest.json", {"counts": {"kept": 1, "dropped": {"short": 3}, "failed": {}}})
-    tell_product(tmp_path / "product", tmp_path, RunConfig())
-
-
 def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
     monkeypatch.setattr(doctor, "examine", lambda *given: [Check("x", "optional", 'pip install "cosfly[vllm]"')])
     monkeypatch.setattr(sys, "argv", ["cosfly", "doctor"])
@@ -99,7 +92,9 @@ def test_ctrl_c_is_one_line():
 
 
 def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(capfd, tmp_path):
-    write_json(tmp_path / "manifest.json", {"counts": {"kept": 3, "dropped": {}, "failed": {"no_path": 1}}})
+    write_json(tmp_path / "product", {})
+    stage = StageFolder(tmp_path, "plan", is_complete=False)
+    stage.finish([tmp_path / "product"], Tally(input=6, kept=3, dropped={"short": 2}, failed={"no_path": 1}))
     with pytest.raises(InputError, match=r"some items failed.*no_path.: 1.*at most 0"):
         tell_product(tmp_path / "product", tmp_path, RunConfig())
     tell_product(tmp_path / "product", tmp_path, RunConfig(max_failed=1))

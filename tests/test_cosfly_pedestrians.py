@@ -12,7 +12,7 @@ import pytest
 
 from cosfly.chance import rng_for
 from cosfly.config import build
-from cosfly.errors import ConfigError, CosflyError, NoPathError
+from cosfly.errors import ConfigError, CosflyError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
 from cosfly.grid import OccupancyGrid
 from cosfly.journal import Journal
@@ -394,7 +394,7 @@ def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
 
 def test_no_path_at_all_is_an_error_after_the_records_are_written(tmp_path):
     write_boxes(tmp_path / "map.json", plain(40.0))
-    with pytest.raises(NoPathError, match=r"not one walk.*no_path 3.*path_00000"):
+    with pytest.raises(NothingKept, match=r"kept nothing.*no_path 3.*path_00000"):
         run(PedestriansConfig(num_paths=3, min_distance_m=60), tmp_path / "map.json", tmp_path / "out")
     assert len((tmp_path / "out" / "failures.jsonl").read_text().splitlines()) == 3
     assert not (tmp_path / "out" / "manifest.json").exists()

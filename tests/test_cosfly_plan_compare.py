@@ -12,7 +12,7 @@ from test_cosfly_planners import CANYON, town_of, walk_along
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import NoPathError
+from cosfly.errors import NoPathError, NothingKept
 from cosfly.planners import compare, compare_plots
 from cosfly.planners.stage import PlanConfig
 from cosfly.products.boxes import write_boxes
@@ -184,7 +184,7 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
 
 def test_nothing_to_compare_is_an_error(inputs, tmp_path):
     write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
-    with pytest.raises(NoPathError, match="both planners"):
+    with pytest.raises(NothingKept, match="both planners"):
         compare.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "out")
     assert not (tmp_path / "out/manifest.json").exists()
 

@@ -16,7 +16,7 @@ import cosfly.planners.stage as planners
 from cosfly import flight_metrics as metrics
 from cosfly import kernels
 from cosfly.config import load
-from cosfly.errors import ConfigError, InputError, NoPathError, ResumeError
+from cosfly.errors import ConfigError, InputError, NoPathError, NothingKept, ResumeError
 from cosfly.geometry import DT_S, look_at
 from cosfly.planners import loss, muco, start, step
 from cosfly.planners.nearby import nothing_nearby
@@ -475,9 +475,10 @@ def test_stage_counts_failures_and_does_the_others(inputs, tmp_path):
 
 
 def test_dropped_flights_are_counted_and_written(inputs, tmp_path):
-    product = planners.run(PlanConfig(jerk_rms_max_mps3=1e-6), *inputs, tmp_path / "plan")
+    with pytest.raises(NothingKept, match=r"3 dropped \(high_jerk 3\), 1 failed \(no_path 1\) of 4"):
+        planners.run(PlanConfig(jerk_rms_max_mps3=1e-6), *inputs, tmp_path / "plan")
+    product = tmp_path / "plan/drone_trace.json"
     assert {trace.drop_reason for trace in read_traces(product)} == {"high_jerk"}
-    assert json.loads((tmp_path / "plan/manifest.json").read_text())["counts"]["dropped"] == {"high_jerk": 3}
 
 
 @pytest.mark.slow
@@ -509,6 +510,6 @@ def test_stage_input_errors(inputs, tmp_path):
     with pytest.raises(InputError, match="more than once"):
         planners.run(CFG, inputs[0], tmp_path / "twice.json", tmp_path / "b")
     write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
-    with pytest.raises(NoPathError, match="not one walk"):
+    with pytest.raises(NothingKept, match="plan kept nothing"):
         planners.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "c")
     assert not (tmp_path / "c/manifest.json").exists()

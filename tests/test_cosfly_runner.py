@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from cosfly.chance import rng_for
+from cosfly.config import Config
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.journal import Journal
 from cosfly.runner import Item, Outcome, run_items
@@ -41,7 +42,7 @@ def make_worker(log: Path):
 
 
 def _stage(path: Path) -> StageFolder:
-    return StageFolder.open(path, "demo", config={}, inputs={}, seed=0)
+    return StageFolder.open(path, "demo", config=Config(), inputs={}, seed=0)
 
 
 def _items(*payloads):
@@ -53,13 +54,13 @@ MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"
 
 def test_everything_is_counted(tmp_path):
     finished = run_items(_stage(tmp_path / "s"), _items(*MIXED), make_worker, (tmp_path / "log",))
-    assert finished.tally.as_dict() == {
+    assert finished.tally.model_dump() == {
         "input": 6,
         "kept": 2,
         "dropped": {"short": 2},
         "failed": {"bug": 1, "input": 1},
     }
-    assert [item_id for item_id, _ in finished.results()] == ["i0", "i3"]
+    assert [record.id for record in finished.kept] == ["i0", "i3"]
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures
     assert "KeyError" in failures
@@ -69,7 +70,7 @@ def test_worker_count_does_not_matter(tmp_path):
     def products(workers: int):
         stage = _stage(tmp_path / f"s{workers}")
         finished = run_items(stage, _items(*MIXED), make_worker, (tmp_path / "log",), workers=workers)
-        return dump_json([{k: v for k, v in r.items() if k != "seconds"} for r in finished.records]), finished.tally
+        return dump_json([r.model_dump(exclude={"seconds"}) for r in finished.records]), finished.tally
 
     assert products(1) == products(2)
 
@@ -150,7 +151,7 @@ def test_kill_and_resume(tmp_path):
     assert 5 <= len(done) < 60
     items = [Item(str(k), k) for k in range(60)]
     finished = run_items(_stage(tmp_path / "s"), items, make_slow_worker)
-    assert [r["result"]["value"] for r in finished.records] == list(range(60))
+    assert [r.result["value"] for r in finished.kept] == list(range(60))
     assert sum(1 for _ in journal.read()) == 60  # nothing was done twice
 
 
@@ -158,6 +159,7 @@ STUCK = """
 import sys, time
 from pathlib import Path
 from cosfly import cli
+from cosfly.config import Config
 from cosfly.runner import Item, run_items
 from cosfly.stage_folder import StageFolder
 
@@ -171,7 +173,7 @@ if __name__ == "__main__":
     @cli.app.command()
     def wait(folder: Path) -> None:
         '''Wait.'''
-        stage = StageFolder.open(folder / "out", "demo", config={}, inputs={}, seed=0)
+        stage = StageFolder.open(folder / "out", "demo", config=Config(), inputs={}, seed=0)
         run_items(stage, [Item("a"), Item("b"), Item("c")], slow, (str(folder),), workers=2)
     sys.argv = ["cosfly", "wait", sys.argv[1]]
     cli.main()

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import Field
 
 from cosfly import store
-from cosfly.errors import InputError, ResumeError, StorageError, VerifyError
+from cosfly.config import MAY_DIFFER, Config
+from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.journal import Journal
-from cosfly.stage_folder import StageFolder, Tally
+from cosfly.stage_folder import Failed, StageFolder, Tally, write_failures
 from cosfly.store import inside, read_json, write_bytes, write_json
 
 
@@ -83,13 +85,18 @@ def test_a_damaged_line_is_counted(tmp_path):
 
 
 def test_a_tally_that_does_not_add_up_is_a_bug():
-    Tally(3, 1, {"short": 1}, {"input": 1}).check()
+    Tally(input=3, kept=1, dropped={"short": 1}, failed={"input": 1}).check()
     with pytest.raises(AssertionError, match="2 outcomes for 3 items"):
-        Tally(3, 1, {"short": 1}, {}).check()
+        Tally(input=3, kept=1, dropped={"short": 1}).check()
+
+
+class Demo(Config):
+    a: dict[str, int] = Field({"b": 1})
+    threads: int = Field(1, json_schema_extra=MAY_DIFFER)
 
 
 def _open(out, **changes):
-    arguments = {"config": {"a": {"b": 1}}, "inputs": {}, "seed": 0, **changes}
+    arguments = {"config": Demo(), "inputs": {}, "seed": 0, **changes}
     return StageFolder.open(out, "demo", **arguments)
 
 
@@ -99,17 +106,18 @@ def test_stage_life(tmp_path):
     stage = _open(out, inputs={"map": source})
     assert not stage.is_complete
     write_json(out / "product.json", {"y": 2})
-    stage.finish([out / "product.json"], Tally(1, 1), extra_fact=7)
+    stage.finish([out / "product.json"], Tally(input=1, kept=1), extra_fact=7)
     again = _open(out, inputs={"map": source})
     assert again.is_complete
-    assert again.manifest()["extra_fact"] == 7
-    assert again.manifest()["counts"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
+    assert again.manifest().facts == {"extra_fact": 7}
+    assert again.manifest().counts == Tally(input=1, kept=1)
+    assert read_json(out / "manifest.json")["counts"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
 
 
 def test_a_stage_with_failed_items_is_open_again(tmp_path):
     stage = _open(tmp_path / "out")
     write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally(2, 1, {}, {"input": 1}))
+    stage.finish([stage.path / "product.json"], Tally(input=2, kept=1, failed={"input": 1}))
     again = _open(tmp_path / "out")
     assert not again.is_complete
     assert not (again.path / "manifest.json").exists()
@@ -118,9 +126,9 @@ def test_a_stage_with_failed_items_is_open_again(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"config": {"a": {"b": 2}}}, "a.b was 1, is 2"),
+        ({"config": Demo(a={"b": 2})}, "a.b was 1, is 2"),
         ({"seed": 5}, "seed was 0, is 5"),
-        ({"config": {"a": {}}}, "a.b was 1"),
+        ({"config": Demo(a={})}, "a.b was 1"),
     ],
 )
 def test_other_settings_are_named(tmp_path, changes, words):
@@ -131,6 +139,20 @@ def test_other_settings_are_named(tmp_path, changes, words):
     assert words in str(read_json(forced.path / "stage.json")["resumed_with_other"])
     with pytest.raises(ResumeError, match="already holds work"):
         _open(tmp_path / "out", **changes, resume="never")
+
+
+def test_a_setting_that_may_differ_is_not_on_record(tmp_path):
+    _open(tmp_path / "out").journal.append({"id": "a", "status": "kept"})
+    again = _open(tmp_path / "out", config=Demo(threads=2))
+    assert read_json(again.path / "stage.json")["config"] == {"a": {"b": 1}}
+
+
+def test_a_stage_that_kept_nothing_is_one_error_and_not_complete(tmp_path):
+    stage = _open(tmp_path / "out")
+    write_failures(stage.path / "failures.jsonl", [Failed(id="i7", code="input", message="the disk is round")])
+    with pytest.raises(NothingKept, match=r"out: demo kept nothing.*4 dropped \(short 4\).* of 5.*the disk is round"):
+        stage.finish([], Tally(input=5, dropped={"short": 4}, failed={"input": 1}))
+    assert not (tmp_path / "out/manifest.json").exists()
 
 
 def test_a_changed_input_is_named(tmp_path):
@@ -147,12 +169,12 @@ def test_an_attempt_without_finished_work_binds_nobody(tmp_path):
     stage.journal.append({"id": "a", "status": "failed", "code": "input", "message": "x"})
     (stage.path / "failures.jsonl").write_text("{}")
     (stage.path / "Town").mkdir()
-    again = _open(tmp_path / "out", config={"a": {"b": 2}})
+    again = _open(tmp_path / "out", config=Demo(a={"b": 2}))
     assert "resumed_with_other" not in read_json(again.path / "stage.json")
     assert list(again.journal.read()) == []
     (again.path / "product.json").write_text("{}")
     with pytest.raises(ResumeError, match=r"a\.b was 2, is 3"):
-        _open(tmp_path / "out", config={"a": {"b": 3}})
+        _open(tmp_path / "out", config=Demo(a={"b": 3}))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -186,7 +208,7 @@ def test_foreign_files_are_not_touched(tmp_path):
 def test_a_missing_product_of_a_complete_stage_is_found(tmp_path):
     stage = _open(tmp_path / "out")
     write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally())
+    stage.finish([stage.path / "product.json"], Tally(input=1, kept=1))
     (stage.path / "product.json").unlink()
     with pytest.raises(VerifyError, match=r"product\.json"):
         _open(tmp_path / "out")

@@ -78,7 +78,7 @@ class Asking:
         Raises:
             TeacherError: no window would get an answer. What was answered is kept.
         """
-        asked = Asked(Tally(num_input=len(allotted)))
+        asked = Asked(Tally(input=len(allotted)))
         parts = {flight.name: flight.part(self.stage.path) for flight in allotted}
         path = self.stage.path / ANSWERS
         book = AnswerBook(path, lambda name: name in parts and parts[name].exists())
@@ -97,7 +97,7 @@ class Asking:
                     await self._ask_all(allotted, teacher, asked.flights, guesses)
         finally:
             self._write_failures()
-        asked.flights.num_input -= self.num_flights_left
+        asked.flights.input -= self.num_flights_left
         asked.unanswered, asked.num_flights_left, asked.stopped = self.unanswered, self.num_flights_left, self.stopped
         return asked
 
@@ -139,13 +139,13 @@ class Asking:
                     break
         except InputError as error:
             self.failures.append({"id": allotted.name, "code": error.code, "message": str(error)})
-            tally.failed[error.code] = tally.failed.get(error.code, 0) + 1
+            tally.fail(error.code)
             log.error("caption: %s: %s", allotted.name, error)
         else:
             if num_windows:
                 tally.kept += 1
             else:
-                tally.dropped["too_short"] = tally.dropped.get("too_short", 0) + 1
+                tally.drop("too_short")
         self.display.correct_total(guessed, num_windows if not self.stopped else guessed)
         flight.is_read = True
         self._close_if_done(flight)

@@ -113,7 +113,8 @@ class Ledger:
     def tally(self, num_unanswered: int) -> Tally:
         """Give the windows' tally and check that nothing was lost."""
         failed = {"no_answer": num_unanswered} if num_unanswered else {}
-        tally = Tally(self.num_windows + num_unanswered, self.num_accepted, dict(self.drops), failed)
+        total = self.num_windows + num_unanswered
+        tally = Tally(input=total, kept=self.num_accepted, dropped=dict(self.drops), failed=failed)
         tally.check()
         rejected = sum(self.repairs.values())
         assert rejected == sum(self.repair_asks.values())
@@ -129,8 +130,8 @@ class Ledger:
             "schema": REPORT_SCHEMA,
             "schema_version": REPORT_VERSION,
             "teacher": self.teacher,
-            "flights": flights.as_dict(),
-            "windows": windows.as_dict(),
+            "flights": flights.model_dump(),
+            "windows": windows.model_dump(),
             "asks": self.num_asks,
             "tokens": dict(sorted(self.tokens.items())),
             "structured": _sorted(self.structured),

@@ -20,7 +20,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.teacher import RuleTeacher, Teacher, shown_url
 from caption.truth.judge import open_judge
 from caption.window_loop import caption_window
-from cosfly.errors import ConfigError, InputError, TeacherError
+from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
@@ -29,11 +29,6 @@ from cosfly.store import write_json
 log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
-# Settings that change how a teacher is asked, not what is asked: a run may be continued with others.
-MANNERS = (
-    "concurrency", "timeout_s", "total_timeout_s", "max_tries", "backoff_s", "max_backoff_s", "stop_after_failures",
-    "image_uuid",
-)  # fmt: skip
 
 
 def run(
@@ -55,7 +50,7 @@ def run(
     Returns:
         `captions.jsonl`.
     Raises:
-        InputError: no flight, or no flight that is long enough.
+        InputError: no flight. NothingKept: none is long enough, or no window gave a caption.
         TeacherError: the endpoint cannot be used, a budget is used up, or windows stayed without an answer; what was
             answered is kept.
     """
@@ -72,8 +67,9 @@ def run(
     ledger = _merge(stage, allotted, with_gaps=bool(asked.unanswered))
     tally = ledger.tally(len(asked.unanswered))
     is_whole = not (asked.unanswered or asked.num_flights_left)
-    if tally.num_input == 0 and is_whole:
-        _complain_of_nothing(stage, cfg, data, asked.flights)
+    if tally.input == 0 and is_whole:
+        num_frames = cfg.window.num_frames + cfg.window.future_frames
+        raise stage.nothing_kept(asked.flights, expected=f"a flight of at least {num_frames} frames")
     report = ledger.report(asked.flights, tally)
     write_json(stage.path / REPORT, report)
     folders = {flight.name: flight.folder for flight in allotted}
@@ -82,7 +78,7 @@ def run(
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
     outputs = [path for path in (out / PRODUCT, out / REPORT, out / PAGE, out / ANSWERS) if path.exists()]
-    stage.finish(outputs, tally, flights=asked.flights.as_dict(), limit=cfg.limit if is_cut else None)
+    stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
     return out / PRODUCT
@@ -94,40 +90,16 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     Raises:
         ResumeError: it holds work made with another prompt, model or input; names what differs.
     """
-    return StageFolder.open(out, "caption", config=_recorded(cfg), inputs={"data": data}, seed=seed, resume=resume)
-
-
-def _recorded(cfg: CaptionConfig) -> dict:
-    """Give the settings that decide what is asked: not the endpoint's address, which may hold a password, manners, limits."""
-    config = cfg.model_dump(mode="json")
-    config["teacher"] = (
-        cfg.teacher if cfg.teacher == "rules" else "vllm" if cfg.teacher.startswith("vllm:") else "endpoint"
-    )
-    config["endpoint"] = {name: value for name, value in config["endpoint"].items() if name not in MANNERS}
-    for name in ("limit", "budget", "vllm"):
-        del config[name]
-    judge = {name: value for name, value in config["judge"].items() if name not in (*MANNERS, "open_flights")}
-    config["judge"] = judge | {"url": None if cfg.judge.url is None else "endpoint"}
-    return config
+    return StageFolder.open(out, "caption", config=cfg, inputs={"data": data}, seed=seed, resume=resume)
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
     """Tell whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
-    limit = stage.manifest().get("limit")
+    limit = stage.manifest().facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
     (stage.path / "manifest.json").unlink()
     return True
-
-
-def _complain_of_nothing(stage: StageFolder, cfg: CaptionConfig, data: Path, flights: Tally) -> None:
-    failures = (stage.path / "failures.jsonl").read_text(encoding="utf-8").splitlines()
-    raise InputError(
-        "no window to caption",
-        where=data,
-        got=f"flights: {flights}" + (f", first failure {failures[0]}" if failures else ""),
-        expected=f"a flight of at least {cfg.window.num_frames + cfg.window.future_frames} frames",
-    )
 
 
 def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
@@ -146,7 +118,7 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
         )
     if missed:
         raise TeacherError(
-            f"{len(missed)} of {tally.num_input} windows got no answer",
+            f"{len(missed)} of {tally.input} windows got no answer",
             where=shown_url(cfg.teacher),
             got=common_causes(missed),
             fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",

@@ -12,6 +12,7 @@ from cosfly.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
     from cosfly.settings import RunConfig
+    from cosfly.stage_folder import Tally
 
 
 class ResumeMode(StrEnum):
@@ -74,20 +75,16 @@ def manner(cfg: RunConfig, resume: ResumeMode) -> dict[str, Any]:
 
 
 def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
-    """Name a stage's product. Nothing kept, or too much failed, is an error: whoever calls the next stage must know."""
-    from cosfly.store import read_json
+    """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
+    from cosfly.stage_folder import read_manifest
 
     typer.echo(product)
-    counts = read_json(out / "manifest.json")["counts"]
-    if counts["kept"] == 0:
-        got = {word: counts[word] for word in ("dropped", "failed") if counts[word]}
-        raise InputError("nothing was kept", where=out, got=str(got), fix="see the records in that folder")
-    check_failures({out.name: counts}, out / "failures.jsonl", cfg)
+    check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl", cfg)
 
 
-def check_failures(counts_by_stage: dict[str, dict], where: Path, cfg: RunConfig) -> None:
+def check_failures(counts_by_stage: dict[str, Tally], where: Path, cfg: RunConfig) -> None:
     """Exit 1, after everything was done, where more items failed than the settings accept."""
-    failed = {stage: counts["failed"] for stage, counts in counts_by_stage.items() if counts["failed"]}
+    failed = {stage: counts.failed for stage, counts in counts_by_stage.items() if counts.failed}
     if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
         raise InputError(
             "some items failed; the others are done",

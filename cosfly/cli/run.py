@@ -42,7 +42,7 @@ def run(
     out = out or Path("runs") / cfg.name
     results = pipeline.run(cfg, out, resume=resume.value)
     _closing_table(results, out)
-    check_failures({r.stage: r.manifest["counts"] for r in results}, out, cfg)
+    check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
 
 
 def _closing_table(results: list[StageResult], out: Path) -> None:
@@ -54,13 +54,13 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
     for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
         table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
     for result in results:
-        counts = result.manifest["counts"]
+        counts = result.manifest.counts
         dropped, failed = (
-            ", ".join(f"{k} {v}" for k, v in counts[word].items()) or "-" for word in ("dropped", "failed")
+            ", ".join(f"{k} {v}" for k, v in reasons.items()) or "-" for reasons in (counts.dropped, counts.failed)
         )
-        seconds = "before" if result.was_complete else f"{result.manifest['seconds']:.1f}"
-        product = os.path.relpath(result.product, out)
-        table.add_row(result.stage, f"{counts['kept']} of {counts['input']}", dropped, failed, seconds, product)
+        seconds = "before" if result.was_complete else f"{result.manifest.seconds:.1f}"
+        product = os.path.relpath(result.stage.product, out)
+        table.add_row(result.stage.name, f"{counts.kept} of {counts.input}", dropped, failed, seconds, product)
     console.print(table)
     for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
         console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)

@@ -42,7 +42,7 @@ from cosfly.products.playback import Flight, find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Failed, Resume, StageFolder
 
 TIME_TOLERANCE_S = 1e-3
 
@@ -298,7 +298,7 @@ def _heights_m(flight: Flight) -> np.ndarray:
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def make_work(cfg: InspectConfig, traces: Path, data: Path) -> Work:
+def make_worker(cfg: InspectConfig, traces: Path, data: Path) -> Work:
     """Worker factory: give the function that inspects one flight folder."""
     by_id = {trace.path_id: trace for trace in read_traces(traces)}
 
@@ -318,7 +318,7 @@ def run(
     stage = StageFolder.open(
         out,
         "inspect",
-        config=cfg.model_dump(mode="json"),
+        config=cfg,
         inputs={"traces": traces, "data": data},
         seed=0,
         resume=resume,
@@ -329,7 +329,7 @@ def run(
     planned = read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_flights(data)]
     finished = run_items(
-        stage, [Item(name, name) for name in names], make_work, (cfg, traces, data), workers=workers, label="inspect"
+        stage, [Item(name, name) for name in names], make_worker, (cfg, traces, data), workers=workers, label="inspect"
     )
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
@@ -344,24 +344,24 @@ def assemble(
     """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
     flights, views = [], {}
     for outcome in finished.records:
-        if outcome["status"] == "failed":
+        if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, data))
         else:
-            flights.append(FlightInspection.model_validate(outcome["result"]["record"]))
-            views[outcome["id"]] = outcome["result"]["view"]
+            flights.append(FlightInspection.model_validate(outcome.result["record"]))
+            views[outcome.id] = outcome.result["view"]
     flights = _with_twins_trace(flights)
     funnel = Funnel(trajectories=_trajectory_funnel(flights, planned), flights=_flight_funnel(flights))
     funnel.trajectories.check()
     return Inspection(settings=cfg.model_dump(mode="json"), funnel=funnel, flights=flights), views
 
 
-def _unreadable(outcome: dict, data: Path) -> FlightInspection:
+def _unreadable(outcome: Failed, data: Path) -> FlightInspection:
     """Give the record of a flight whose inspection failed: rejected, for the reason that the error names."""
-    town, trajectory, variant = ("", "", *outcome["id"].split("/"))[-3:]
+    town, trajectory, variant = ("", "", *outcome.id.split("/"))[-3:]
     report = Report()
-    report.error("unreadable", outcome["id"], outcome["message"].replace(f"{data}/", ""), "a flight that can be read")
+    report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a flight that can be read")
     return FlightInspection(
-        town=town, trajectory=trajectory, variant=variant, folder=outcome["id"], trace_id=None, result="rejected",
+        town=town, trajectory=trajectory, variant=variant, folder=outcome.id, trace_id=None, result="rejected",
         issues=report.issues, metrics={},
     )  # fmt: skip
 

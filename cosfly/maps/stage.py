@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -42,6 +42,11 @@ class MapsConfig(Config):
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
 
+    def recorded(self) -> dict[str, Any]:
+        """Only the chosen source counts for resumption: the settings of the others change nothing."""
+        others = SOURCES.keys() - {self.source}
+        return {name: value for name, value in super().recorded().items() if name not in others}
+
 
 def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
     """Read or build the map that the settings name."""
@@ -54,14 +59,8 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
 
     The region of interest is what the map has ground for: real maps are not rectangles, and outside of them there is nothing.
     """
-    # Only the chosen source counts for resumption: the settings of the others change nothing.
-    config = {
-        "source": cfg.source,
-        cfg.source: getattr(cfg, cfg.source).model_dump(mode="json"),
-        "picture_px": cfg.picture_px,
-    }
     inputs = getattr(cfg, cfg.source).inputs()
-    stage = StageFolder.open(out, "maps", config=config, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "boxes_3d.json"
     if stage.is_complete:
         return product
@@ -72,7 +71,7 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     write_json(out / "roi_polygon.json", covered_ground(box_map).model_dump())
     dropped = {str(k): int(v) for k, v in box_map.header.get("dropped_objects", {}).items()}
     num_objects = int(box_map.header.get("num_objects", len(box_map)))
-    tally = Tally(num_input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
+    tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     outputs = [product, out / "roi_polygon.json", out / "map.png"]
     stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

@@ -231,11 +231,11 @@ def run(
     Returns:
         the path of `path.json`.
     Raises:
-        NoPathError: nothing is walkable, or not one walk could be made; a walk that fails alone is counted.
+        NoPathError: nothing is walkable. NothingKept: not one walk could be made; a walk that fails alone is counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     settings = cfg.model_dump(mode="json")
-    stage = StageFolder.open(out, STAGE, config=settings, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "path.json"
     if stage.is_complete:
         return product
@@ -248,14 +248,9 @@ def run(
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
     finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, label="walks")
-    results = [result for _, result in finished.results()]
-    if not results:
-        raise NoPathError(
-            "not one walk could be made",
-            where=out / "failures.jsonl",
-            got=f"{finished.tally}; first: {finished.records[0]['message']}",
-            fix="change what the first failure names and run again",
-        )
+    if not finished.kept:
+        raise stage.nothing_kept(finished.tally)
+    results = [record.result for record in finished.kept]
     paths = [Walk.from_json(result["path"], f"{out}: items.jsonl") for result in results]
     for result in results:
         for step, seconds in result["seconds"].items():

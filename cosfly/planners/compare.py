@@ -19,7 +19,7 @@ from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
 from cosfly.store import read_json, write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "1.0"
@@ -177,12 +177,12 @@ def run(
 
     Raises:
         InputError: a file is not what it must be.
-        NoPathError: there is no walk that both fly.
+        NothingKept: there is no walk that both fly.
     """
     from cosfly.planners.compare_plots import draw_overlay, draw_radar, draw_series
 
     stage = StageFolder.open(
-        out, "plan_compare", config=cfg.model_dump(mode="json"), inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
+        out, "plan_compare", config=cfg, inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
     )  # fmt: skip
     product = out / "compare.json"
     if stage.is_complete:
@@ -191,15 +191,11 @@ def run(
     _check_ids(walks, paths)
     items = [Item(walk.path_id, walk) for walk in walks]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
-    shared = [record for record in finished.records if record["status"] == "kept"]
+    shared = finished.kept
     if not shared:
-        raise NoPathError(
-            "there is no walk that both planners fly", where=paths, got=f"{len(walks)} walks", fix=f"see {out / 'items.jsonl'}"
-        )  # fmt: skip
+        raise stage.nothing_kept(finished.tally, expected="a walk that both planners fly")
     flights = {
-        name: [
-            DroneTrace.from_json(r["result"]["flights"][name], f"{out}/items.jsonl: {r['id']}: {name}") for r in shared
-        ]
+        name: [DroneTrace.from_json(r.result["flights"][name], f"{out}/items.jsonl: {r.id}: {name}") for r in shared]
         for name in (FIRST, SECOND)
     }
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
@@ -214,7 +210,7 @@ def run(
         outputs.append(out / f"drone_trace_{name}.json")
         write_traces(outputs[-1], traces, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
-    flown: list[Walk] = [by_id[record["id"]] for record in shared]
+    flown: list[Walk] = [by_id[record.id] for record in shared]
     pictures = {
         "compare_overlay.png": draw_overlay(box_map, flown, flights),
         "compare_series.png": draw_series(flown, flights),
@@ -227,22 +223,22 @@ def run(
     return product
 
 
-def _left_out(records: list[dict]) -> list[dict[str, str]]:
+def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
     """Walks that are not compared, with the reason of the planner that failed; of a walk that neither flies, the shared one."""
     rows = []
     for record in records:
-        if record["status"] == "failed":
-            rows.append({"id": record["id"], "planner": "both", "message": record["message"]})
-        elif record["status"] == "dropped":
-            rows += [{"id": record["id"], "planner": k, "message": v} for k, v in record["result"]["errors"].items()]
+        if isinstance(record, Failed):
+            rows.append({"id": record.id, "planner": "both", "message": record.message})
+        elif isinstance(record, Dropped):
+            rows += [{"id": record.id, "planner": k, "message": v} for k, v in record.result["errors"].items()]
     return rows
 
 
-def _timings(shared: list[dict]) -> dict[str, dict[str, float]]:
+def _timings(shared: list[Kept]) -> dict[str, dict[str, float]]:
     """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
     for name in (FIRST, SECOND):
-        times_ms = np.array([record["result"]["times_ms"][name] for record in shared])
+        times_ms = np.array([record.result["times_ms"][name] for record in shared])
         table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
     return table
 
@@ -250,7 +246,7 @@ def _timings(shared: list[dict]) -> dict[str, dict[str, float]]:
 def table_rows(product: Path) -> dict[str, list[list[str]]]:
     """Read `compare.json` and its manifest back as rows of text for the terminal: figures, axes, wins."""
     record = read_json(product, what="comparison")
-    timings = read_json(product.parent / "manifest.json", what="manifest").get("timings", {})
+    timings = read_manifest(product.parent).facts["timings"]
     means, change = record["means"], record["deltas"]
     figures = []
     for name, title, digits in FIGURES:

@@ -29,7 +29,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
 from cosfly.store import write_bytes
 
 if TYPE_CHECKING:
@@ -317,12 +317,12 @@ def run(
 
     Raises:
         InputError: a file is not what it must be.
-        NoPathError: not one walk has a flight.
+        NothingKept: not one walk has a flight, or the prefilter dropped them all.
     """
     from cosfly.planners.overview import draw_flights
 
     stage = StageFolder.open(
-        out, "plan", config=cfg.model_dump(mode="json"), inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
+        out, "plan", config=cfg, inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
     )  # fmt: skip
     product, picture = out / "drone_trace.json", out / "plan.png"
     if stage.is_complete:
@@ -331,12 +331,10 @@ def run(
     _check_ids(walks, paths)
     items = [Item(walk.path_id, walk) for walk in walks]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
-    planned = [record for record in finished.records if record["status"] != "failed"]
+    planned = [record for record in finished.records if not isinstance(record, Failed)]
     if not planned:
-        raise NoPathError(
-            "not one walk has a flight", where=paths, got=f"{len(walks)} walks, all failed", fix=f"see {out / 'failures.jsonl'}"
-        )  # fmt: skip
-    traces = [DroneTrace.from_json(record["result"], f"{stage.path}/items.jsonl: {record['id']}") for record in planned]
+        raise stage.nothing_kept(finished.tally)
+    traces = [DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}") for record in planned]
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.model_dump(mode="json")}
     write_traces(product, traces, header)
     write_bytes(picture, draw_flights(box_map, walks, traces))
@@ -344,9 +342,9 @@ def run(
     return product
 
 
-def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[dict]) -> dict:
+def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[Kept | Dropped]) -> dict:
     """What the manifest says beyond the counts; planning times stand here and not in the product."""
-    times_ms = np.array([1000.0 * record["seconds"] for record in records])
+    times_ms = np.array([1000.0 * record.seconds for record in records])
     names = ("five_ray_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
     return {
         "num_boxes": len(box_map),

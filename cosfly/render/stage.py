@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from cosfly.chance import rng_for
-from cosfly.config import Config
+from cosfly.config import MAY_DIFFER, Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
@@ -67,7 +67,9 @@ class RenderConfig(Config):
         lt=1,
         description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
     )
-    encoder_threads: int = Field(2, ge=1, le=64, description="threads that encode and write beside the drawing")
+    encoder_threads: int = Field(
+        2, ge=1, le=64, json_schema_extra=MAY_DIFFER, description="threads that encode and write beside the drawing"
+    )
 
     @field_validator("fovs_deg")
     @classmethod
@@ -176,8 +178,7 @@ def run(
         InputError: an input is missing or malformed, or no flight is left to draw. EnvironmentMissing: no renderer here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces}
-    config = cfg.model_dump(mode="json", exclude={"encoder_threads"})
-    stage = StageFolder.open(out, "render", config=config, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
     box_map = read_boxes(boxes)
@@ -200,7 +201,7 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, label="render")
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, _ids_record(box_map, instances), indent=None)
-    results = [result for _, result in finished.results()]
+    results = [record.result for record in finished.kept]
     outputs = [out / result["folder"] / name for result in results for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
         [*outputs, ids_file],

@@ -403,8 +403,7 @@ def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:
     """Reads `boxes_3d.json`; writes `step2_simplified.json`, `simplify_report.json` and the before/after `simplify.png`."""
-    config = cfg.model_dump(mode="json")
-    stage = StageFolder.open(out, "simplify", config=config, inputs={"maps": maps}, seed=0, resume=resume)
+    stage = StageFolder.open(out, "simplify", config=cfg, inputs={"maps": maps}, seed=0, resume=resume)
     product = out / "step2_simplified.json"
     if stage.is_complete:
         return product
@@ -418,7 +417,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
     write_bytes(out / "simplify.png", _picture(raw, result.box_map, facts, cfg.picture_px))
-    tally = Tally(num_input=1, kept=1)
+    tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product
 
