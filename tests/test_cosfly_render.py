@@ -16,19 +16,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from test_renderers_contract import pose_towards, street
+from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly import gallery
 from cosfly.config import build
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError
-from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matrices, world_from_camera
+from cosfly.geometry import focal_px, intrinsic_matrix, rotation_matrices, world_from_camera
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products import playback
-from cosfly.products.boxes import make_box_map, write_boxes
+from cosfly.products.boxes import make_box_map
 from cosfly.products.frames import Camera, Look, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
-from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
 from cosfly.render.contract import (
@@ -64,17 +63,6 @@ def without_gl() -> str:
 
 NO_GL = without_gl()
 needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
-
-
-def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
-    """A person walks along the pavement, the drone circles."""
-    t = np.arange(n) * 0.5
-    targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
-    angle = 0.15 * t - 1.0
-    drones = targets + np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), np.full(n, 6.0)], axis=1)
-    pitch, yaw = look_at(drones, targets)
-    rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
-    return DroneTrace(path_id, "hand", t, drones, rotations, targets, np.ones(n), np.ones(n), drop_reason=drop_reason)
 
 
 # --- scene ------------------------------------------------------------------------------------------------------------
@@ -415,14 +403,6 @@ def test_missing_gl_names_the_packages(monkeypatch):
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
-
-
-def write_inputs(folder: Path, traces: list[DroneTrace]) -> list[Path]:
-    folder.mkdir(exist_ok=True)
-    write_boxes(folder / "boxes_3d.json", street())
-    write_boxes(folder / "step2_simplified.json", street())
-    write_traces(folder / "drone_trace.json", traces, {})
-    return [folder / name for name in ("boxes_3d.json", "step2_simplified.json", "drone_trace.json")]
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""One contract for every renderer of the table: depth and ids against computed rays, sky, person, repeatability.
+"""One contract for every renderer of the table: depth and ids against computed rays, sky, person, repeatability, a whole flight.
 
 Tolerance between processes: the default renderer gives identical bytes on one machine and driver; other machines may differ by
 one level of colour in 0.5 % of the pixels, and by 5 mm of depth away from silhouettes.
@@ -6,18 +6,25 @@ one level of colour in 0.5 % of the pixels, and by 5 mm of depth away from silho
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import multiprocessing
+import sys
+from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 
-from cosfly.errors import EnvironmentMissing
+from cosfly.config import build
+from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, look_at, rotation_matrices, world_from_camera
-from cosfly.products.boxes import BoxMap, make_box_map
-from cosfly.products.frames import SKY_DEPTH_M, Camera
+from cosfly.products import playback
+from cosfly.products.boxes import BoxMap, make_box_map, write_boxes
+from cosfly.products.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
 from cosfly.products.kinds import KINDS
+from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,
@@ -30,10 +37,11 @@ from cosfly.render.contract import (
     ground_z_m,
 )
 from cosfly.render.person import choose_clothes
-from cosfly.render.stage import RENDERERS, open_renderer
+from cosfly.render.stage import RENDERERS, RenderConfig, open_renderer, run
 
 SIZE = (320, 180)
-DEPTH_TOLERANCE_M = 0.005
+DEPTH_TOLERANCE_M = 0.001  # within 60 m
+VISIBILITY_TOLERANCE = 0.02  # figures differ, and where the person itself is drawn its box is visible
 HIP = np.array([4.0, -3.0, 0.9])
 
 
@@ -53,6 +61,35 @@ def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
     return make_box_map(
         centers, [row[2] for row in rows], rotations, [KINDS[row[0]] for row in rows], ids, {"name": "street"}
     )
+
+
+def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
+    """A person walks along the pavement, the drone circles."""
+    t = np.arange(n) * 0.5
+    targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
+    angle = 0.15 * t - 1.0
+    drones = targets + np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), np.full(n, 6.0)], axis=1)
+    pitch, yaw = look_at(drones, targets)
+    rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
+    return DroneTrace(path_id, "hand", t, drones, rotations, targets, np.ones(n), np.ones(n), drop_reason=drop_reason)
+
+
+def behind_a_wall(n: int = 8) -> DroneTrace:
+    """The drone sinks on the other side of a wall until the person is hidden."""
+    t = np.arange(n) * 0.5
+    targets = np.stack([-8.0 + 1.3 * t, np.full(n, -9.0), np.full(n, 1.0)], axis=1)
+    drones = targets + np.stack([np.zeros(n), np.full(n, -13.0), np.linspace(5.0, -0.4, n)], axis=1)
+    pitch, yaw = look_at(drones, targets)
+    rotations = np.degrees(np.stack([pitch, yaw, 0.0 * pitch], axis=1))
+    return DroneTrace("path_007", "hand", t, drones, rotations, targets, np.ones(n), np.ones(n))
+
+
+def write_inputs(folder: Path, traces: list[DroneTrace]) -> list[Path]:
+    folder.mkdir(exist_ok=True)
+    write_boxes(folder / "boxes_3d.json", street())
+    write_boxes(folder / "step2_simplified.json", street())
+    write_traces(folder / "drone_trace.json", traces, {})
+    return [folder / name for name in ("boxes_3d.json", "step2_simplified.json", "drone_trace.json")]
 
 
 def pose_towards(eye, target) -> np.ndarray:
@@ -115,6 +152,7 @@ def renderer(renderer_name):
 
 VIEWS = [
     ((-10.0, -22.0, 14.0), (8.0, 10.0, 2.0), 60.0),
+    ((-10.0, -22.0, 14.0), (8.0, 10.0, 2.0), 110.0),
     ((30.0, -12.0, 3.0), (-10.0, 10.0, 3.0), 90.0),
     ((0.0, -8.0, 30.0), (0.1, 4.0, 0.0), 30.0),
 ]
@@ -134,6 +172,31 @@ def test_depth_and_ids_agree_with_computed_rays(renderer, eye, target, fov_deg):
     np.testing.assert_array_equal(frame.kinds[inner], kinds[inner])
     # Coplanar faces and silhouettes may fall either way, but not many of them.
     assert (frame.ids != ids).mean() < 0.02
+
+
+def test_an_intrinsic_matrix_is_used_as_it_stands(renderer):
+    """Pixels need not be square nor the principal point in the middle."""
+    intrinsic = np.array([[230.0, 0.0, 131.5], [0.0, 260.0, 104.25], [0.0, 0.0, 1.0]])
+    pose = pose_towards(*VIEWS[0][:2])
+    frame = renderer.render(pose, intrinsic, None)
+    depth, _, ids = traced(street(), ground_z_m(street()), pose, intrinsic)
+    inner = away_from_silhouettes(depth, ids)
+    assert np.abs(frame.depth - depth)[inner & (depth < 60.0)].max() < DEPTH_TOLERANCE_M
+    np.testing.assert_array_equal(frame.ids[inner], ids[inner])
+
+
+def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
+    kinds = ["Terrain", "Ground", "Roads", "RoadLines", "Sidewalks"]
+    centers = [(2.0 * k, 0.0, -0.1) for k in range(len(kinds))]  # each lies half on the one before
+    halves = [(2.0, 3.0, 0.1)] * len(kinds)
+    box_map = make_box_map(centers, halves, np.zeros((5, 3)), [KINDS[kind] for kind in kinds])
+    renderer = opened(renderer_name, box_map)
+    frame = renderer.render(pose_towards((4.0, -9.0, 8.0), (4.0, 0.0, 0.0)), intrinsic_matrix(*SIZE, 70.0), None)
+    renderer.close()
+    row = frame.ids[SIZE[1] // 2]
+    steps = row[row > 0]
+    np.testing.assert_array_equal(steps, np.sort(steps))
+    assert set(steps.tolist()) == {1, 2, 3, 4, 5}
 
 
 def test_depth_is_exact_far_from_the_world_origin(renderer_name):
@@ -192,6 +255,34 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0)
 
 
+def test_a_pose_that_is_not_finite_is_refused(renderer):
+    intrinsic = intrinsic_matrix(*SIZE, 60.0)
+    with pytest.raises(RenderError, match="not finite"):
+        renderer.render(np.full((4, 4), np.nan), intrinsic, None)
+    with pytest.raises(RenderError, match="not finite"):
+        renderer.render(np.eye(4), intrinsic + np.inf, None)
+
+
+@pytest.mark.parametrize("other", sorted(RENDERERS))
+def test_closing_one_renderer_leaves_others_alone(renderer_name, other):
+    kept, closed = opened(renderer_name, street()), opened(other, street())
+    before = _digest(kept)
+    _digest(closed)
+    closed.close()
+    assert _digest(kept) == before
+    kept.close()
+
+
+def test_the_look_is_in_the_picture(renderer_name):
+    brightness = []
+    for look in (Look(), Look(exposure=0.3), Look(haze_m=10.0), Look(sun_elevation_deg=10.0)):
+        renderer = open_renderer(renderer_name, street(), *SIZE, look)
+        frame = renderer.render(pose_towards(VIEWS[0][0], HIP), intrinsic_matrix(*SIZE, 60.0), None)
+        brightness.append(float(frame.rgb[frame.kinds != KINDS["Sky"]].mean()))
+        renderer.close()
+    assert len({round(value) for value in brightness}) == len(brightness), brightness
+
+
 def test_the_same_scene_twice_gives_the_same_bytes(renderer_name):
     digests = []
     for _ in range(2):
@@ -228,3 +319,60 @@ def test_the_checker_of_this_file_can_fail():
     shifted = intrinsic + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     wrong, _, _ = traced(street(), -0.1, pose, shifted)
     assert np.abs(wrong - depth)[away_from_silhouettes(depth, ids) & (depth < 60.0)].max() > DEPTH_TOLERANCE_M
+
+
+def test_settings_name_the_renderers_of_the_table():
+    assert set(get_args(RenderConfig.model_fields["backend"].annotation)) == set(RENDERERS)
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory):
+    """Gives the tree that a renderer draws of two flights; each is drawn once."""
+    folder = tmp_path_factory.mktemp("flights")
+    inputs = write_inputs(folder / "in", [circling(4), behind_a_wall()])
+
+    @functools.cache
+    def drawn(name: str) -> Path:
+        opened(name, street()).close()  # skips where it cannot run
+        settings = {"backend": name, "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street"}
+        return run(build(RenderConfig, settings, "test"), *inputs, folder / name, seed=5)
+
+    return drawn
+
+
+def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_name, flights):
+    tree, reference = flights(renderer_name), flights("gl")
+    found = sorted(str(path.relative_to(tree)) for path in (tree / "Street").rglob("*"))
+    assert found == sorted(str(path.relative_to(reference)) for path in (reference / "Street").rglob("*"))
+    visibilities = []
+    for folder in playback.find_flights(tree):
+        flight = playback.read_flight(folder)
+        for i in range(len(flight)):
+            there = reference / folder.relative_to(tree) / playback.frame_name(i)
+            meta, expected = read_meta(flight.frame_folder(i)), read_meta(there)
+            assert meta.target.visibility == pytest.approx(expected.target.visibility, abs=VISIBILITY_TOLERANCE)
+            assert meta.target.visible == expected.target.visible
+            visibilities.append(meta.target.visibility)
+            differing = {"visibility": 0.0, "num_pixels": 0}
+            assert meta.model_copy(update={"target": meta.target.model_copy(update=differing)}) == expected.model_copy(
+                update={"target": expected.target.model_copy(update=differing)}
+            )
+            if expected.target.visibility > 0.5:  # not hidden but for a piece
+                px_per_m = expected.camera.focal_length_px / expected.target.depth_m
+                _same_person(read_instance(flight.frame_folder(i))[1], read_instance(there)[1], px_per_m)
+    assert min(visibilities) < 0.2
+    assert max(visibilities) == 1.0
+
+
+def _same_person(ids: np.ndarray, expected: np.ndarray, px_per_m: float) -> None:
+    """The masks of two figures lie in the same place: middles within 0.15 m, borders within 0.3 m: one bends its knees."""
+    masks = [np.argwhere(image == PERSON_ID) for image in (ids, expected)]
+    np.testing.assert_allclose(masks[0].mean(axis=0), masks[1].mean(axis=0), atol=0.15 * px_per_m)
+    for border in (np.min, np.max):
+        np.testing.assert_allclose(border(masks[0], axis=0), border(masks[1], axis=0), atol=0.3 * px_per_m)
+
+
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyrender", None)
+    with pytest.raises(EnvironmentMissing, match=r'pip install "cosfly\[pyrender\]"'):
+        open_renderer("pyrender", street(), *SIZE)

@@ -18,6 +18,8 @@ from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 
+DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU
+
 NEAR_M, FAR_M = 0.3, 1000.0  # clip planes (sec:step5)
 
 # Instance ids of the 16 bits that instance.png has: 0 is nobody (sky, ground plane).

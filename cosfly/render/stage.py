@@ -32,7 +32,10 @@ from cosfly.store import CHECKSUMS, atomic_folder, write_json
 
 log = logging.getLogger(__name__)
 
-RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer"}
+RENDERERS = {
+    "gl": "cosfly.render.gl.backend:GlRenderer",
+    "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer",
+}
 VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
 IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 
@@ -40,7 +43,10 @@ IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 class RenderConfig(Config):
     """Camera, tracks and files of the frames."""
 
-    backend: Literal["gl"] = Field("gl", description="renderer; gl is OpenGL without a window, on a GPU or the CPU")
+    backend: Literal["gl", "pyrender"] = Field(
+        "gl",
+        description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow cross-check",
+    )
     width_px: int = Field(1280, ge=16, le=8192, description="image width, px")
     height_px: int = Field(720, ge=16, le=8192, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(

@@ -16,7 +16,7 @@ from cosfly.errors import EnvironmentMissing
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedPerson, check_pose
+from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import Body, make_body
@@ -25,7 +25,6 @@ from cosfly.render.gl.scene import Scene, build_scene
 
 log = logging.getLogger(__name__)
 
-DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
 SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house

@@ -1,0 +1,213 @@
+"""The second renderer, a cross-check of the default one: plain boxes and a plain figure through trimesh and pyrender (EGL).
+
+Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is drawn three
+times in pyrender's segmentation mode, with our own two shaders: tags, colours, and the float32 bits of the depth. The depth
+that pyrender itself gives comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cosfly.errors import EnvironmentMissing
+from cosfly.geometry import rotation_matrices, rotation_matrix
+from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import SKY_DEPTH_M, Look
+from cosfly.products.kinds import KINDS
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.render.contract import (  # fmt: skip
+    DEBIAN_PACKAGES,
+    FAR_M,
+    LAYER_STEP,
+    NEAR_M,
+    NO_INSTANCE,
+    PERSON_ID,
+    STANDING_LAYER,
+    Frame,
+    PosedPerson,
+    check_pose,
+    ground_plane,
+    instance_ids,
+    layers_of,
+    scene_origin,
+)
+
+SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
+AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
+PLAIN_COLOR = (0.42, 0.40, 0.37)
+COLORS = {
+    "Roads": (0.11, 0.11, 0.115), "Sidewalks": (0.36, 0.345, 0.32), "Buildings": (0.50, 0.38, 0.29), "Vegetation": (0.09, 0.165, 0.04),
+    "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16), "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63),
+    "Car": (0.30, 0.05, 0.05), "Truck": (0.05, 0.10, 0.26), "Bus": (0.62, 0.44, 0.05), "Poles": (0.18, 0.18, 0.19),
+}  # fmt: skip
+
+HIP_Z_M, SHOULDER_Z_M, LEG_SWING_RAD, ARM_SWING_RAD = 0.90, 1.42, 0.25, 0.38  # heights over the feet
+
+
+def _open_screen(width_px: int, height_px: int) -> Any:
+    """Load pyrender and open its context without a window.
+
+    Raises:
+        EnvironmentMissing: a package of the extra or EGL is not there.
+    """
+    os.environ["PYOPENGL_PLATFORM"] = "egl"  # read by the first import of OpenGL
+    np.infty = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 uses the name that NumPy 2 dropped
+    try:
+        import pyrender
+        import trimesh  # noqa: F401
+        from pyrender.shader_program import ShaderProgramCache
+    except ImportError as error:
+        raise EnvironmentMissing(
+            "the renderer pyrender is not installed", got=str(error), fix='pip install "cosfly[pyrender]"'
+        ) from None
+    try:
+        screen = pyrender.OffscreenRenderer(width_px, height_px)
+    except Exception as error:  # PyOpenGL raises its own, pyrender's platforms bare assertions
+        raise EnvironmentMissing(
+            "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {DEBIAN_PACKAGES}"
+        ) from None
+    screen._renderer._program_cache = ShaderProgramCache(str(Path(__file__).parent / "pyrender_shaders"))
+    _keep_display(screen._platform)
+    return screen
+
+
+def _keep_display(platform: Any) -> None:
+    """Let closing end this context alone: pyrender would terminate the display, which all contexts of the process share."""
+    from OpenGL.EGL import eglDestroyContext
+
+    platform.delete_context = lambda: eglDestroyContext(platform._egl_display, platform._egl_context)
+
+
+class PyrenderRenderer:
+    """Draws a map as plain boxes. Positions on the device are relative to the map's middle."""
+
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
+        self._screen, self._look = _open_screen(width_px, height_px), look
+        import pyrender
+        from OpenGL.GL import GL_RENDERER, glGetString
+
+        self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
+        self._origin = scene_origin(box_map)
+        self._scene = pyrender.Scene()
+        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin)))
+
+    def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
+        """Nothing holds for a flight alone: there are no shadows."""
+
+    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+        """Draw one frame, as the contract says."""
+        check_pose(camera_pose, intrinsic)
+        import pyrender
+
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera looks along -z, y up
+        pose = camera_pose @ flip
+        pose[:3, 3] -= self._origin
+        lens = [intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]]
+        added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
+        if person is not None:
+            added.append(self._scene.add(self._mesh(*_figure(person, self._origin))))
+        tags, colors, bits = (self._draw(red) for red in (255, 128, 0))
+        for node in added:
+            self._scene.remove_node(node)
+        return self._frame(tags, colors, bits)
+
+    def close(self) -> None:
+        self._screen.delete()
+
+    def _draw(self, red: int) -> np.ndarray:
+        """One picture of the scene, (h, w, 4) uint8; red chooses it, see the fragment shader."""
+        from pyrender import RenderFlags
+
+        nodes = dict.fromkeys(self._scene.mesh_nodes, (red, 0, 0))
+        image, _ = self._screen.render(self._scene, RenderFlags.SEG | RenderFlags.RGBA, nodes)
+        return np.ascontiguousarray(image)
+
+    def _frame(self, tags: np.ndarray, colors: np.ndarray, bits: np.ndarray) -> Frame:
+        is_sky = tags[..., 3] > 0
+        depth = np.where(is_sky, np.float32(SKY_DEPTH_M), bits.view("<f4")[..., 0])
+        kinds = np.where(is_sky, np.uint8(KINDS["Sky"]), tags[..., 0])
+        ids = np.where(is_sky, np.uint16(NO_INSTANCE), tags[..., 1] | tags[..., 2].astype(np.uint16) << 8)
+        clear = np.where(is_sky, 0.0, np.exp(-depth / self._look.haze_m)).astype(np.float32)[..., None]
+        sky = _as_byte(SKY_COLOR * self._look.exposure).astype(np.float32)
+        return Frame(cv2.convertScaleAbs(sky + clear * (colors[..., :3] - sky)), depth, kinds, ids)
+
+    def _mesh(self, triangles: np.ndarray, colors: np.ndarray, tags: np.ndarray) -> Any:
+        """Make a mesh of triangles (k, 3, 3) with linear RGB (k, 3) and tags (k, 4): the sun's light is baked in."""
+        import pyrender
+
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        sun = np.maximum(normals @ self._look.sun_direction(), 0.0)[:, None]
+        lit = _as_byte(colors * (AMBIENT + (1.0 - AMBIENT) * sun) * 1.6 * self._look.exposure) / 255.0
+        paint = np.column_stack([lit, np.ones(len(lit))])
+        corners = {"tangents": np.repeat(tags, 3, axis=0), "color_0": np.repeat(paint, 3, axis=0)}
+        return pyrender.Mesh([pyrender.Primitive(triangles.reshape(-1, 3), **corners)])
+
+
+def _as_byte(linear: np.ndarray) -> np.ndarray:
+    return np.round(255.0 * np.clip(linear, 0.0, 1.0) ** (1.0 / 2.2))
+
+
+def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
+    """What the vertex shader is given of kind, id and layer, (n, 4) float."""
+    ids = ids.astype(np.int64)
+    return np.column_stack([kinds, ids & 255, ids >> 8, LAYER_STEP * layers]).astype(np.float32)
+
+
+def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, colours and tags of every box and of the ground plane."""
+    import trimesh
+
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    center, half = ground_plane(box_map)
+    centers = np.vstack([box_map.centers, center]) - origin
+    halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
+    turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
+    kinds = np.append(box_map.kinds, KINDS["Terrain"])
+    corners = np.einsum("nij,nvj->nvi", turns, halves[:, None] * box.vertices) + centers[:, None]
+    table = np.tile(PLAIN_COLOR, (256, 1))
+    table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
+    tags = _tags(kinds, np.append(instance_ids(box_map).ids, NO_INSTANCE), np.append(layers_of(box_map), 0))
+    num_faces = len(box.faces)
+    triangles = corners[:, box.faces].reshape(-1, 3, 3)
+    return triangles, np.repeat(table[kinds], num_faces, axis=0), np.repeat(tags, num_faces, axis=0)
+
+
+def _figure(person: PosedPerson, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, colours and tags of a person of cylinders with a round head; x is forward and the feet are at 0."""
+    import trimesh
+
+    trunk = _rod((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), 0.19).apply_scale((0.65, 1.0, 1.0))  # flatter than wide
+    solids = [trunk, _rod((0.0, 0.0, 1.46), (0.02, 0.0, 1.60), 0.055)]
+    colors = [person.clothes.shirt, person.clothes.skin]
+    head = trimesh.creation.icosphere(subdivisions=2, radius=0.115)
+    solids.append(head.apply_translation((0.02, 0.0, 1.68)))
+    colors.append(person.clothes.hair)
+    for side, phase in ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi)):
+        stride = person.swing * np.sin(phase)
+        solids.append(_hanging(0.09 * side, HIP_Z_M, 0.88, LEG_SWING_RAD * stride, 0.075))
+        solids.append(_hanging(0.22 * side, SHOULDER_Z_M, 0.58, -ARM_SWING_RAD * stride, 0.055))
+        colors += [person.clothes.trousers, person.clothes.shirt]
+    turn = rotation_matrix(0.0, person.heading_rad, 0.0)
+    feet = person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M] - origin
+    triangles = np.concatenate([solid.triangles for solid in solids]) @ turn.T + feet
+    painted = np.concatenate([np.tile(color, (len(s.faces), 1)) for s, color in zip(solids, colors, strict=True)])
+    tag = _tags(np.array([KINDS["Pedestrians"]]), np.array([PERSON_ID]), np.array([STANDING_LAYER]))
+    return triangles, painted, np.repeat(tag, len(triangles), axis=0)
+
+
+def _hanging(y: float, z: float, length: float, angle_rad: float, radius: float) -> Any:
+    """A limb that hangs from a joint at the person's middle, turned forward by an angle."""
+    end = (length * np.sin(angle_rad), y, z - length * np.cos(angle_rad))
+    return _rod((0.0, y, z), end, radius)
+
+
+def _rod(low: tuple[float, float, float], high: tuple[float, float, float], radius: float) -> Any:
+    import trimesh
+
+    return trimesh.creation.cylinder(radius, sections=12, segment=[low, high])
