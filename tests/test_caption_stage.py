@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 
 import pytest
@@ -79,34 +74,6 @@ def test_another_seed_changes_the_wording_only(tree, done, tmp_path):
     assert [c.label for c in other] == [c.label for c in base]
     assert [c.en.flight_decision for c in other] == [c.en.flight_decision for c in base]
     assert [c.en.critical_components for c in other] != [c.en.critical_components for c in base]
-
-
-SCRIPT = """
-import sys
-from pathlib import Path
-import caption.run.stage as stage
-from caption.schema import CaptionConfig
-plain = stage.write_captions
-def slow(path, captions):
-    import time
-    time.sleep(0.3)
-    return plain(path, captions)
-stage.write_captions = slow
-stage.run(CaptionConfig(), Path(sys.argv[1]), Path(sys.argv[2]))
-"""
-
-
-def test_kill_9_and_resume_give_the_same_bytes(tree, done, tmp_path):
-    out = tmp_path / "out"
-    child = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tree), str(out)])
-    deadline_s = time.monotonic() + 60
-    while len(list(out.glob("parts/*.jsonl"))) < 2 and child.poll() is None and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    os.kill(child.pid, signal.SIGKILL)
-    child.wait()
-    assert not (out / "manifest.json").exists()
-    assert 2 <= len(list(out.glob("parts/*.jsonl"))) < 6
-    assert run(CaptionConfig(), tree, out).read_bytes() == (done / "captions.jsonl").read_bytes()
 
 
 def test_a_complete_folder_is_not_touched_again(tree, done):

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -340,37 +335,6 @@ def test_same_bytes_with_one_and_two_workers(workplace):
     inspect(workplace, out="two", workers=2)
     for name in ("inspect.json", "report.html"):
         assert (workplace / "one" / name).read_bytes() == (workplace / "two" / name).read_bytes()
-
-
-KILLED = """
-import sys, time
-from pathlib import Path
-from cosfly.inspection import stage as qc
-root = Path(sys.argv[1])
-slow, original = float(sys.argv[2]), qc.inspect_flight
-def delayed(*args):
-    time.sleep(slow)
-    return original(*args)
-qc.inspect_flight = delayed
-cfg = qc.InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
-qc.run(cfg, root / "drone_trace.json", root / "tree", root / "killed")
-"""
-
-
-def test_kill_and_resume_gives_the_same_bytes(workplace):
-    journal = workplace / "killed" / "items.jsonl"
-    child = subprocess.Popen([sys.executable, "-c", KILLED, str(workplace), "0.5"])
-    deadline = time.monotonic() + 60
-    while not (journal.exists() and journal.read_bytes().count(b"\n") >= 1) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    os.kill(child.pid, signal.SIGKILL)
-    child.wait()
-    assert not (workplace / "killed" / "inspect.json").exists()
-    assert journal.read_bytes().count(b"\n") >= 1
-    inspect(workplace, out="killed")
-    inspect(workplace, out="calm")
-    for name in ("inspect.json", "report.html"):
-        assert (workplace / "killed" / name).read_bytes() == (workplace / "calm" / name).read_bytes()
 
 
 def test_the_page_stands_alone_and_shows_every_flight(workplace):

@@ -1,9 +1,4 @@
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -15,7 +10,6 @@ from cosfly.config import build
 from cosfly.errors import ConfigError, CosflyError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
 from cosfly.grid import OccupancyGrid
-from cosfly.journal import Journal
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
@@ -348,28 +342,6 @@ def test_fewer_paths_are_the_first_of_more(map_file, tmp_path):
     few = read_paths(run(PedestriansConfig(num_paths=2), map_file, tmp_path / "few"))
     more = read_paths(run(PedestriansConfig(num_paths=4), map_file, tmp_path / "more"))
     assert [p.as_json() for p in few] == [p.as_json() for p in more[:2]]
-
-
-def test_killed_and_resumed_gives_the_same_bytes(map_file, tmp_path):
-    program = (
-        "import sys; from pathlib import Path; from cosfly.pedestrians.stage import PedestriansConfig, run\n"
-        "run(PedestriansConfig(num_paths=250), Path(sys.argv[1]), Path(sys.argv[2]))"
-    )
-    victim = subprocess.Popen([sys.executable, "-c", program, str(map_file), str(tmp_path / "killed")])
-    journal = tmp_path / "killed" / "items.jsonl"
-    deadline_s = time.monotonic() + 60
-    while time.monotonic() < deadline_s and not (journal.exists() and journal.stat().st_size > 20_000):
-        time.sleep(0.001)
-    os.kill(victim.pid, signal.SIGKILL)
-    victim.wait()
-    assert not (tmp_path / "killed" / "manifest.json").exists(), "the run ended before it was killed"
-    num_before = len(list(Journal(journal).read()))
-    assert 0 < num_before < 250
-    cfg = PedestriansConfig(num_paths=250)
-    run(cfg, map_file, tmp_path / "killed")
-    run(cfg, map_file, tmp_path / "whole")
-    assert products(tmp_path / "killed") == products(tmp_path / "whole")
-    assert len(list(Journal(journal).read())) == 250  # what was finished was not done again
 
 
 def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):

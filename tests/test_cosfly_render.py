@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import textwrap
-import time
 from pathlib import Path
 
 import numpy as np
@@ -483,36 +477,6 @@ def test_two_workers_give_the_same_files(finished, tmp_path):
     tree, inputs = finished
     again = run(build(RenderConfig, SMALL, "test"), *inputs, tmp_path / "out", seed=5, workers=2)
     assert files_of(again) == files_of(tree)
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from cosfly.config import build
-from cosfly.render.stage import RenderConfig, run
-inputs = [Path(p) for p in sys.argv[1:4]]
-if __name__ == "__main__":
-    run(build(RenderConfig, {config!r}, "test"), *inputs, Path(sys.argv[4]), seed=5)
-"""
-
-
-@needs_gl
-def test_kill_and_resume_gives_the_same_files(finished, tmp_path):
-    tree, inputs = finished
-    script = tmp_path / "stage.py"
-    script.write_text(textwrap.dedent(KILLED.format(config=SMALL)))
-    out = tmp_path / "out"
-    process = subprocess.Popen([sys.executable, str(script), *map(str, inputs), str(out)])
-    first, deadline_s = out / "Street/trajectory_1776000000/ORI", time.monotonic() + 60
-    while not first.exists() and time.monotonic() < deadline_s:
-        time.sleep(0.005)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert first.exists()
-    assert not (out / "manifest.json").exists(), "the kill came too late to show anything"
-    run(build(RenderConfig, SMALL, "test"), *inputs, out, seed=5)
-    assert files_of(out) == files_of(tree)
-    assert not list(out.rglob(".*.partial"))
 
 
 @needs_gl

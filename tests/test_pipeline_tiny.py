@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ import pytest
 from cosfly import pipeline
 from cosfly.config import load
 from cosfly.errors import ResumeError
+from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.settings import RunConfig
@@ -20,10 +20,12 @@ from cosfly.store import read_json
 
 TINY = [
     "pedestrians.num_paths=2",
+    "pedestrians.min_distance_m=15",
+    "pedestrians.max_distance_m=25",
     "render.width_px=160",
     "render.height_px=90",
     "render.fovs_deg=[60]",
-    "caption.window.stride=8",
+    "caption.window.stride=4",
     "workers=1",
 ]
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
@@ -104,15 +106,17 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
     assert products(out / stage) == products(base / stage)
 
 
-# Kills the process at the n-th time that a file or a line is made safe after the stage was opened.
+# The moments of a kill: as the n-th file or line is made safe after the stage was opened, or as an item is done and not yet in
+# the journal while another is.
 KILLED = """
 import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import test_pipeline_tiny as tiny
+from cosfly.journal import Journal
 from cosfly.stage_folder import StageFolder
 
-left = {countdown}
+what, left = {what!r}, {count}
 def deadly(function):
     def wrapped(*args, **kwargs):
         global left
@@ -122,10 +126,19 @@ def deadly(function):
         return function(*args, **kwargs)
     return wrapped
 
+append = Journal.append
+def append_second(journal, record, **kwargs):
+    if journal.path.name == "items.jsonl" and journal.path.exists() and journal.path.stat().st_size:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return append(journal, record, **kwargs)
+
 opened = StageFolder.open.__func__
 def open_then_arm(cls, *args, **kwargs):
     stage = opened(cls, *args, **kwargs)
-    os.replace, os.fsync = deadly(os.replace), deadly(os.fsync)
+    if what == "file":
+        os.replace, os.fsync = deadly(os.replace), deadly(os.fsync)
+    else:
+        Journal.append = append_second
     return stage
 StageFolder.open = classmethod(open_then_arm)
 tiny.work(tiny.tiny(), Path({out!r}), {stage!r})
@@ -133,23 +146,34 @@ print("SURVIVED")
 """
 
 
+def kill(out: Path, stage: str, what: str, count: int = 0) -> None:
+    program = KILLED.format(tests=str(Path(__file__).parent), what=what, count=count, out=str(out), stage=stage)
+    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
+    assert not (out / stage / "manifest.json").exists()
+
+
+def finished_items(folder: Path) -> list[str]:
+    return [record["id"] for record in Journal(folder / "items.jsonl").read()]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("countdown", [1, 4])
 @pytest.mark.parametrize("stage", STAGES)
-def test_kill_in_the_middle_and_resume(base, tmp_path, stage, countdown):
-    """The products of a killed and resumed stage are those of an undisturbed one, byte for byte.
+def test_kill_again_and_again_and_resume(base, tmp_path, stage):
+    """The products of a killed and resumed stage are those of an undisturbed one, byte for byte, and nothing is done twice.
 
     Frames too: the renderer gives the same bytes in every process of one machine.
     """
     out = begin(base, tmp_path / "run", stage)
-    program = KILLED.format(tests=str(Path(__file__).parent), countdown=countdown, out=str(out), stage=stage)
-    killed = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=False
-    )
-    assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
-    assert not (out / stage / "manifest.json").exists()
+    kill(out, stage, "file", 1)
+    if stage not in ("maps", "simplify"):  # what is done item by item
+        kill(out, stage, "item")
+        assert 0 < len(finished_items(out / stage)) < len(finished_items(base / stage))
+        assert stage == "render" or not any((out / stage / name).exists() for name in products(base / stage))
+    kill(out, stage, "file", 4)
     work(tiny(), out, stage)
     assert products(out / stage) == products(base / stage)
+    assert sorted(finished_items(out / stage)) == sorted(finished_items(base / stage))
     assert not list(out.rglob("*.partial"))
 
 

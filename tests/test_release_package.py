@@ -7,10 +7,6 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -291,35 +287,6 @@ def test_a_second_run_has_nothing_to_do(inputs, built):
     assert build(inputs, built.parent) == built
     assert {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")} == before
     assert not (built.parent / "parts").exists()
-
-
-KILLED = """
-import sys, time
-from pathlib import Path
-import release.package as package
-original = package.write_part
-def delayed(*args):
-    result = original(*args)
-    time.sleep(0.5)
-    return result
-package.write_part = delayed
-root, out = Path(sys.argv[1]), Path(sys.argv[2])
-cfg = package.ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.")
-package.run(cfg, root / "tree", root / "captions.jsonl", root / "inspect.json", out)
-"""
-
-
-def test_kill_and_resume_gives_the_same_bytes(inputs, built, tmp_path):
-    journal = tmp_path / "killed" / "items.jsonl"
-    child = subprocess.Popen([sys.executable, "-c", KILLED, str(inputs), str(tmp_path / "killed")])
-    deadline = time.monotonic() + 60
-    while not (journal.exists() and journal.read_bytes().count(b"\n") >= 2) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    os.kill(child.pid, signal.SIGKILL)
-    child.wait()
-    assert journal.read_bytes().count(b"\n") >= 2
-    assert not (tmp_path / "killed" / "dataset").exists()
-    assert all_bytes(build(inputs, tmp_path / "killed")) == all_bytes(built)
 
 
 @pytest.mark.parametrize(("name", "left"), [("depth.npy", None), ("depth.npy", 300), ("rgb.png", 500)])
