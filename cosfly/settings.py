@@ -12,7 +12,7 @@ from cosfly.config import Config
 from cosfly.inspection.stage import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.stage import PedestriansConfig
-from cosfly.planners.stage import PlanConfig
+from cosfly.planners.contract import PlanConfig
 from cosfly.render.stage import RenderConfig
 from cosfly.simplify.stage import SimplifyConfig
 from distill.dataset import PrepareConfig

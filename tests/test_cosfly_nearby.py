@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
 
 from cosfly import kernels
-from cosfly.planners import loss, muco, nearby, start, step
-from cosfly.planners.stage import PlanConfig, Scenario
+from cosfly.planners import behind
+from cosfly.planners.contract import PlanConfig, Scenario
+from cosfly.planners.muco import loss, muco, nearby, step
 
 
 def random_boxes(rng, count, size_m=40.0):
@@ -84,7 +85,7 @@ def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
     )
     targets = np.column_stack([np.linspace(-30, 30, 80), np.full(80, 2.0), np.full(80, 1.0)])
     scenario = Scenario("w", targets, 0.0)
-    headings = start.smoothed_headings(targets, 4.0)
+    headings = behind.smoothed_headings(targets, 4.0)
     problem = muco.make_problem(scenario, headings, cfg)
     first, _ = muco.start_trajectory(scenario, headings, problem, obstacles, cfg)
     points, solver = muco.optimize(first, problem, obstacles, cfg.muco)

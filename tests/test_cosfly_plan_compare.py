@@ -8,13 +8,13 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from test_cosfly_planners import CANYON, town_of, walk_along
+from specimens_planning import CANYON, town_of, walk_along
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import NoPathError, NothingKept
 from cosfly.planners import compare, compare_plots
-from cosfly.planners.stage import PlanConfig
+from cosfly.planners.contract import PlanConfig
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
@@ -148,7 +148,7 @@ def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkey
     code = (
         "import os, pathlib, signal, sys\n"
         "from cosfly.planners import compare\n"
-        "from cosfly.planners.stage import PlanConfig\n"
+        "from cosfly.planners.contract import PlanConfig\n"
         "real = compare.plan_flight\n"
         "def deadly(walk, *rest):\n"
         "    if walk.path_id == 'b': os.kill(os.getpid(), signal.SIGKILL)\n"

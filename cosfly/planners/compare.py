@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import NoPathError
-from cosfly.planners.stage import PLANNERS, PlanConfig, _check_ids, _warm_up, plan_flight
+from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
@@ -139,7 +140,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     obstacles = obstacle_index(read_boxes(simplified_map))
     settings = {name: cfg.model_copy(update={"planner": name}) for name in (FIRST, SECOND)}
     for planner in settings.values():
-        _warm_up(planner)
+        warm_up(planner)
 
     def work(item: Item) -> Outcome:
         flights: dict[str, dict] = {}
@@ -188,7 +189,7 @@ def run(
     if stage.is_complete:
         return product
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
-    _check_ids(walks, paths)
+    check_ids(walks, paths)
     items = [Item(walk.path_id, walk) for walk in walks]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
     shared = finished.kept

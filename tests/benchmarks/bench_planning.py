@@ -17,9 +17,11 @@ from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
-from cosfly.planners import muco, start
-from cosfly.planners.loss import evaluate, make_state
-from cosfly.planners.stage import PLANNERS, PlanConfig, Scenario, load_planner, make_scenario
+from cosfly.planners import behind
+from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
+from cosfly.planners.muco import muco
+from cosfly.planners.muco.loss import evaluate, make_state
+from cosfly.planners.stage import make_scenario
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
 
@@ -133,7 +135,7 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     """
     rows, without_rule = [], cfg.muco.model_copy(update={"low_visibility_frames": 1_000_000})
     for scenario in scene.scenarios:
-        headings = start.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
+        headings = behind.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
         problem = muco.make_problem(scenario, headings, cfg)
         first, _ = muco.start_trajectory(scenario, headings, problem, scene.obstacles, cfg)
         ms, (_, solver) = scenes.cpu_ms(lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule))

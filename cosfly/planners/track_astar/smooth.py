@@ -19,7 +19,7 @@ from cosfly.geometry import DT_S
 from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, signed_distances, visibility
 
 if TYPE_CHECKING:
-    from cosfly.planners.stage import PlanConfig, TrackAStarConfig
+    from cosfly.planners.contract import PlanConfig, TrackAStarConfig
 
 ROUNDING_M = 1e-9
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box, window_rays
-from cosfly.planners.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
+from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 
 TERM_NAMES = (
     "tracking",

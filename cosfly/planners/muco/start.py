@@ -8,7 +8,6 @@ reached from each other: dynamic programming over time, places on rings round th
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from cosfly.compiled import njit
 from cosfly.geometry import DT_S
@@ -27,30 +26,6 @@ TURN_COST = 0.5  # looking at the walker's face instead of the back
 CLIMB_COST = 0.6  # each preferred altitude more
 STEEP_COST = 0.1  # a ring other than the normal one
 MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
-
-
-def smoothed_headings(targets_m: np.ndarray, smoothing_s: float) -> np.ndarray:
-    """Walking direction of each point, radians, continuous, smoothed over time by a Gaussian.
-
-    Args:
-        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0 takes the direction as it is.
-    Returns:
-        (n,). A walker who stands keeps the direction before; one who never moves faces east.
-    """
-    steps = np.diff(targets_m[:, :2], axis=0)
-    moves = np.flatnonzero(np.hypot(steps[:, 0], steps[:, 1]) > 1e-6)
-    if len(moves) == 0:
-        return np.zeros(len(targets_m))
-    yaws = np.unwrap(np.arctan2(steps[moves, 1], steps[moves, 0]))
-    before = np.searchsorted(moves, np.arange(len(targets_m)), side="right") - 1
-    yaws = yaws[np.maximum(before, 0)]
-    return gaussian_filter1d(yaws, smoothing_s / DT_S, mode="nearest") if smoothing_s > 0 else yaws
-
-
-def behind(targets_m: np.ndarray, headings_rad: np.ndarray, distance_m: float, altitude_m: float) -> np.ndarray:
-    """Give the places `distance_m` behind the target, (n, 3), at the world altitude `altitude_m`."""
-    back = -distance_m * np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=1)
-    return np.column_stack([targets_m[:, :2] + back, np.full(len(targets_m), altitude_m)])
 
 
 def search_start(

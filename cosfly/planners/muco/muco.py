@@ -13,11 +13,12 @@ from scipy.ndimage import gaussian_filter1d
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, visibility
-from cosfly.planners.loss import TERM_NAMES, Problem, make_state
-from cosfly.planners.nearby import nothing_nearby
-from cosfly.planners.stage import MucoConfig, Plan, PlanConfig, Scenario
-from cosfly.planners.start import behind, search_start, smoothed_headings
-from cosfly.planners.step import STOP_REASONS, Rules, descend, is_feasible, project
+from cosfly.planners.behind import behind, smoothed_headings
+from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
+from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
+from cosfly.planners.muco.nearby import nothing_nearby
+from cosfly.planners.muco.start import search_start
+from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, is_feasible, project
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:

@@ -13,8 +13,8 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.kernels import collect_hits, nearest_box, normal_of_box
-from cosfly.planners.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
-from cosfly.planners.nearby import known, nearest_among, nearest_of, nothing_nearby
+from cosfly.planners.muco.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
+from cosfly.planners.muco.nearby import known, nearest_among, nearest_of, nothing_nearby
 
 TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
 REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere

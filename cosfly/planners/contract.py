@@ -1,0 +1,182 @@
+"""What a planner is: what it gets, what it gives, and what it must keep. All settings of step 4 stand here.
+
+A planner is one function, named in PLANNERS, with the signature
+
+    plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan
+
+It gives one drone position for each target position, keeps to the shared settings (tab:drone_params), draws chance from `rng` only,
+and raises NoPathError where it finds nothing. `tests/test_planners_contract.py` holds every entry of PLANNERS to that.
+Compiled code is imported by the planners alone: settings are read without it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from cosfly.config import Config
+from cosfly.errors import nearest
+from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3
+
+if TYPE_CHECKING:
+    from cosfly.kernels import BoxIndex
+
+# In the order of comparisons: deltas and win rates are the first's against each other one.
+PLANNERS = {
+    "track_astar": "cosfly.planners.track_astar.track_astar:plan",
+    "muco": "cosfly.planners.muco.muco:plan",
+}
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+class MucoConfig(Config):
+    """Settings of the MuCO optimiser (subsec:appendix_planner_muco)."""
+
+    track_distance_m: float = Field(28.0, gt=0, description="wanted distance to the target, m")
+    weight_tracking: float = Field(2.0, ge=0, description="weight of (distance - track_distance_m)^2")
+    weight_smoothness: float = Field(4.0, ge=0, description="weight of the squared second difference")
+    weight_jerk: float = Field(3.0, ge=0, description="weight of the squared third difference")
+    weight_safety: float = Field(2.0, ge=0, description="weight of half the squared intrusion into influence_m")
+    weight_visibility: float = Field(2.0, ge=0, description="weight of (1 - five-ray visibility)^2")
+    weight_view_angle: float = Field(1.0, ge=0, description="weight of squared pitch and azimuth deviation, per rad^2")
+    weight_path_length: float = Field(2.0, ge=0, description="weight of a tenth of the path length")
+    weight_below: float = Field(50.0, ge=0, description="weight of squared altitude below altitude_min_m")
+    weight_above: float = Field(20.0, ge=0, description="weight of squared altitude above altitude_preferred_m")
+    weight_oscillation: float = Field(8.0, ge=0, description="weight of the squared change of altitude per step")
+    weight_pitch: float = Field(
+        20.0, ge=0, description="weight of squared pitch outside pitch_band_deg, per rad^2 (the paper names none)"
+    )
+    influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
+    pitch_deg: float = Field(45.0, gt=0, lt=90, description="wanted downward pitch of the camera, degrees")
+    pitch_band_deg: tuple[float, float] = Field(
+        (30.0, 60.0), description="pitch outside this band costs extra, degrees"
+    )
+    low_visibility: float = Field(0.3, ge=0, le=1, description="visibility below this is low")
+    low_visibility_frames: int = Field(
+        20, ge=1, description="so many low frames in a row take visibility and view angle out of the gradient"
+    )
+    step: Literal["newton", "paper"] = Field(
+        "newton", description="newton: band-matrix step, halved until the loss falls; paper: plain step, may overshoot"
+    )
+    gradient: Literal["analytic", "finite_difference"] = Field(
+        "analytic", description="of all terms but visibility, whose gradient is always a difference"
+    )
+    difference_m: float = Field(0.5, gt=0, description="half width of the difference window, m")
+    learning_rate: float = Field(0.05, gt=0, description="of the paper's step; the newton step has none")
+    step_cap_m: float = Field(0.5, gt=0, description="longest move of a waypoint in one iteration, m")
+    iterations_max: int = Field(1500, ge=0, description="iterations at most")
+    tolerance: float = Field(1e-5, gt=0, description="converged when the loss changes by less than this part of it")
+    pushes_max: int = Field(10, ge=1, description="pushes out of obstacles per waypoint and projection, at most")
+    start_visibility: float = Field(
+        0.95,
+        ge=0,
+        le=1,
+        description="search for a better start when flying plainly behind sees less than this; 0: never",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> MucoConfig:
+        low, high = self.pitch_band_deg
+        if not 0 <= low < high <= 90:
+            raise ValueError("pitch_band_deg must be two angles from 0 to 90, the lower one first")
+        return self
+
+
+class TrackAStarConfig(Config):
+    """Settings of TA*+Smooth (subsec:appendix_planner_tastar); what the terms are stands in track_astar.py."""
+
+    voxel_m: float = Field(4.0, gt=0, description="voxel size in the plane, m")
+    voxel_height_m: float = Field(4.0, gt=0, description="voxel height, m")
+    corridor_m: float = Field(45.0, gt=0, description="horizontal margin of the grid round the walk, m")
+    beam: int = Field(2048, ge=1, description="places kept per time layer")
+    weight_tracking: float = Field(2.0, ge=0, description="weight of the distance to the preferred ring, in voxels")
+    weight_visibility: float = Field(18.0, ge=0, description="weight of the blocked part of the five rays")
+    weight_path: float = Field(1.0, ge=0, description="weight of the way, in voxels")
+    weight_safety: float = Field(8.0, ge=0, description="weight of the squared intrusion into influence_m")
+    weight_smoothness: float = Field(0.15, ge=0, description="weight of the squared change of the move, in voxels")
+    influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
+    shortcut_frames: int = Field(12, ge=0, description="longest run replaced by a straight line, frames; 0: none")
+    elastic_iterations: int = Field(30, ge=0, description="iterations of the elastic band at most; 0: none")
+    elastic_step: float = Field(0.35, gt=0, le=1, description="step towards the middle of the neighbours")
+    elastic_step_min: float = Field(0.02, gt=0, le=1, description="a step that is not valid is halved down to this")
+    anchor_visibility: float = Field(0.999, ge=0, le=1, description="visibility above this counts as full")
+    visibility_loss_point: float = Field(0.05, ge=0, le=1, description="visibility that one change may cost a frame")
+    visibility_loss_frame: float = Field(0.10, ge=0, le=1, description="visibility that smoothing may cost a frame")
+    visibility_loss_mean: float = Field(0.05, ge=0, le=1, description="mean visibility that smoothing may cost")
+
+
+class PlanConfig(Config):
+    """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walk."""
+
+    planner: str = Field("muco", description="which planner flies: a name in PLANNERS")
+    safety_distance_m: float = Field(3.0, gt=0, description="nominal distance to obstacles, m")
+    relaxed_safety_m: float = Field(2.5, gt=0, description="distance that must be kept where the nominal one cannot, m")
+    altitude_min_m: float = Field(20.0, gt=0, description="least altitude, m")
+    altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude, m")
+    altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
+    behind_distance_m: float = Field(20.0, gt=0, description="horizontal distance behind the target at the start, m")
+    speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
+    heading_smoothing_s: float = Field(
+        4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
+    )
+    five_ray_mean_min: float = Field(
+        FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a flight whose mean five-ray visibility is below this; 0: never",
+        json_schema_extra={"formerly": "visibility_min"},
+    )  # fmt: skip
+    accel_rms_max_mps2: float = Field(
+        ACCEL_RMS_MAX_MPS2, gt=0, description="drop a flight of greater RMS acceleration, m/s^2"
+    )
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="drop a flight of greater RMS jerk, m/s^3")
+    muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
+    track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
+
+    @field_validator("planner")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name not in PLANNERS:
+            raise ValueError(f"there is no such planner{nearest(name, PLANNERS)}; there are {', '.join(PLANNERS)}")
+        return name
+
+    @model_validator(mode="after")
+    def _check(self) -> PlanConfig:
+        if self.relaxed_safety_m > self.safety_distance_m:
+            raise ValueError("relaxed_safety_m may not exceed safety_distance_m")
+        if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
+            raise ValueError("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
+        return self
+
+
+# --- a planner ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What a planner gets to know. targets_m: (n, 3) hip points, n >= 2, DT_S apart. ground_m: height of the ground below."""
+
+    path_id: str
+    targets_m: np.ndarray
+    ground_m: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a planner gives. positions_m: (n, 3), one per target. solver: JSON-able facts, no times (they would differ)."""
+
+    positions_m: np.ndarray
+    solver: dict = field(default_factory=dict)
+
+
+Planner = Callable[[Scenario, "BoxIndex", PlanConfig, np.random.Generator], Plan]
+
+
+def load_planner(name: str) -> Planner:
+    """Import a planner of PLANNERS."""
+    module, _, function = PLANNERS[name].partition(":")
+    return getattr(importlib.import_module(module), function)

@@ -1,0 +1,1 @@
+"""MuCO: one trajectory, optimised as a whole."""

@@ -1,0 +1,1 @@
+"""TA*+Smooth: a search for sight, then smoothing."""

@@ -1,0 +1,164 @@
+"""Who sees the target: what can hide it, sorted by direction once a layer, so that thousands of looks test a few boxes each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cosfly.compiled import njit
+from cosfly.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, _clip, _in_box_frame
+
+NUM_SECTORS = 128  # of the horizon round a target
+
+# Feet of the five rays (RAY_OFFSETS_M): the lowest relative to the hip, and how far to the side.
+FOOT_LOW_M, FOOT_SIDE_M = -0.6, 0.3
+ALL_BLOCKED = 0b11111
+
+
+class Horizon(NamedTuple):
+    """What can hide one target, by direction. m boxes near it.
+
+    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector. near: (m,) m, horizontal distance less the
+    rays' spread. slopes: (m,) a ray that rises more than this per horizontal metre passes above. steepest: (NUM_SECTORS,).
+    """
+
+    boxes: np.ndarray
+    near: np.ndarray
+    slopes: np.ndarray
+    counts: np.ndarray
+    lists: np.ndarray
+    steepest: np.ndarray
+
+
+@njit(cache=True)
+def make_horizon(index, target, reach_m):
+    """Sort the boxes round a target by direction, so that a look from above tests the few that can hide it.
+
+    A ray that starts at height `low` or above and ends d away at p_z has risen to low + (p_z - low) t at the share t of its way,
+    and it is no nearer to a box at horizontal distance r than t = (r - FOOT_SIDE_M) / d.
+    """
+    boxes, near, slopes, spans = _boxes_round(index, target, reach_m)
+    counts = np.zeros(NUM_SECTORS, dtype=np.int64)
+    lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
+    steepest = np.full(NUM_SECTORS, -np.inf)
+    for k in range(len(boxes)):
+        first = int(np.floor(spans[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
+        last = int(np.floor(spans[k, 1] / (2.0 * np.pi) * NUM_SECTORS))
+        for step in range(min(last - first + 1, NUM_SECTORS)):
+            sector = (first + step) % NUM_SECTORS
+            lists[sector, counts[sector]] = k
+            counts[sector] += 1
+            steepest[sector] = max(steepest[sector], slopes[k])
+    return Horizon(boxes, near, slopes, counts, lists, steepest)
+
+
+@njit(cache=True)
+def _boxes_round(index, target, reach_m):
+    """Give the boxes within `reach_m`, their horizontal distance, slope, and span of azimuth (2,), first <= last."""
+    boxes = np.empty(len(index.rows), dtype=np.int64)
+    near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
+    if len(index.rows) == 0:
+        return boxes, near, slopes, spans
+    cell, num_x, num_y = index.grid[2], index.shape[0], index.shape[1]
+    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[0]) / cell)), 0), num_x)
+    last_x = min(int(np.floor((target[0] + reach_m - index.grid[0]) / cell)), num_x - 1)
+    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[1]) / cell)), 0), num_y)
+    last_y = min(int(np.floor((target[1] + reach_m - index.grid[1]) / cell)), num_y - 1)
+    known, low = np.zeros(len(index.rows), dtype=np.bool_), target[2] + FOOT_LOW_M
+    for ix in range(first_x, last_x + 1):
+        for iy in range(first_y, last_y + 1):
+            for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
+                box = index.members[place]
+                if known[box]:
+                    continue
+                known[box] = True
+                rows = index.rows[box]
+                dx = max(rows[15] - target[0], 0.0, target[0] - rows[18])
+                dy = max(rows[16] - target[1], 0.0, target[1] - rows[19])
+                distance = np.sqrt(dx * dx + dy * dy)
+                if distance > reach_m + FOOT_SIDE_M or rows[20] < low:
+                    continue
+                boxes[num], near[num] = box, max(distance - FOOT_SIDE_M, 0.0)
+                slopes[num] = (rows[20] - low) / near[num] if near[num] > 1e-6 else np.inf
+                spans[num, 0], spans[num, 1] = _span(rows, target, distance)
+                num += 1
+    return boxes[:num], near[:num], slopes[:num], spans[:num]
+
+
+@njit(cache=True)
+def _span(rows, target, distance_m):
+    """Give the azimuths under which rays to a target may touch a box: those of its bounds, and the feet's spread."""
+    if distance_m < 1.0:
+        return 0.0, 2.0 * np.pi
+    middle = np.arctan2(0.5 * (rows[16] + rows[19]) - target[1], 0.5 * (rows[15] + rows[18]) - target[0])
+    left, right = 0.0, 0.0
+    for corner in range(4):
+        x, y = rows[15 + 3 * (corner % 2)], rows[16 + 3 * (corner // 2)]
+        turn = np.arctan2(y - target[1], x - target[0]) - middle
+        turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
+        left, right = min(left, turn), max(right, turn)
+    spread = np.arcsin(FOOT_SIDE_M / distance_m) + 1e-9
+    return middle + left - spread, middle + right + spread
+
+
+@njit(cache=True, inline="always")
+def look(index, horizon, target, x, y, z):
+    """Give the five-ray visibility of the horizon's target from a point above it: that of `kernels.visibility`, sooner."""
+    dx, dy = x - target[0], y - target[1]
+    away, rise = np.sqrt(dx * dx + dy * dy), z - target[2] - FOOT_LOW_M
+    sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS
+    # In products, so that straight above needs no division; a box round the target itself is infinitely steep.
+    if horizon.counts[sector] == 0 or rise > horizon.steepest[sector] * away + 1e-9:
+        return 1.0
+    blocked = 0
+    for place in range(horizon.counts[sector]):
+        k = horizon.lists[sector, place]
+        if horizon.near[k] <= away + 1e-9 and not rise > horizon.slopes[k] * away + 1e-9:
+            blocked = _blocked_rays(index.rows, horizon.boxes[k], x, y, z, target, blocked)
+            if blocked == ALL_BLOCKED:
+                break
+    num_free = 5
+    for ray in range(5):
+        num_free -= (blocked >> ray) & 1
+    return num_free / 5.0
+
+
+@njit(cache=True)
+def _blocked_rays(rows, box, x, y, z, target, blocked):
+    """Add to the bits of `blocked` the rays to a target that touch a box: the point and the hip turned into its frame once."""
+    tx, ty, tz = target[0], target[1], target[2]
+    if min(x, tx - FOOT_SIDE_M) > rows[box, 18] or max(x, tx + FOOT_SIDE_M) < rows[box, 15]:
+        return blocked
+    if min(y, ty) > rows[box, 19] or max(y, ty) < rows[box, 16] or tz + FOOT_LOW_M > rows[box, 20]:
+        return blocked
+    u, v, w = _in_box_frame(rows, box, x, y, z)
+    hip_u, hip_v, hip_w = _in_box_frame(rows, box, tx, ty, tz)
+    # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked, deep inside all are.
+    if not _touches(rows, box, hip_u, hip_v, hip_w, u, v, w, RAY_SPREAD_M):
+        return blocked
+    if _touches(rows, box, hip_u, hip_v, hip_w, u, v, w, -RAY_SPREAD_M):
+        return ALL_BLOCKED
+    for ray in range(5):
+        if (blocked >> ray) & 1:
+            continue
+        a, b, c = RAY_OFFSETS_M[ray, 0], RAY_OFFSETS_M[ray, 1], RAY_OFFSETS_M[ray, 2]
+        foot_u = hip_u + rows[box, 6] * a + rows[box, 9] * b + rows[box, 12] * c
+        foot_v = hip_v + rows[box, 7] * a + rows[box, 10] * b + rows[box, 13] * c
+        foot_w = hip_w + rows[box, 8] * a + rows[box, 11] * b + rows[box, 14] * c
+        enter, leave = _clip(foot_u, u - foot_u, rows[box, 3], 0.0, 1.0)
+        enter, leave = _clip(foot_v, v - foot_v, rows[box, 4], enter, leave)
+        enter, leave = _clip(foot_w, w - foot_w, rows[box, 5], enter, leave)
+        if enter <= leave:
+            blocked |= 1 << ray
+    return blocked
+
+
+@njit(cache=True, inline="always")
+def _touches(rows, box, a, b, c, u, v, w, inflate_m):
+    """Tell whether a segment in a box's frame touches the box grown (or shrunk) on every side; a box shrunk away never is."""
+    enter, leave = _clip(a, u - a, rows[box, 3] + inflate_m, 0.0, 1.0)
+    enter, leave = _clip(b, v - b, rows[box, 4] + inflate_m, enter, leave)
+    enter, leave = _clip(c, w - c, rows[box, 5] + inflate_m, enter, leave)
+    least = min(rows[box, 3], rows[box, 4], rows[box, 5]) + inflate_m
+    return enter <= leave and least >= 0.0

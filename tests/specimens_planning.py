@@ -1,0 +1,61 @@
+"""Hand-made worlds for planners, and the check that a flight through them is safe."""
+
+import numpy as np
+
+from cosfly import kernels
+from cosfly.geometry import DT_S
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.stage import make_scenario
+from cosfly.products.boxes import make_box_map
+from cosfly.products.kinds import KINDS
+from cosfly.products.walks import Walk
+
+
+def walk_along(path_id, corners, speed_mps=1.2):
+    """Walk a polyline at constant speed, sampled every DT_S."""
+    corners = np.asarray(corners, dtype=np.float64)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    time_s = np.arange(0, along[-1] / speed_mps, DT_S)
+    xy = np.stack([np.interp(time_s * speed_mps, along, corners[:, k]) for k in (0, 1)], axis=1)
+    positions = np.column_stack([xy, np.zeros(len(xy))])
+    return Walk(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
+
+
+def town_of(*rows):
+    """(centre, half extents[, yaw_deg]) of buildings, on a large ground slab that must not count as an obstacle."""
+    ground = ((0, 0, -0.5), (500, 500, 0.5), 0)
+    rows = [ground, *((*row, 0) if len(row) == 2 else row for row in rows)]
+    kinds = [KINDS["Ground"]] + [KINDS["Buildings"]] * (len(rows) - 1)
+    return make_box_map(
+        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header={"name": "hand"}
+    )
+
+
+CANYON = [((x, side * 16, 20), (9, 8, 20)) for x in range(-40, 140, 20) for side in (-1, 1)]
+WORLDS = {
+    "empty": (town_of(), [(0, 0), (60, 0), (60, 50)]),
+    "canyon": (town_of(*CANYON), [(0, 0), (100, 0)]),
+    "u_turn": (town_of(*CANYON), [(0, 0), (50, 0), (50, 2), (0, 2)]),
+    "tower_behind": (town_of(((-18, 0, 40), (6, 6, 40), 30)), [(0, 0), (60, 0)]),  # the plain start is inside it
+    "tower_midway": (town_of(((30, 14, 60), (8, 8, 60), 30)), [(0, 0), (30, 0), (60, 0), (60, 60)]),
+    "corner": (town_of(((-20, 20, 25), (30, 12, 25)), ((40, 40, 25), (12, 40, 25))), [(-30, 0), (20, 2), (22, 70)]),
+    "short": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (1.3, 0)]),  # three points
+}  # fmt: skip
+
+
+def scenario_of(world):
+    box_map, corners = WORLDS[world]
+    obstacles = kernels.obstacle_index(box_map)
+    return make_scenario(walk_along(world, corners), obstacles), obstacles
+
+
+def assert_safe(positions, obstacles, cfg=PlanConfig(), ground_m=0.0):
+    """Check a flight point by point and, between points, every ten centimetres: independent of `is_feasible`."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert steps.max() <= cfg.speed_max_mps * DT_S + 1e-3
+    assert positions[:, 2].min() - ground_m >= cfg.altitude_min_m - 1e-3
+    assert positions[:, 2].max() - ground_m <= cfg.altitude_max_m + 1e-3
+    assert kernels.signed_distances(obstacles, positions)[0].min() >= cfg.relaxed_safety_m - 1e-3
+    shares = np.linspace(0, 1, 51)[:, None, None]
+    between = (positions[None, :-1] * (1 - shares) + positions[None, 1:] * shares).reshape(-1, 3)
+    assert kernels.signed_distances(obstacles, between)[0].min() > 0
