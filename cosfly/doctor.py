@@ -14,6 +14,8 @@ from typing import Literal
 
 import httpx
 
+from cosfly.chat.client import KEY_VARIABLE
+from cosfly.chat.protocol import base_url, read_models, shown_url
 from cosfly.errors import EnvironmentMissing
 
 State = Literal["ok", "missing", "optional"]
@@ -100,23 +102,16 @@ def _package(name: str) -> Check:
 
 def _endpoint(url: str) -> Check:
     """Ask an OpenAI-compatible server for its models. The key comes from the environment and is not shown."""
-    key = os.environ.get("COSFLY_API_KEY")
-    base = httpx.URL(url)
-    shown = str(base.copy_with(userinfo=b"", query=None))
-    path = base.path.rstrip("/").removesuffix("/chat/completions").removesuffix("/v1")
+    key, root = os.environ.get(KEY_VARIABLE), base_url(url)
+    shown = shown_url(root)
     try:
-        answer = httpx.get(
-            base.copy_with(path=f"{path}/v1/models"),
-            headers={"Authorization": f"Bearer {key}"} if key else {},
-            timeout=10,
-        )
+        answer = httpx.get(f"{root}/models", headers={"Authorization": f"Bearer {key}"} if key else {}, timeout=10)
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         return Check("endpoint", "missing", f"{shown}: {type(error).__name__}: {error}")
     if answer.status_code != 200:
-        hint = "; set COSFLY_API_KEY" if answer.status_code in (401, 403) and not key else ""
-        return Check("endpoint", "missing", f"{shown}: HTTP {answer.status_code} for /v1/models{hint}")
-    try:
-        models = [str(model["id"]) for model in answer.json()["data"]]
-    except (ValueError, KeyError, TypeError):
+        hint = f"; set {KEY_VARIABLE}" if answer.status_code in (401, 403) and not key else ""
+        return Check("endpoint", "missing", f"{shown}: HTTP {answer.status_code} for /models{hint}")
+    models = read_models(answer)
+    if models is None:
         return Check("endpoint", "missing", f"{shown}: answers, but not as an OpenAI-compatible server")
-    return Check("endpoint", "ok", f"{shown}: {', '.join(models) or 'no models'}")
+    return Check("endpoint", "ok", f"{shown}: {', '.join(model['id'] for model in models) or 'no models'}")

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import httpx
 import pytest
 
 from cosfly import cli, doctor
@@ -99,3 +100,27 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
         tell_product(tmp_path / "product", tmp_path, RunConfig())
     tell_product(tmp_path / "product", tmp_path, RunConfig(max_failed=1))
     assert capfd.readouterr().out.count("product") == 2
+
+
+@pytest.mark.parametrize(
+    ("teacher", "asked"),
+    [
+        ("http://h:8000", "http://h:8000/v1/models"),
+        ("http://h:8000/v1/chat/completions", "http://h:8000/v1/models"),
+        ("https://h/v1beta/openai", "https://h/v1beta/openai/models"),
+        ("https://me:pw@h/api/v3/", "https://me:pw@h/api/v3/models"),
+    ],
+)
+def test_the_doctor_asks_for_the_models_where_captions_do(tmp_path, monkeypatch, teacher, asked):
+    urls = []
+
+    def get(url, **_):
+        urls.append(url)
+        return httpx.Response(200, json={"data": [{"id": "one"}, {"id": "two"}]})
+
+    monkeypatch.setattr(httpx, "get", get)
+    found = doctor.examine(tmp_path, teacher)[-1]
+    assert urls == [asked]
+    assert found.state == "ok"
+    assert found.detail.endswith(": one, two")
+    assert "pw" not in found.detail
