@@ -13,10 +13,12 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
+from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.config import MAY_DIFFER, Config
 from cosfly.frame_views import DEPTH_RANGE_M, View
-from cosfly.products.captions import Verdict
+from cosfly.products.captions import KeyframeRecord, TeacherKind, Verdict
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
@@ -80,17 +82,7 @@ class Sample:
     observed: ObservedWindow
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
-    keyframe: dict[str, Any] | None = None  # why it was taken, and how many windows after it were not
-
-
-@dataclass(frozen=True)
-class Reply:
-    """One answer of a teacher. `structured` says how its shape was enforced: json_schema, plain, or native (rules)."""
-
-    text: str
-    usage: dict[str, int]
-    structured: str
-    finish_reason: str | None = None
+    keyframe: KeyframeRecord | None = None  # why it was taken, and how many windows after it were not
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -160,31 +152,6 @@ class EvidenceConfig(Config):
     drop: bool = Field(False, description="drop a sample whose text contradicts a measured value")
 
 
-class BudgetConfig(Config):
-    """What a teacher may use up, counted over all runs into one folder."""
-
-    price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
-    price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
-    max_cost: float | None = Field(None, gt=0, description="stop before this cost is passed; empty: no limit")
-    max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are passed; empty: no limit")
-
-    @model_validator(mode="after")
-    def _priced(self) -> Self:
-        if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
-            raise ValueError("max_cost needs price_prompt and price_completion, else it could never be reached")
-        return self
-
-
-class VllmConfig(Config):
-    """The engine in this process, for teacher `vllm:MODEL_DIR`."""
-
-    batch: int = Field(256, ge=1, description="most requests in the engine at once")
-    max_model_len: int | None = Field(None, ge=1024, description="context length; empty takes the model's")
-    gpu_memory_utilization: float = Field(0.9, gt=0, le=1, description="share of the accelerator's memory")
-    tensor_parallel_size: int = Field(1, ge=1, description="accelerators that share the model")
-    engine: dict[str, Any] = Field(default_factory=dict, description="further arguments of vllm.LLM")
-
-
 class JudgeConfig(Config):
     """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
 
@@ -197,9 +164,6 @@ class JudgeConfig(Config):
         6, ge=1, json_schema_extra=MAY_DIFFER, description="tries of one request when the server is busy or fails"
     )
     json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
-    open_flights: int = Field(
-        64, ge=1, json_schema_extra=MAY_DIFFER, description="flights whose judgements are kept in memory"
-    )
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
     @model_validator(mode="after")
@@ -251,7 +215,7 @@ class CaptionConfig(Config):
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:
-        if self.teacher != "rules" and not self.teacher.startswith(("http://", "https://", "vllm:")):
+        if self.teacher_kind == "endpoint" and not self.teacher.startswith(("http://", "https://")):
             raise ValueError(
                 "teacher must be `rules` or a URL that begins with http:// or https://, or vllm:MODEL_DIR, "
                 f"got {self.teacher!r}"
@@ -259,10 +223,20 @@ class CaptionConfig(Config):
         return self
 
     @property
-    def teacher_kind(self) -> Literal["rules", "endpoint", "vllm"]:
+    def teacher_kind(self) -> TeacherKind:
         if self.teacher == "rules":
             return "rules"
         return "vllm" if self.teacher.startswith("vllm:") else "endpoint"
+
+    @property
+    def most_in_flight(self) -> int:
+        """Requests that the teacher takes at once."""
+        return {"rules": 1, "endpoint": self.endpoint.concurrency, "vllm": self.vllm.batch}[self.teacher_kind]
+
+    @property
+    def num_images(self) -> int:
+        """Pictures of one question, at most."""
+        return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
         """A teacher's address may hold a password, so its kind is put on record."""

@@ -1,4 +1,4 @@
-"""The bounded ask-verify loop of one window, and the stage: reads a playback tree, writes `captions.jsonl`.
+"""The bounded ask-verify loop of one window.
 
 Every window ends in one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A decision that
 the flight contradicts is asked for again, by default anchored to the true one; the record says so for ever.
@@ -7,18 +7,28 @@ the flight contradicts is asked for again, by default anchored to the true one; 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
-from caption.schema import CaptionConfig, Reply, Sample, Strategy
+from caption.schema import CaptionConfig, Sample, Strategy
 from caption.teachers.prompts import Question, make_question, prompt_hash
-from caption.teachers.teacher import NoAnswer, Teacher
+from caption.teachers.teacher import Teacher
 from caption.truth.actions import Motion, label_of, measure, verdict_of
 from caption.truth.facts import measure_facts
 from caption.truth.glossary import load_glossary
 from caption.truth.judge import Case, Judge
 from caption.truth.verify import check_evidence, check_mirror, flight_numbers
+from cosfly.chat.contract import NoAnswer, Reply, Usage
 from cosfly.errors import InputError, RenderError
-from cosfly.products.captions import Caption, Coc, Language, Parsed, Verdict, parse_answer
+from cosfly.products.captions import (
+    Caption,
+    Checks,
+    Coc,
+    JudgeRecord,
+    Language,
+    Parsed,
+    RepairRecord,
+    Verdict,
+    parse_answer,
+)
 
 
 async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:
@@ -35,8 +45,7 @@ async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, j
     facts = measure_facts(window)
     question = make_question(window, facts, cfg.image)
     loop = _Loop(teacher, cfg, motion, label_of(motion, cfg.label), judge)
-    if sample.keyframe is not None:
-        loop.checks["keyframe"] = sample.keyframe
+    loop.checks.keyframe = sample.keyframe
     reason = sample.problem
     if reason is None:
         try:
@@ -47,7 +56,7 @@ async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, j
             reason = error.cause
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unreadable_frame"
-            loop.checks["frame"] = error.what
+            loop.checks.frame = error.what
     return Caption(
         sample_id=window.sample_id,
         town=window.town,
@@ -58,7 +67,7 @@ async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, j
         future=list(sample.future.indices),
         prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
         prompt_hash=prompt_hash(question.prompts),
-        teacher=teacher.record | {"structured": loop.structured} if loop.structured else dict(teacher.record),
+        teacher=teacher.record.model_copy(update={"structured": loop.structured}),
         usage=loop.usage,
         attempts=loop.asks,
         en=loop.english,
@@ -99,12 +108,12 @@ async def try_strategy(sample: Sample, teacher: Teacher, cfg: CaptionConfig, str
     if await loop.ask_freely(question) is not None or loop.verdict not in repair.verdicts or loop.label is None:
         return None
     assert loop.english is not None
-    first, asked, tokens = loop.english, loop.asks, sum(loop.usage.values())
+    first, asked, tokens = loop.english, loop.asks, loop.usage.total
     reason = await loop.regenerate(question)
     assert loop.repair is not None
     last = loop.english if reason is None else None
-    rung = loop.repair["rung"]
-    return Trial(first, last, loop.verdict, rung, loop.asks - asked, sum(loop.usage.values()) - tokens)
+    rung = loop.repair.rung
+    return Trial(first, last, loop.verdict, rung, loop.asks - asked, loop.usage.total - tokens)
 
 
 def _rungs(strategy: Strategy, max_asks: int) -> list[str]:
@@ -125,12 +134,12 @@ class _Loop:
         self.chinese: Coc | None = None
         self.answered: Question | None = None  # the one that `english` answers
         self.verdict: Verdict | None = None
-        self.judgement: dict[str, Any] | None = None
-        self.repair: dict[str, Any] | None = None
-        self.checks: dict[str, Any] = {}
-        self.usage = {"prompt_tokens": 0, "completion_tokens": 0}
+        self.judgement: JudgeRecord | None = None
+        self.repair: RepairRecord | None = None
+        self.checks = Checks()
+        self.usage = Usage()
         self.asks = 0
-        self.structured = ""
+        self.structured: str | None = None
         self._recovered: set[str] = set()
 
     async def run(self, question: Question) -> str | None:
@@ -143,7 +152,7 @@ class _Loop:
         if reason is None:
             reason = self._check_evidence(question)
         if self._recovered:
-            self.checks["recovered"] = sorted(self._recovered)
+            self.checks.recovered = sorted(self._recovered)
         return reason
 
     async def ask_freely(self, question: Question) -> str | None:
@@ -153,9 +162,9 @@ class _Loop:
             parsed = self._read(await self.teacher.ask(asked), "en")
             if parsed.coc is not None:
                 self._accept(parsed.coc, asked)
-                self.checks["structure"] = "ok"
+                self.checks.structure = "ok"
                 return None
-        self.checks["structure"] = parsed.reason
+        self.checks.structure = parsed.reason
         return f"structure_{parsed.reason}"
 
     async def _is_rejected(self, question: Question) -> bool:
@@ -170,31 +179,26 @@ class _Loop:
             return self.verdict in self.cfg.repair.verdicts
         case = Case(question.window.sample_id, question.prompts["en"].user, self.english, self.label)
         self.judgement = await self.judge.judge(case)
-        verdict = self.judgement["verdict"]
+        verdict = self.judgement.verdict
         if verdict == "ACCEPT_ALTERNATIVE" and self.verdict == "HARD_CONFLICT":
-            self.judgement["overruled_by"] = "geometry"
+            self.judgement.overruled_by = "geometry"
         if verdict == "FIX_LABEL" and self.label is not None:
             fixed = self.english.model_copy(update={"flight_decision": self.label})
             problems = check_evidence(fixed, question.facts, self.cfg.evidence, "en")
             old_words = load_glossary().actions[self.english.flight_decision]["en"]
             states_old = old_words in self.english.reasoning_trace.lower()
             if not states_old and not any(problem.startswith("decision:") for problem in problems):
-                self.repair = self._repair("fix_label") | {"outcome": "repaired", "rung": "fix_label"}
+                self.repair = self._repair("fix_label")
+                self.repair.outcome, self.repair.rung = "repaired", "fix_label"
                 self._accept(fixed, question)
                 return False
-            self.judgement["overruled_by"] = "text"
+            self.judgement.overruled_by = "text"
         return verdict != "ACCEPT_ALTERNATIVE" or self.verdict == "HARD_CONFLICT"
 
-    def _repair(self, strategy: str) -> dict[str, Any]:
+    def _repair(self, strategy: str) -> RepairRecord:
         assert self.english is not None
-        return {
-            "strategy": strategy,
-            "rung": None,
-            "outcome": "no_label",
-            "asks": 0,
-            "first_decision": self.english.flight_decision,
-            "first_verdict": self.verdict,
-        }
+        decision = self.english.flight_decision
+        return RepairRecord(strategy=strategy, first_decision=decision, first_verdict=self.verdict)
 
     async def regenerate(self, question: Question) -> str | None:
         """Ask again by the chosen strategy until an answer is no longer rejected (sec:appendix_e, four strategies)."""
@@ -205,7 +209,7 @@ class _Loop:
         if self.label is None and "anchored" in rungs:
             return "conflict_without_label"
         for ask, rung in enumerate(rungs):
-            self.repair["asks"] = ask + 1
+            self.repair.asks = ask + 1
             asked = self._reworked(question, rung, rejected, ask)
             parsed = self._read(await self.teacher.ask(asked), "en")
             if parsed.coc is None or (asked.decision and parsed.coc.flight_decision != asked.decision):
@@ -213,9 +217,9 @@ class _Loop:
             verdict = verdict_of(parsed.coc.flight_decision, self.motion, self.cfg.label, self.label)
             if verdict not in self.cfg.repair.verdicts and parsed.coc.flight_decision != rejected:
                 self._accept(parsed.coc, asked)
-                self.repair |= {"outcome": "repaired", "rung": rung}
+                self.repair.outcome, self.repair.rung = "repaired", rung
                 return None
-        self.repair["outcome"] = "failed"
+        self.repair.outcome = "failed"
         return "regeneration_failed"
 
     def _reworked(self, question: Question, rung: str, rejected: str, ask: int) -> Question:
@@ -240,7 +244,7 @@ class _Loop:
             problem = check_mirror(self.english, parsed.coc, flight)
             if problem is None:
                 break
-        self.checks["bilingual"] = problem or "ok"
+        self.checks.bilingual = problem or "ok"
         return None if problem is None else f"bilingual_{problem}"
 
     def _check_evidence(self, question: Question) -> str | None:
@@ -249,13 +253,12 @@ class _Loop:
         cfg = self.cfg.evidence
         found = [f"en {problem}" for problem in check_evidence(self.english, question.facts, cfg, "en")]
         found += [f"zh {problem}" for problem in check_evidence(self.chinese, question.facts, cfg, "zh")]
-        self.checks["evidence"] = found or "ok"
+        self.checks.evidence = found or "ok"
         return "evidence" if found and cfg.drop else None
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1
-        for name, count in reply.usage.items():
-            self.usage[name] = self.usage.get(name, 0) + count
+        self.usage += reply.usage or Usage()
         self.structured = reply.structured
         parsed = parse_answer(reply.text, language)
         if parsed.coc is None and reply.finish_reason == "length":

@@ -9,12 +9,12 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Sample, WindowConfig
 from caption.truth.actions import label_of, measure
+from cosfly.products.captions import KeyframeRecord
 from cosfly.products.playback import Flight, sample_id
 
 DEFAULT_LABEL = LabelConfig()
@@ -39,7 +39,7 @@ def iterate_samples(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFA
     files = [_files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
     currents = list(current_frames(len(flight), cfg))
-    keyframes: list[dict[str, Any] | None] = [None] * len(currents)
+    keyframes: list[KeyframeRecord | None] = [None] * len(currents)
     if cfg.keyframes:
         futures = (cut_future(flight, clean_positions, clean_yaw_deg, i, cfg.future_frames) for i in currents)
         chosen = choose_keyframes([label_of(measure(future), label) for future in futures], cfg.keyframe_stride)
@@ -51,24 +51,24 @@ def iterate_samples(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFA
         yield Sample(observed, future, problem, keyframe)
 
 
-def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, dict[str, Any]]:
+def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, KeyframeRecord]:
     """Choose the windows at which the label changes, the first one, and each `stride`-th after a chosen one.
 
     Returns:
         index -> {reason: start | change | stride, skipped: windows left out up to the next chosen one, missed: changes of
         the label among them, counted anew from the labels}.
     """
-    chosen: dict[int, dict[str, Any]] = {}
+    chosen: dict[int, KeyframeRecord] = {}
     last = -1
     for i, label in enumerate(labels):
         reason = "start" if i == 0 else "change" if label != labels[i - 1] else "stride" if i - last == stride else None
         if reason is None:
-            chosen[last]["skipped"] += 1
+            chosen[last].skipped += 1
         else:
-            chosen[i] = {"reason": reason, "skipped": 0, "missed": 0}
+            chosen[i] = KeyframeRecord(reason=reason, skipped=0, missed=0)
             last = i
     for i in missed_changes(labels, set(chosen)):
-        chosen[max(k for k in chosen if k < i)]["missed"] += 1
+        chosen[max(k for k in chosen if k < i)].missed += 1
     return chosen
 
 

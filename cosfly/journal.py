@@ -11,6 +11,8 @@ from typing import Any
 
 from cosfly.store import dump_json, parse_json, sha256_bytes, storage_errors
 
+BLOCK = 65_536  # bytes looked at together, from the end
+
 
 class Journal:
     """An append-only JSON-lines file whose every line carries its own checksum.
@@ -28,64 +30,43 @@ class Journal:
 
     def read(self) -> Iterator[dict]:
         """Yield the records in order, damaged lines left out."""
-        for _, _, record in self.lines():
-            yield record
-
-    def lines(self, start: int = 0, end: int | None = None) -> Iterator[tuple[int, int, dict]]:
-        """Yield (first byte, byte after the last, record) of the lines that begin in a range of bytes, damaged ones left out.
-
-        Args:
-            start: where a line begins.
-        """
         self.num_damaged = 0
         if not self.path.exists():
             return
         with open(self.path, "rb") as file:
-            file.seek(start)
-            position = start
             for line in file:
-                first, position = position, position + len(line)
-                if end is not None and first >= end:
-                    return
-                try:
-                    digest, body = line.rstrip(b"\n").split(b" ", 1)
-                    if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
-                        raise ValueError
-                    record = parse_json(body)
-                except (ValueError, UnicodeDecodeError):
+                record = _record_of(line)
+                if record is None:
                     self.num_damaged += 1
-                    continue
-                yield first, position, record
+                else:
+                    yield record
 
-    def append(self, record: dict, *, sync: bool = True) -> int:
-        """Add a record and, unless told otherwise, wait until it is on the disk. Gives the length of the file, bytes."""
+    def last(self) -> dict | None:
+        """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""
+        with open(self.path, "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - BLOCK))
+            tail = file.read()
+        return _record_of(tail[tail.rfind(b"\n", 0, -1) + 1 :])
+
+    def append(self, record: dict, *, sync: bool = True) -> None:
+        """Add a record and, unless told otherwise, wait until it is on the disk."""
         body = dump_json(record).encode()
         line = sha256_bytes(body)[:16].encode() + b" " + body + b"\n"
         with self._lock, storage_errors(self.path):
-            self._open()
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                _cut_torn_line(self.path)
+                self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
             self._file.write(line)
             self._file.flush()
             if sync:
                 os.fsync(self._file.fileno())
-            return int(self._file.tell())
 
     def sync(self) -> None:
         """Wait until all that was appended is on the disk."""
         with storage_errors(self.path):
             if self._file is not None:
                 os.fsync(self._file.fileno())
-
-    def start(self) -> int:
-        """Open the file for appending, without a line that a kill cut short. Gives its length, bytes."""
-        with self._lock, storage_errors(self.path):
-            self._open()
-            return int(self._file.tell())
-
-    def _open(self) -> None:
-        if self._file is None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            _cut_torn_line(self.path)
-            self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
 
     def close(self) -> None:
         if self._file is not None:
@@ -100,13 +81,24 @@ class Journal:
         self.close()
 
 
+def _record_of(line: bytes) -> dict | None:
+    """Read a line; None where it was cut short or damaged."""
+    try:
+        digest, body = line.rstrip(b"\n").split(b" ", 1)
+        if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
+            return None
+        return parse_json(body)
+    except ValueError:
+        return None
+
+
 def _cut_torn_line(path: Path) -> None:
     """Take off the line that a kill cut short: a reader skips it, so it must not come back to life when more is written."""
     if not path.exists():
         return
     with open(path, "r+b") as file:
         end = file.seek(0, os.SEEK_END)
-        keep, block = end, 65536
+        keep, block = end, BLOCK
         while keep > 0:
             start = max(0, keep - block)
             file.seek(start)

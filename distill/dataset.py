@@ -195,7 +195,7 @@ def make_sample(caption: Caption, language: Language, cfg: PrepareConfig) -> Sam
         answer=answer,
         decision=parsed.coc.flight_decision,
         label=caption.label,
-        repair=None if caption.repair is None else str(caption.repair.get("strategy", "unknown")),
+        repair=None if caption.repair is None else caption.repair.strategy,
         weight=1.0 if caption.repair is None else cfg.repaired_weight,
     )
 

@@ -50,7 +50,6 @@ def _released(caption: Caption, path: Path) -> ReleasedCaption:
     answers = {"en": caption.en, "zh": caption.zh}
     texts = {f"caption_{lang}_{name}": getattr(answer, name) for lang, answer in answers.items() for name in FIELDS}
     assert set(texts) == set(CAPTION_FIELDS)
-    model = caption.teacher.get("model")
     return ReleasedCaption(
         tuple(caption.window),
         texts,
@@ -58,10 +57,8 @@ def _released(caption: Caption, path: Path) -> ReleasedCaption:
             "decision": caption.en.flight_decision,
             "label": caption.label,
             "verdict": caption.verdict,
-            "repair_strategy": str(caption.repair["strategy"])
-            if caption.repair and "strategy" in caption.repair
-            else None,
-            "teacher_kind": str(caption.teacher.get("kind", "unknown")),
-            "teacher_model": None if model is None else str(model),
+            "repair_strategy": caption.repair.strategy if caption.repair else None,
+            "teacher_kind": caption.teacher.kind,
+            "teacher_model": caption.teacher.model,
         },
     )

@@ -38,7 +38,7 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
             "zh": Prompt(system="你驾驶无人机。", user=f"五帧，最后一帧为{frame}。请用JSON回答。"),
         },
         "prompt_hash": "0" * 64,
-        "teacher": {"kind": "rules", "model": "rules", "settings": {}},
+        "teacher": {"kind": "rules", "model": "rules", "settings": {"seed": 0}},
         "usage": {"prompt_tokens": 0, "completion_tokens": 0},
         "attempts": 1,
         "en": Coc(

@@ -14,7 +14,9 @@ import threading
 import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
+from cosfly.journal import Journal
 from cosfly.products.captions import ACTIONS
 
 MODEL = "test-teacher"
@@ -107,6 +109,12 @@ class TeacherServer:
 
     def digests(self) -> list[str]:
         return [hashlib.sha256(body).hexdigest() for body in self.bodies]
+
+
+def kept_answers(out: Path) -> list[dict]:
+    """Read all that the journals of a run hold, flight by flight."""
+    lines = [record for path in sorted((out / "answers").glob("*.jsonl")) for record in Journal(path).read()]
+    return [record for record in lines if "key" in record]
 
 
 def is_mirror(body: dict) -> bool:

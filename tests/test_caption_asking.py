@@ -1,4 +1,4 @@
-"""Runs of an endpoint teacher that stop, go on, retry and show what they do; and the journal's index."""
+"""Runs of an endpoint teacher that stop, go on, retry and show what they do; and the book of answers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from teacher_server import TeacherServer, is_mirror
+from teacher_server import TeacherServer, is_mirror, kept_answers
 
 from caption.run.progress import Display, duration
 from caption.run.stage import run
-from caption.schema import BudgetConfig, CaptionConfig
-from caption.teachers.answers import AnswerBook, flight_of
-from caption.teachers.budget import Budget, BudgetSpent
+from caption.schema import CaptionConfig
+from cosfly.chat import answers
+from cosfly.chat.answers import AnswerBook, journal_name
+from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
 from cosfly.chat.protocol import encode_body, with_image_ids
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.journal import Journal
@@ -55,7 +56,14 @@ def whole(tree, tmp_path_factory) -> bytes:
 
 
 def keys_of(out: Path) -> list[str]:
-    return [record["key"] for record in Journal(out / "answers.jsonl").read()]
+    return [record["key"] for record in kept_answers(out)]
+
+
+def keys_by_flight(out: Path) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for kept in kept_answers(out):
+        found.setdefault(kept["sample_id"].partition("_frame_")[0], []).append(kept["key"])
+    return found
 
 
 # --- limits -----------------------------------------------------------------------------------------------------------
@@ -100,7 +108,7 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
             assert 0 < answered * (1000 * 3 + 100 * 15) / 1e6 <= 0.06
         assert not (out / "manifest.json").exists()
         assert len(list(read_captions(out / "captions.jsonl"))) == sum(
-            1 for record in Journal(out / "answers.jsonl").read() if record["purpose"].startswith("mirror")
+            1 for record in kept_answers(out) if record["purpose"].startswith("mirror")
         )
         with pytest.raises(TeacherError, match="stopped before"):  # the same budget is not spent twice
             run(settings(server.url, budget=budget), tree, out)
@@ -117,7 +125,7 @@ def test_a_budget_needs_a_server_that_counts_and_a_price():
     with budget.request(), budget.request(), pytest.raises(BudgetSpent, match="0 of at most 10"), budget.request():
         pass
     with pytest.raises(TeacherError, match="reports no token usage"):
-        budget.note({}, "http://x")
+        budget.note(None, "http://x")
 
 
 # --- what failed ------------------------------------------------------------------------------------------------------
@@ -160,11 +168,11 @@ def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
         with pytest.raises(TeacherError, match="in a row"):
             run(settings(server.url, endpoint=endpoint), tree, out)
         held = [json.loads(line)["id"] for line in (out / "quarantine.jsonl").read_text().splitlines()]
-        answered = {record["sample_id"] for record in Journal(out / "answers.jsonl").read()}
+        answered = {record["sample_id"] for record in kept_answers(out)}
         assert 2 <= len(held) <= 4
         state["on"] = False
         run(settings(server.url), tree, out, retry_failed=True)
-        now = {record["sample_id"] for record in Journal(out / "answers.jsonl").read()}
+        now = {record["sample_id"] for record in kept_answers(out)}
         assert now == answered | set(held)
         assert not (out / "manifest.json").exists()
         assert run(settings(server.url), tree, out).read_bytes() == whole
@@ -260,11 +268,12 @@ def test_rate_and_time_left():
 
 
 def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
-    budget = Budget(BudgetConfig(price_prompt=2.0), Counter(), first_prompt=1, first_completion=1)
+    used = Counter()
+    budget = Budget(BudgetConfig(price_prompt=2.0), used, first_prompt=1, first_completion=1)
     display = Display(100, budget, Clock())
     display.num_accepted, display.num_repaired = 40, 3
     display.dropped.update(structure_cut_short=2, bilingual_number=1)
-    budget.totals.update(prompt_tokens=100_000, completion_tokens=9_000, answers=88)
+    used.update(prompt_tokens=100_000, completion_tokens=9_000, answers=88)
     for renderable in (display.panel(), display.closing_table()):
         file = io.StringIO()
         Console(file=file, width=100).print(renderable)
@@ -278,81 +287,145 @@ def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
     assert lines[1].strip() == "caption: 43 of 100 windows"
 
 
-# --- the journal's index ----------------------------------------------------------------------------------------------
+# --- the book of answers ----------------------------------------------------------------------------------------------
+
+
+def flight_name(flight: int) -> str:
+    return f"trajectory_{flight}_ORI"
 
 
 def record(flight: int, window: int, purpose: str = "free/0") -> dict:
-    sample_id = f"trajectory_{flight}_ORI_frame_{window:05d}"
+    sample_id = f"{flight_name(flight)}_frame_{window:05d}"
     usage = {"prompt_tokens": 10, "completion_tokens": 2}
     return {"key": f"{sample_id}/{purpose}", "sample_id": sample_id, "purpose": purpose, "usage": usage, "text": "t"}
 
 
-def fill(path: Path, num_flights: int, num_windows: int, unfinished: set[str]) -> None:
-    """Write a journal in which the answers of neighbouring flights are mixed, as a run writes them."""
+def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int]) -> None:
+    """Write journals as a run does, the answers of neighbouring flights in any order; an unfinished flight is cut off by a kill."""
 
     async def write() -> None:
-        with AnswerBook(path, lambda name: False) as book:
-            order = [(flight, window) for flight in range(num_flights) for window in range(num_windows)]
-            open_count = Counter(dict.fromkeys(range(num_flights), num_windows))
-            rng = random.Random(0)
-            while order:
-                flight, window = order.pop(rng.randrange(min(len(order), num_windows)))
-                await book.put(record(flight, window))
-                open_count[flight] -= 1
-                name = flight_of(record(flight, 0)["sample_id"])
-                if not open_count[flight] and name not in unfinished:
-                    book.forget(name)
+        book = AnswerBook(folder)
+        order = [(flight, window) for flight in range(num_flights) for window in range(num_windows)]
+        open_count = Counter(dict.fromkeys(range(num_flights), num_windows))
+        rng = random.Random(0)
+        while order:
+            flight, window = order.pop(rng.randrange(min(len(order), num_windows)))
+            await book.put(flight_name(flight), record(flight, window))
+            open_count[flight] -= 1
+            if not open_count[flight] and flight not in unfinished:
+                book.forget(flight_name(flight))
 
     asyncio.run(write())
 
 
-def test_the_index_spares_a_start_the_finished_flights(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    unfinished = {"trajectory_28_ORI"}
-    fill(path, 30, 20, unfinished)
-    with AnswerBook(path, lambda name: name not in unfinished) as book:
-        assert book.num_found == 20
-        assert book.num_read < 120  # of 600
+def lines_read(monkeypatch) -> list[dict]:
+    """Note every line that is read through from here on."""
+    seen: list[dict] = []
+    plain = Journal.read
+
+    def read(self):
+        for line in plain(self):
+            seen.append(line)
+            yield line
+
+    monkeypatch.setattr(Journal, "read", read)
+    return seen
+
+
+def test_a_start_reads_the_last_line_of_finished_flights(tmp_path, monkeypatch):
+    fill(tmp_path, 30, 20, unfinished={28})
+    seen = lines_read(monkeypatch)
+    with AnswerBook(tmp_path) as book:
+        assert len(seen) == 20  # of 600
         assert book.totals == {"answers": 600, "prompt_tokens": 6000, "completion_tokens": 1200}
-        assert book.get(record(28, 7)["key"]) == record(28, 7)
-        assert book.get(record(3, 7)["key"]) is None  # finished: not needed
-    # A part that was removed by hand makes its flight unfinished again: its answers are found all the same.
-    with AnswerBook(path, lambda name: name != "trajectory_3_ORI") as book:
-        assert book.num_found == 20
-        assert book.get(record(3, 7)["key"]) == record(3, 7)
+        assert book.get(flight_name(28), record(28, 7)["key"]) == record(28, 7)
+        # A part that was removed by hand makes its flight unfinished again: its answers are found all the same.
+        assert book.get(flight_name(3), record(3, 7)["key"]) == record(3, 7)
+        assert len(seen) == 20 + 20 + 21
+        assert book.get(flight_name(99), "no such key") is None
 
 
-@pytest.mark.parametrize("damage", ["remove", "garbage", "cut_journal"])
-def test_a_lost_index_costs_time_only(tmp_path, damage):
-    path, index = tmp_path / "answers.jsonl", tmp_path / "answers.index.jsonl"
-    fill(path, 5, 4, set())
-    if damage == "remove":
-        index.unlink()
-    elif damage == "garbage":
-        index.write_bytes(b"not an index\n")
-    else:
-        path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:10]))
-    with AnswerBook(path, lambda name: False) as book:
-        assert book.num_found == book.totals["answers"] == (10 if damage == "cut_journal" else 20)
+def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):
+    fill(tmp_path, 3, 4, unfinished=set())
+
+    async def go_on() -> None:
+        with AnswerBook(tmp_path) as book:
+            assert not book._flights
+            for flight in range(3):
+                book.get(flight_name(flight), "x")
+                await book.put(flight_name(flight), record(flight, 4))
+                assert list(book._flights) == [flight_name(flight)]
+                book.forget(flight_name(flight))
+            book.forget("never seen")
+
+    asyncio.run(go_on())
+    with AnswerBook(tmp_path) as book:
+        assert book.totals["answers"] == 15
 
 
-def test_a_torn_line_does_not_shift_the_index(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    fill(path, 2, 4, {"trajectory_1_ORI"})
-    with open(path, "ab") as file:
+@pytest.mark.parametrize("damage", ["remove", "garbage", "torn"])
+def test_a_lost_line_of_totals_costs_time_only(tmp_path, damage):
+    fill(tmp_path, 5, 4, set())
+    for path in tmp_path.iterdir():
+        lines = path.read_bytes().splitlines(keepends=True)
+        lines[-1] = {"remove": b"", "garbage": b"not a line\n", "torn": lines[-1][:20]}[damage]
+        path.write_bytes(b"".join(lines))
+    with AnswerBook(tmp_path) as book:
+        assert book.totals["answers"] == 20
+        assert book.get(flight_name(3), record(3, 2)["key"]) == record(3, 2)
+
+
+def test_a_torn_line_is_not_an_answer_and_the_journal_goes_on(tmp_path):
+    fill(tmp_path, 2, 4, unfinished={1})
+    with open(tmp_path / journal_name(flight_name(1)), "ab") as file:
         file.write(b'0123456789abcdef {"torn')
 
     async def go_on() -> None:
-        with AnswerBook(path, lambda name: name == "trajectory_0_ORI") as book:
-            assert book.num_found == 4
-            await asyncio.gather(*(book.put(record(2, window)) for window in range(4)))
-            book.forget("trajectory_2_ORI")
+        with AnswerBook(tmp_path) as book:
+            assert book.totals["answers"] == 8
+            await asyncio.gather(*(book.put(flight_name(1), record(1, window)) for window in range(4, 8)))
 
     asyncio.run(go_on())
-    with AnswerBook(path, lambda name: name in ("trajectory_0_ORI", "trajectory_1_ORI")) as book:
-        assert book.num_found == 4
-        assert book.get(record(2, 0)["key"]) == record(2, 0)
-        assert book.num_damaged == 0
+    journal = Journal(tmp_path / journal_name(flight_name(1)))
+    *kept, last = journal.read()
+    assert sorted(line["key"] for line in kept) == [record(1, window)["key"] for window in range(8)]
+    assert last == {"totals": {"answers": 8, "prompt_tokens": 80, "completion_tokens": 16}}
+    assert journal.num_damaged == 0
+    with AnswerBook(tmp_path) as book:
+        assert book.totals["answers"] == 12
+
+
+def test_many_flights_at_once_do_not_use_up_the_open_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(answers, "MOST_OPEN_FILES", 4)
+
+    async def write() -> int:
+        with AnswerBook(tmp_path) as book:
+            for window in range(3):
+                await asyncio.gather(*(book.put(flight_name(flight), record(flight, window)) for flight in range(40)))
+            return sum(opened.journal._file is not None for opened in book._flights.values())
+
+    assert asyncio.run(write()) <= 4
+    with AnswerBook(tmp_path) as book:
+        assert book.totals["answers"] == 120
+        assert book.get(flight_name(39), record(39, 2)["key"]) == record(39, 2)
+
+
+@pytest.mark.parametrize(
+    "flight", ["..", ".hidden", "a/b", "../../etc/passwd", "", "x" * 300, "nul\0", "~", "飞" * 90, "-rf"]
+)
+def test_any_flight_has_a_journal_inside_its_folder(tmp_path, flight):
+    assert (tmp_path / journal_name(flight)).resolve().parent == tmp_path.resolve()
+    assert not journal_name(flight).startswith((".", "-"))
+    assert len(journal_name(flight).encode()) < 250
+    assert journal_name("trajectory_1_ORI") == "trajectory_1_ORI.jsonl"
+
+    async def write() -> None:
+        with AnswerBook(tmp_path) as book:
+            await book.put(flight, record(0, 0))
+
+    asyncio.run(write())
+    with AnswerBook(tmp_path) as book:
+        assert book.get(flight, record(0, 0)["key"]) == record(0, 0)
 
 
 # --- kills ------------------------------------------------------------------------------------------------------------
@@ -371,9 +444,10 @@ def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, who
         assert "cannot write" in filled.stderr, filled.stderr
         assert "finished work is kept" in filled.stderr
         assert not (out / "manifest.json").exists()
-        kept = keys_of(out)
+        kept = keys_by_flight(out)
         assert run(config, tree, out).read_bytes() == whole
-    assert keys_of(out)[: len(kept)] == kept
+    now = keys_by_flight(out)
+    assert all(now[flight][: len(keys)] == keys for flight, keys in kept.items())
     assert len(keys_of(out)) == len(set(keys_of(out)))
 
 

@@ -11,7 +11,7 @@ import pytest
 from teacher_server import ENGLISH, TeacherServer
 from typer.testing import CliRunner
 
-from caption.run.plan import estimate, make_plan
+from caption.run.forecast import estimate, make_forecast
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
@@ -160,32 +160,32 @@ def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
     budget = {"price_prompt": 2.0, "price_completion": 10.0}
     with TeacherServer(decision=lambda body: "hover") as server:
         cfg = settings(server.url, budget=budget)
-        planned = make_plan(cfg, tree, tmp_path / "out")
+        forecast = make_forecast(cfg, tree, tmp_path / "out")
         num_trial_requests = len(server.bodies)
         run(cfg, tree, tmp_path / "out")
         asked = len(server.bodies) - 2  # two requests measured the pictures' tokens
     report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
-    assert planned.num_windows == report["windows"]["input"] == 22
-    assert planned.calls.expected == asked == 44
-    assert planned.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 44_000
-    assert planned.completion_tokens.low == report["tokens"]["completion_tokens"] == 4_400
-    assert planned.cost.expected == pytest.approx((44_000 * 2.0 + 4_400 * 10.0) / 1e6)
-    assert num_trial_requests == 2 * planned.num_trials + 2  # and the run did not ask about these windows again
-    assert 0 < planned.seconds.low <= planned.seconds.expected <= planned.seconds.high
-    assert ("cost", "0.13 (0.13 to 0.13)") in planned.rows()
+    assert forecast.num_windows == report["windows"]["input"] == 22
+    assert forecast.calls.expected == asked == 44
+    assert forecast.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 44_000
+    assert forecast.completion_tokens.low == report["tokens"]["completion_tokens"] == 4_400
+    assert forecast.cost.expected == pytest.approx((44_000 * 2.0 + 4_400 * 10.0) / 1e6)
+    assert num_trial_requests == 2 * forecast.num_trials + 2  # and the run did not ask about these windows again
+    assert 0 < forecast.seconds.low <= forecast.seconds.expected <= forecast.seconds.high
+    assert ("cost", "0.13 (0.13 to 0.13)") in forecast.rows()
 
 
 def test_the_plan_knows_the_images_share(tree, tmp_path):
     with TeacherServer(respond=patient(max_images=99)) as server:
-        planned = make_plan(settings(server.url, repair={"verdicts": ()}), tree, tmp_path / "out")
-    assert planned.image_tokens is not None
-    asks = planned.image_tokens.expected / (15 * TOKENS_PER_IMAGE * planned.num_windows)
+        forecast = make_forecast(settings(server.url, repair={"verdicts": ()}), tree, tmp_path / "out")
+    assert forecast.image_tokens is not None
+    asks = forecast.image_tokens.expected / (15 * TOKENS_PER_IMAGE * forecast.num_windows)
     assert asks == round(asks)  # whole asks of 15 pictures
 
 
 def test_a_plan_needs_an_endpoint(tree, tmp_path):
     with pytest.raises(ConfigError, match="needs an endpoint"):
-        make_plan(CaptionConfig(), tree, tmp_path / "out")
+        make_forecast(CaptionConfig(), tree, tmp_path / "out")
 
 
 def test_plan_on_the_command_line_asks_a_few_and_stops(tree, tmp_path):
@@ -193,5 +193,5 @@ def test_plan_on_the_command_line_asks_a_few_and_stops(tree, tmp_path):
         words = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(tmp_path / "out"), "--plan"]
         result = CliRunner().invoke(app, [*words, "--no-check", "--set", "caption.image.max_side_px=32"])
         assert result.exit_code == 0, result.output
-    assert (tmp_path / "out" / "answers.jsonl").exists()
+    assert any((tmp_path / "out" / "answers").iterdir())
     assert not (tmp_path / "out" / "captions.jsonl").exists()

@@ -15,7 +15,7 @@ from caption.schema import CaptionConfig, JudgeConfig
 from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement
 from caption.truth.judge_gold import read_gold
 from cosfly.cli import app
-from cosfly.errors import InputError
+from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -67,8 +67,8 @@ def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
     soft = [c for c in captions if c.judge and not c.repair]
     assert hard, "the specimens must hold a hard conflict"
     assert soft, "the specimens must hold a soft conflict"
-    assert all(c.judge["overruled_by"] == "geometry" and c.verdict != "HARD_CONFLICT" for c in hard)
-    assert all(c.verdict == "SOFT_CONFLICT" and "overruled_by" not in c.judge for c in soft)
+    assert all(c.judge.overruled_by == "geometry" and c.verdict != "HARD_CONFLICT" for c in hard)
+    assert all(c.verdict == "SOFT_CONFLICT" and c.judge.overruled_by is None for c in soft)
     assert report["judgements"] == {"ACCEPT_ALTERNATIVE": len(hard) + len(soft), "overruled_by_geometry": len(hard)}
     assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
 
@@ -77,8 +77,8 @@ def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
 def test_what_cannot_be_read_is_never_an_acceptance(tree, tmp_path, text):
     captions, report, _ = judged(tree, tmp_path / "out", lambda body: text)
     asked = [c for c in captions if c.judge]
-    assert {c.judge["verdict"] for c in asked} == {UNJUDGED}
-    assert all(c.repair and c.repair["rung"] == "anchored" and c.verdict == "CONSISTENT" for c in asked)
+    assert {c.judge.verdict for c in asked} == {UNJUDGED}
+    assert all(c.repair and c.repair.rung == "anchored" and c.verdict == "CONSISTENT" for c in asked)
     assert report["judgements"] == {UNJUDGED: len(asked)}
 
 
@@ -88,7 +88,7 @@ def test_a_judge_that_does_not_answer_leaves_conflicts_unjudged(tree, tmp_path):
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     asked = [c for c in captions if c.judge]
     assert asked
-    assert all(c.judge["verdict"] == UNJUDGED and "http_500" in c.judge["reason"] for c in asked)
+    assert all(c.judge.verdict == UNJUDGED and "http_500" in c.judge.reason for c in asked)
     assert all(c.verdict == "CONSISTENT" for c in asked)
 
 
@@ -97,7 +97,7 @@ def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_
     captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
     asked = [c for c in captions if c.judge]
     # The rule teacher names its decision in the text, so replacing the token alone would make a lie.
-    assert all(c.judge["overruled_by"] == "text" and c.repair["rung"] == "anchored" for c in asked)
+    assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
 
 
 def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
@@ -108,9 +108,9 @@ def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
     fixed = [c for c in captions if c.repair]
     assert fixed
     for caption in fixed:
-        assert caption.repair["rung"] == caption.repair["strategy"] == "fix_label"
-        assert caption.repair["asks"] == 0
-        assert caption.repair["first_decision"] == "hover"
+        assert caption.repair.rung == caption.repair.strategy == "fix_label"
+        assert caption.repair.asks == 0
+        assert caption.repair.first_decision == "hover"
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
 
 
@@ -122,9 +122,25 @@ def test_judgements_are_kept_and_not_asked_again(tree, tmp_path):
         asked = len(server.bodies)
         assert asked > 0
         (tmp_path / "out" / "manifest.json").unlink()
-        (tmp_path / "out" / "items.jsonl").unlink()
         assert run(cfg, tree, tmp_path / "out").read_bytes() == first
         assert len(server.bodies) == asked
+
+
+def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
+    out, reject = tmp_path / "out", '{"verdict": "REJECT_REGEN", "reason": "no"}'
+    with judging_server(lambda body: reject) as server:  # each judgement: 1,000 tokens in, 100 out
+        settings = {"judge": {"url": server.url, "concurrency": 2}, "endpoint": {"max_tokens": 64}}
+        with pytest.raises(TeacherError, match="stopped before the budget was passed"):
+            run(CaptionConfig.model_validate(settings | {"budget": {"max_tokens": 10_000}}), tree, out)
+        assert 0 < len(server.bodies) * 1100 <= 10_000
+        whole = run(CaptionConfig.model_validate(settings), tree, out).read_bytes()
+        num_asked = len(server.bodies)
+        report = json.loads((out / "caption_report.json").read_text())
+        assert run(CaptionConfig.model_validate(settings), tree, tmp_path / "other").read_bytes() == whole
+        assert len(server.bodies) == 2 * num_asked  # what was judged before the budget stopped was not asked again
+    assert report["judge_tokens"] == {"prompt_tokens": 1000 * num_asked, "completion_tokens": 100 * num_asked}
+    assert report["tokens"] == {"completion_tokens": 0, "prompt_tokens": 0}  # the rule teacher's
+    assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
 
 
 # --- the check --------------------------------------------------------------------------------------------------------

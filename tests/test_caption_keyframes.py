@@ -20,7 +20,8 @@ LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=6
 
 def test_a_hand_made_flight():
     labels = ["a", "a", "a", "b", "b", "b", "b", "b", "a", None, None]
-    assert choose_keyframes(labels, 3) == {
+    found = choose_keyframes(labels, 3)
+    assert {i: keyframe.model_dump() for i, keyframe in found.items()} == {
         0: {"reason": "start", "skipped": 2, "missed": 0},
         3: {"reason": "change", "skipped": 2, "missed": 0},
         6: {"reason": "stride", "skipped": 1, "missed": 0},
@@ -34,8 +35,8 @@ def test_a_hand_made_flight():
 def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride):
     chosen = choose_keyframes(labels, stride)
     assert missed_changes(labels, set(chosen)) == []
-    assert len(chosen) + sum(keyframe["skipped"] for keyframe in chosen.values()) == len(labels)
-    assert all(keyframe["skipped"] < stride for keyframe in chosen.values())
+    assert len(chosen) + sum(keyframe.skipped for keyframe in chosen.values()) == len(labels)
+    assert all(keyframe.skipped < stride for keyframe in chosen.values())
     # Whoever gives each window the label of the keyframe before it gets the flight's labels back.
     spread = [labels[max(k for k in chosen if k <= i)] for i in range(len(labels))]
     assert spread == labels
@@ -43,7 +44,7 @@ def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride
 
 def test_the_count_of_missed_changes_can_fail():
     assert missed_changes(["a", "b", "b", "a"], {0, 3}) == [1]
-    assert choose_keyframes(["a"] * 8, 20)[0]["skipped"] == 7
+    assert choose_keyframes(["a"] * 8, 20)[0].skipped == 7
 
 
 def test_a_run_reports_what_it_saved(tmp_path):
@@ -68,7 +69,8 @@ def test_a_run_reports_what_it_saved(tmp_path):
             assert before == after or sample.observed.sample_id in ids
     # The window itself is the same one: only the mark is added.
     for caption in taken:
-        assert caption.checks.pop("keyframe")["missed"] == 0
+        assert caption.checks.keyframe.missed == 0
+        caption.checks.keyframe = None
         assert caption == every[caption.sample_id]
     assert json.loads((tmp_path / "plain" / "caption_report.json").read_text())["keyframes"] is None
 

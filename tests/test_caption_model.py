@@ -8,11 +8,11 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
+from teacher_server import kept_answers
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
-from cosfly.journal import Journal
 from cosfly.products.captions import parse_answer, read_captions
 from distill.student import make_tiny_student
 from specimens import make_playback_tree
@@ -42,7 +42,7 @@ def settings(server: ModelServer, **changes) -> CaptionConfig:
 def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 13, with_augmented=False)
     path = run(settings(server), tree, tmp_path / "out")
-    answers = list(Journal(tmp_path / "out" / "answers.jsonl").read())
+    answers = kept_answers(tmp_path / "out")
     assert len(answers) == server.num_answers > 0
     assert server.num_images >= 4 * 15
     for answer in answers:

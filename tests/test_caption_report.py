@@ -8,10 +8,11 @@ from html.parser import HTMLParser
 
 import pytest
 
-from caption.run.ledger import NUM_CARDS, Shelf
+from caption.run.ledger import NUM_CARDS, CaptionReport, Shelf
 from caption.run.report import page_html
 from caption.run.stage import run
-from caption.schema import BudgetConfig, CaptionConfig
+from caption.schema import CaptionConfig
+from cosfly.chat.budget import BudgetConfig
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -61,6 +62,10 @@ def test_the_page_is_whole_self_contained_and_small(done):
         assert words in text
 
 
+def report_of(done):
+    return CaptionReport.model_validate_json((done / "caption_report.json").read_text())
+
+
 def test_its_numbers_are_the_reports(done):
     report = json.loads((done / "caption_report.json").read_text())
     text = (done / "report.html").read_text(encoding="utf-8")
@@ -77,7 +82,7 @@ def test_its_numbers_are_the_reports(done):
 
 
 def test_text_of_a_teacher_cannot_become_markup(done):
-    report = json.loads((done / "caption_report.json").read_text())
+    report = report_of(done)
     caption = next(read_captions(done / "captions.jsonl"))
     evil = caption.en.model_copy(update={"reasoning_trace": "<script>alert(1)</script> & so on"})
     page = page_html(report, [caption.model_copy(update={"en": evil})], {}, BudgetConfig())
@@ -87,8 +92,8 @@ def test_text_of_a_teacher_cannot_become_markup(done):
 
 
 def test_cost_is_told_when_there_are_prices(done):
-    report = json.loads((done / "caption_report.json").read_text())
-    report["tokens"] = {"prompt_tokens": 2_000_000, "completion_tokens": 100_000}
+    used = {"prompt_tokens": 2_000_000, "completion_tokens": 100_000}
+    report = report_of(done).model_copy(update={"tokens": used})
     page = page_html(report, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0))
     assert ">1.30<" in page
     assert "no prices set" in page_html(report, [], {}, BudgetConfig())

@@ -39,7 +39,7 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     assert {caption.sample_id: caption.label for caption in captions} == expected
     assert len(captions) == 6 * 9
     for caption in captions:
-        assert caption.teacher["kind"] == "rules"
+        assert caption.teacher.kind == "rules"
         assert caption.window[-1] == caption.frame_index
         assert caption.future[0] == caption.frame_index + 1
         assert caption.status == "accepted"
@@ -56,7 +56,7 @@ def test_the_report_adds_up_and_repairs_stay_on_record(done):
     repaired = [caption for caption in captions if caption.repair]
     assert repaired, "the specimens must hold a conflict for this test to mean anything"
     assert report["repair"]["rejected"] == report["verdicts_of_first_answers"]["HARD_CONFLICT"] == len(repaired)
-    assert all(c.repair["strategy"] == "anchored" and c.en.flight_decision == c.label for c in repaired)
+    assert all(c.repair.strategy == "anchored" and c.en.flight_decision == c.label for c in repaired)
     first = sum(count for row in report["confusion_label_to_first_decision"].values() for count in row.values())
     assert first == sum(report["verdicts_of_first_answers"].values()) == 54
     assert not (done / "parts").exists()

@@ -14,14 +14,14 @@ import time
 from pathlib import Path
 
 import pytest
-from teacher_server import MODEL, TeacherServer, is_mirror
+from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.teacher import KEY_VARIABLE, base_url, shown_url
+from cosfly.chat.client import KEY_VARIABLE
+from cosfly.chat.protocol import base_url, shown_url
 from cosfly.chat.throttle import Throttle
 from cosfly.errors import ResumeError, TeacherError
-from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -155,9 +155,9 @@ def test_anchored_repair_enforces_the_label(tree, tmp_path):
     repaired = [caption for caption in read_captions(path) if caption.repair]
     assert repaired, "the seeded decisions must hit a hard conflict for this test to mean anything"
     for caption in repaired:
-        assert caption.repair["first_verdict"] == "HARD_CONFLICT"
-        assert caption.repair["strategy"] == "anchored"
-        assert caption.repair["first_decision"] != caption.label
+        assert caption.repair.first_verdict == "HARD_CONFLICT"
+        assert caption.repair.strategy == "anchored"
+        assert caption.repair.first_decision != caption.label
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
         assert caption.verdict == "CONSISTENT"
     anchored = [json.loads(body) for body in server.bodies if b"Hard constraint" in body]
@@ -182,17 +182,17 @@ def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
     repaired = [caption for caption in read_captions(path) if caption.repair]
     assert repaired
     for caption in repaired:
-        assert caption.repair["strategy"] == strategy
-        assert caption.repair["first_decision"] == "hover"
+        assert caption.repair.strategy == strategy
+        assert caption.repair.first_decision == "hover"
         if "anchored" in rungs:
-            assert caption.repair["rung"] == "anchored"
-            assert caption.repair["asks"] == rungs.index("anchored") + 1
+            assert caption.repair.rung == "anchored"
+            assert caption.repair.asks == rungs.index("anchored") + 1
             assert caption.en.flight_decision == caption.label
         else:
-            assert (caption.repair["rung"], caption.repair["asks"]) == (None, 3)
+            assert (caption.repair.rung, caption.repair.asks) == (None, 3)
             assert caption.drop_reason == "regeneration_failed"
     hints = sum(b"Hint: an earlier answer" in body for body in server.bodies)
-    assert hints == len(repaired) * rungs[: repaired[0].repair["asks"]].count("hint")
+    assert hints == len(repaired) * rungs[: repaired[0].repair.asks].count("hint")
     repair = report_of(tmp_path / "out")["repair"]
     assert repair["rejected"] == sum(repair["rungs"].values()) == len(repaired)
 
@@ -206,7 +206,7 @@ def test_a_hint_can_mend_a_conflict(tree, tmp_path):
     with TeacherServer(decision=decide) as server:
         cfg = settings(server.url, repair={"strategy": "cascade"})
         path = run(cfg, tree, tmp_path / "out")
-    rungs = {caption.repair["rung"] for caption in read_captions(path) if caption.repair}
+    rungs = {caption.repair.rung for caption in read_captions(path) if caption.repair}
     assert "hint" in rungs
 
 
@@ -216,7 +216,7 @@ def test_a_server_that_ignores_the_schema_exhausts_the_asks(tree, tmp_path):
     captions = list(read_captions(path))
     failed = [caption for caption in captions if caption.drop_reason == "regeneration_failed"]
     assert failed
-    assert all(caption.repair["asks"] == 3 and caption.repair["outcome"] == "failed" for caption in failed)
+    assert all(caption.repair.asks == 3 and caption.repair.outcome == "failed" for caption in failed)
     repair = report_of(tmp_path / "out")["repair"]
     assert repair["rejected"] == sum(repair["rungs"].values()) == sum(repair["asks"].values())
 
@@ -314,7 +314,7 @@ def test_a_server_with_room_for_three_is_not_flooded(tmp_path):
         endpoint = {"concurrency": 16, "max_tries": 20}
         run(settings(server.url, endpoint=endpoint), tree, tmp_path / "out")
         asked = len(server.bodies)
-        answered = len(list(Journal(tmp_path / "out" / "answers.jsonl").read()))
+        answered = len(kept_answers(tmp_path / "out"))
     assert report_of(tmp_path / "out")["windows"]["failed"] == {}
     assert asked - answered < 0.6 * answered  # most requests are answered at once
     assert asked > answered  # the limit was met
@@ -345,7 +345,7 @@ def test_nothing_answered_is_asked_twice_after_kill_9(tmp_path):
                 time.sleep(0.005)
             os.kill(child.pid, signal.SIGKILL)
             child.wait()
-        answered = {record["key"] for record in Journal(out / "answers.jsonl").read()}
+        answered = {record["key"] for record in kept_answers(out)}
         assert answered, "the kills must fall in the middle"
         assert not (out / "manifest.json").exists()
         found = run(settings(server.url), tree, out).read_bytes()
@@ -353,7 +353,7 @@ def test_nothing_answered_is_asked_twice_after_kill_9(tmp_path):
     in_flight = kills * ENDPOINT["concurrency"]
     assert len(undisturbed.bodies) <= len(server.bodies) <= len(undisturbed.bodies) + in_flight
     assert set(server.digests()) == set(undisturbed.digests())
-    keys = [record["key"] for record in Journal(out / "answers.jsonl").read()]
+    keys = [record["key"] for record in kept_answers(out)]
     assert len(keys) == len(set(keys))
 
 
@@ -364,9 +364,10 @@ def test_a_damaged_journal_line_costs_one_request(tree, tmp_path):
         expected = run(cfg, tree, out).read_bytes()
         asked = len(server.bodies)
         (out / "manifest.json").unlink()
-        lines = (out / "answers.jsonl").read_bytes().splitlines(keepends=True)
+        [journal] = (out / "answers").iterdir()
+        lines = journal.read_bytes().splitlines(keepends=True)
         lines[3] = lines[3].replace(b"pedestrian", b"pedestrain").replace("行人".encode(), "路人".encode())
-        (out / "answers.jsonl").write_bytes(b"".join(lines))
+        journal.write_bytes(b"".join(lines))
         assert run(cfg, tree, out).read_bytes() == expected
     assert len(server.bodies) == asked + 1
 
@@ -385,7 +386,7 @@ def test_records_name_the_teacher(tree, tmp_path):
     with TeacherServer() as server:
         path = run(settings(server.url, limit=1), tree, tmp_path / "out")
     caption = next(read_captions(path))
-    assert caption.teacher["kind"] == "endpoint"
-    assert caption.teacher["model"] == MODEL
-    assert caption.teacher["structured"] == "json_schema"
-    assert caption.usage["prompt_tokens"] == 1000 * caption.attempts
+    assert caption.teacher.kind == "endpoint"
+    assert caption.teacher.model == MODEL
+    assert caption.teacher.structured == "json_schema"
+    assert caption.usage.prompt_tokens == 1000 * caption.attempts

@@ -1,4 +1,4 @@
-"""The vLLM teacher without vLLM: what it asks of the engine, how it reads what the engine gives back, and its absence.
+"""The vLLM engine without vLLM: what it asks of the engine, how it reads what the engine gives back, and its absence.
 
 The stand-in behaves as vLLM 0.26 did on one H200: `enqueue_chat` gives an id with a random part that the output lacks and raises
 ValueError for a prompt that is too long, `step` gives what is finished in any order, a dead engine raises an Exception of its own,
@@ -17,7 +17,9 @@ from teacher_server import CHINESE, ENGLISH, is_mirror
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.vllm_engine import Request, build_request, engine_arguments, load_engine, read_output
+from caption.teachers.teacher import make_engine
+from cosfly.chat.contract import Reply, Usage
+from cosfly.chat.vllm_engine import VllmEngine, read_output
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -109,10 +111,16 @@ def settings(model, **sections) -> CaptionConfig:
     return CaptionConfig.model_validate(shared | sections)
 
 
+def engine_of(model, **sections) -> VllmEngine:
+    engine = make_engine(CaptionConfig.model_validate({"teacher": f"vllm:{model}", **sections}))
+    assert isinstance(engine, VllmEngine)
+    return engine
+
+
 @pytest.mark.skipif(importlib.util.find_spec("vllm") is not None, reason="vllm is installed here")
 def test_without_vllm_one_line_says_what_to_install(model, tmp_path):
     with pytest.raises(EnvironmentMissing, match=r"vLLM engine is not installed.*cosfly\[vllm\]"):
-        load_engine(model, CaptionConfig())
+        engine_of(model).load()
     tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
     with pytest.raises(EnvironmentMissing, match="not installed"):
         run(CaptionConfig(teacher=f"vllm:{model}"), tree, tmp_path / "out")
@@ -125,46 +133,47 @@ def test_a_folder_that_is_no_model(tmp_path):
 
 
 def test_the_engine_gets_our_images_and_no_free_whitespace(model):
-    cfg = CaptionConfig.model_validate({"vllm": {"max_model_len": 8192, "engine": {"gdn_prefill_backend": "triton"}}})
-    arguments = engine_arguments(model, cfg)
+    own = {"max_model_len": 8192, "engine": {"gdn_prefill_backend": "triton"}}
+    arguments = engine_of(model, vllm=own).arguments()
     assert arguments["model"] == str(model)
     assert arguments["limit_mm_per_prompt"] == {"image": 15, "video": 0}
     assert arguments["structured_outputs_config"] == {"backend": "xgrammar", "disable_any_whitespace": True}
     assert arguments["max_model_len"] == 8192
     assert arguments["gdn_prefill_backend"] == "triton"
-    tiled = CaptionConfig.model_validate({"image": {"layout": "tiled"}})
-    assert engine_arguments(model, tiled)["limit_mm_per_prompt"] == {"image": 5, "video": 0}
-    assert "max_model_len" not in engine_arguments(model, tiled)
+    tiled = engine_of(model, image={"layout": "tiled"}).arguments()
+    assert tiled["limit_mm_per_prompt"] == {"image": 5, "video": 0}
+    assert "max_model_len" not in tiled
 
 
-def test_a_request_holds_sampling_and_schema():
+def test_a_request_holds_sampling_and_schema(stand_in, model):
     messages, schema = [{"role": "user", "content": "x"}], {"type": "object"}
-    cfg = CaptionConfig.model_validate({"endpoint": {"temperature": 0.3, "top_p": 0.8, "max_tokens": 99}})
-    request = build_request(cfg, messages, schema, 5)
-    assert request == Request(messages, {"temperature": 0.3, "top_p": 0.8, "max_tokens": 99, "seed": 5}, schema)
-    free = CaptionConfig.model_validate({"endpoint": {"json_schema": False}})
-    assert build_request(free, messages, schema, 5).schema is None
-    more = {"top_k": 20, "chat_template_kwargs": {"enable_thinking": False}}
-    thinking = build_request(CaptionConfig.model_validate({"endpoint": {"extra_body": more}}), messages, schema, 5)
-    assert thinking.sampling["top_k"] == 20
-    assert thinking.template == {"enable_thinking": False}
+
+    def parameters_of(**endpoint) -> dict:
+        engine = engine_of(model, endpoint=endpoint)
+        return engine.parameters(engine.sampling.request(messages, [], schema, 5)).values
+
+    plain = parameters_of(temperature=0.3, top_p=0.8, max_tokens=99)
+    assert plain.pop("structured_outputs").values == {"json": schema}
+    assert plain == {"temperature": 0.3, "top_p": 0.8, "max_tokens": 99, "seed": 5}
+    assert parameters_of(json_schema=False)["structured_outputs"] is None
+    more = parameters_of(extra_body={"top_k": 20, "chat_template_kwargs": {"enable_thinking": False}})
+    assert more["top_k"] == 20
+    assert "chat_template_kwargs" not in more  # goes to the call itself: see the templates below
 
 
 def test_an_output_is_read():
-    found = read_output(output("{}", 10, "length"))
-    assert found == {
-        "text": "{}", "usage": {"prompt_tokens": 10, "completion_tokens": 7}, "finish_reason": "length",
-    }  # fmt: skip
+    found = read_output(output("{}", 10, "length"), "json_schema")
+    assert found == Reply("{}", Usage(prompt_tokens=10, completion_tokens=7), "json_schema", "length")
 
 
 def test_what_vllm_does_not_know_is_a_setting_not_a_crash(stand_in, model):
     with pytest.raises(ConfigError, match=r"caption.vllm.engine.*gdn_prefil"):
-        load_engine(model, CaptionConfig.model_validate({"vllm": {"engine": {"gdn_prefil": "triton"}}}))
+        engine_of(model, vllm={"engine": {"gdn_prefil": "triton"}}).load()
     with pytest.raises(ConfigError, match="top_kk"):
-        load_engine(model, CaptionConfig.model_validate({"endpoint": {"extra_body": {"top_kk": 3}}}))
+        engine_of(model, endpoint={"extra_body": {"top_kk": 3}}).load()
     whitespace = {"structured_outputs_config": {"disable_any_whitespace": True}}
     with pytest.raises(EnvironmentMissing, match=r"does not start.*only supported for xgrammar"):
-        load_engine(model, CaptionConfig.model_validate({"vllm": {"engine": whitespace}}))
+        engine_of(model, vllm={"engine": whitespace}).load()
 
 
 def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_in, model, tmp_path):
@@ -174,9 +183,9 @@ def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_
     path = run(cfg, tree, tmp_path / "out")
     captions = list(read_captions(path))
     assert len(captions) == 14
-    assert {caption.teacher["kind"] for caption in captions} == {"vllm"}
-    assert {caption.teacher["model"] for caption in captions} == {"model-2b"}
-    assert all(caption.usage == {"prompt_tokens": 2560, "completion_tokens": 14} for caption in captions)
+    assert {caption.teacher.kind for caption in captions} == {"vllm"}
+    assert {caption.teacher.model for caption in captions} == {"model-2b"}
+    assert all(caption.usage == Usage(prompt_tokens=2560, completion_tokens=14) for caption in captions)
     assert len(stand_in.asked) == 28
     assert stand_in.templates == [template] * 28
     assert 2 <= max(stand_in.open_at_step) <= 6  # together, and never more than were allowed

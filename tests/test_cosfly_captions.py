@@ -92,9 +92,10 @@ def test_no_text_breaks_the_parser(text):
 
 def a_caption(number):
     prompt = {"en": {"system": "s", "user": "u"}}
+    teacher = {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}}
     return Caption(
         sample_id=f"t_ORI_frame_{number:05d}", town="T", trajectory="t", variant="ORI", frame_index=number, window=[0, 1, 2, 3, 4],
-        future=[5], prompt=prompt, prompt_hash="h", teacher={"kind": "rules"}, usage={"prompt_tokens": 1}, attempts=1,
+        future=[5], prompt=prompt, prompt_hash="h", teacher=teacher, usage={"prompt_tokens": 1}, attempts=1,
         en=Coc(**GOOD), zh=Coc(**GOOD), label="ascend", verdict="SOFT_CONFLICT", status="accepted",
     )  # fmt: skip
 

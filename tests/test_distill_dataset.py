@@ -132,7 +132,7 @@ def test_modalities_are_interleaved_by_frame():
     assert [Path(image).name for image in sample.images[:4]] == ["rgb.png", "depth.npy", "rgb.png", "depth.npy"]
 
 
-REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover"}
+REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,8 @@ from specimens import make_playback_tree
 NUM_POINTS = 12
 CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.")
 
+REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
+
 
 def make_caption(flight, index: int, **change) -> Caption:
     decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
@@ -51,7 +53,7 @@ def make_caption(flight, index: int, **change) -> Caption:
         "future": [index + 1],
         "prompt": {"en": prompt, "zh": prompt},
         "prompt_hash": "0" * 64,
-        "teacher": {"kind": "rules", "model": "rules-1", "settings": {}},
+        "teacher": {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}},
         "usage": {"prompt_tokens": 0, "completion_tokens": 0},
         "attempts": 1,
         "en": Coc(
@@ -66,7 +68,7 @@ def make_caption(flight, index: int, **change) -> Caption:
         ),
         "label": "track_straight",
         "verdict": "CONSISTENT",
-        "repair": {"strategy": "anchored", "asks": 1} if index % 4 == 0 else None,
+        "repair": REPAIR if index % 4 == 0 else None,
         "status": "accepted",
     }
     return Caption(**{**values, **change})

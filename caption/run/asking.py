@@ -7,7 +7,6 @@ last window is done. Windows without an answer sit in `quarantine.jsonl` until a
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections import Counter
 from dataclasses import dataclass, field
@@ -16,21 +15,23 @@ from pathlib import Path
 from caption.run.flights import Allotted
 from caption.run.progress import Display
 from caption.schema import CaptionConfig, Sample
-from caption.teachers.answers import AnswerBook, flight_of
-from caption.teachers.budget import Budget, BudgetSpent
-from caption.teachers.teacher import EndpointTeacher, Teacher, first_budget, shown_url
-from caption.teachers.vllm_engine import PREFIX, VllmTeacher
+from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.judge import open_judge
 from caption.window_loop import caption_window
-from cosfly.chat.client import NoAnswer
+from cosfly.chat.answers import AnswerBook
+from cosfly.chat.budget import BudgetSpent
+from cosfly.chat.contract import NoAnswer, Usage
+from cosfly.chat.protocol import shown_url
 from cosfly.errors import CosflyError, InputError, TeacherError
 from cosfly.products.captions import Caption, write_captions
+from cosfly.products.playback import flight_of
 from cosfly.stage_folder import StageFolder, Tally
 from cosfly.store import dump_json, parse_json, write_bytes
 
 log = logging.getLogger(__name__)
 
-ANSWERS, QUARANTINE, FAILURES = "answers.jsonl", "quarantine.jsonl", "failures.jsonl"
+ANSWERS, JUDGEMENTS = "answers", "judgements"  # folders
+QUARANTINE, FAILURES = "quarantine.jsonl", "failures.jsonl"
 WAITING_WINDOWS = (
     16  # begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked
 )
@@ -44,6 +45,7 @@ class Asked:
     unanswered: list[dict] = field(default_factory=list)
     num_flights_left: int = 0
     stopped: str | None = None
+    judge_usage: Usage | None = None  # of all runs into the folder
 
 
 @dataclass
@@ -67,7 +69,7 @@ class Asking:
         self.unanswered: list[dict] = []
         self.quarantine = _read_quarantine(stage.path / QUARANTINE)
         self.only = frozenset(self.quarantine) if retry_failed else None
-        in_flight = cfg.vllm.batch if cfg.teacher.startswith(PREFIX) else cfg.endpoint.concurrency
+        in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.most_open = in_flight + WAITING_WINDOWS
         self.failed_in_row = self.num_flights_left = 0
         self.stopped: str | None = None
@@ -79,26 +81,27 @@ class Asking:
             TeacherError: no window would get an answer. What was answered is kept.
         """
         asked = Asked(Tally(input=len(allotted)))
-        parts = {flight.name: flight.part(self.stage.path) for flight in allotted}
-        path = self.stage.path / ANSWERS
-        book = AnswerBook(path, lambda name: name in parts and parts[name].exists())
-        if book.num_damaged:
-            log.warning("%s: %d damaged lines are left out", path, book.num_damaged)
-        budget = first_budget(self.cfg.budget, self.cfg.endpoint, self.cfg.image, book)
         guesses = {flight.name: flight.guess_num_windows(self.cfg.window) for flight in allotted}
-        self.book = book
+        self.books = AnswerBook(self.stage.path / ANSWERS), AnswerBook(self.stage.path / JUDGEMENTS)
+        answers, judgements = self.books
+        budget = first_budget(self.cfg, answers.totals, judgements.totals)
         try:
-            with book, Display(sum(guesses.values()), budget) as self.display:
+            with (
+                answers,
+                judgements,
+                Display(sum(guesses.values()), budget, of_judge=judgements.totals) as self.display,
+            ):
                 async with (
-                    open_teacher(self.cfg, book, self.seed, budget) as teacher,
-                    open_judge(self.cfg.judge, self.stage.path, self.seed) as self.judge,
+                    open_teacher(self.cfg, answers, self.seed, budget, self.only) as teacher,
+                    open_judge(self.cfg.judge, self.seed, judgements, budget) as self.judge,
                 ):
-                    teacher.kept.only = self.only
                     await self._ask_all(allotted, teacher, asked.flights, guesses)
         finally:
             self._write_failures()
         asked.flights.input -= self.num_flights_left
         asked.unanswered, asked.num_flights_left, asked.stopped = self.unanswered, self.num_flights_left, self.stopped
+        if judgements.totals:
+            asked.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
         return asked
 
     async def _ask_all(self, allotted: list[Allotted], teacher: Teacher, tally: Tally, guesses: dict[str, int]) -> None:
@@ -205,22 +208,14 @@ class Asking:
             write_captions(gap if flight.has_gap else allotted.part(self.stage.path), flight.captions)
         if not flight.has_gap:
             gap.unlink(missing_ok=True)
-        self.book.forget(allotted.name)
+        for book in self.books:
+            book.forget(allotted.name)
 
     def _write_failures(self) -> None:
         """Write what failed: flights and windows of this run, and the quarantine of all runs."""
         windows = [failure for failure in self.unanswered if failure["code"] != "not_asked"]
         for name, records in ((FAILURES, self.failures + windows), (QUARANTINE, list(self.quarantine.values()))):
             write_bytes(self.stage.path / name, "".join(dump_json(record) + "\n" for record in records).encode())
-
-
-def open_teacher(
-    cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget
-) -> contextlib.AbstractAsyncContextManager[EndpointTeacher | VllmTeacher]:
-    """Make the teacher that the settings name; it is ready inside `async with`."""
-    if cfg.teacher.startswith(PREFIX):
-        return VllmTeacher(cfg, book, seed, budget)
-    return EndpointTeacher(cfg.teacher, cfg.endpoint, cfg.image, book, seed, budget)
 
 
 async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:

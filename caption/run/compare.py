@@ -8,8 +8,8 @@ natural, and the further a constraint moves it, the less it is.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable
-from contextlib import asynccontextmanager
+import itertools
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -17,13 +17,13 @@ from typing import get_args
 
 from rich.table import Table
 
-from caption.run.asking import ANSWERS, open_teacher
+from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
 from caption.schema import CaptionConfig, Sample, Strategy
-from caption.teachers.answers import AnswerBook
-from caption.teachers.teacher import RuleTeacher, Teacher, first_budget
+from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.window_loop import Trial, try_strategy
-from cosfly.chat.client import NoAnswer
+from cosfly.chat.answers import AnswerBook
+from cosfly.chat.contract import NoAnswer
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc
 from cosfly.store import write_json
@@ -86,7 +86,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     value = {
         "schema": "cosfly.compare_strategies",
         "schema_version": "1.0",
-        "teacher": "rules" if cfg.teacher == "rules" else "endpoint",
+        "teacher": cfg.teacher_kind,
         "windows": num_windows,
         "strategies": [asdict(comparison) for comparison in comparisons],
     }
@@ -99,15 +99,17 @@ async def _try_all(
 ) -> tuple[int, dict[Strategy, list[Trial]]]:
     trials: dict[Strategy, list[Trial]] = {strategy: [] for strategy in STRATEGIES}
     num_windows = 0
-    async with _teacher(cfg, out, seed) as teacher:
-        for batch in _batches(_samples(cfg, data), 1 if cfg.teacher == "rules" else cfg.endpoint.concurrency):
-            num_windows += len(batch)
-            for tried in await asyncio.gather(*(_try_each(sample, teacher, cfg) for sample in batch)):
-                if tried is not None and len(trials[STRATEGIES[0]]) < most:
-                    for strategy in STRATEGIES:
-                        trials[strategy].append(tried[strategy])
-            if len(trials[STRATEGIES[0]]) >= most:
-                break
+    with AnswerBook(out / ANSWERS) as book:  # the first answer is asked once for all strategies
+        async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
+            samples = iter(_samples(cfg, data))
+            while batch := list(itertools.islice(samples, cfg.most_in_flight)):
+                num_windows += len(batch)
+                for tried in await asyncio.gather(*(_try_each(sample, teacher, cfg) for sample in batch)):
+                    if tried is not None and len(trials[STRATEGIES[0]]) < most:
+                        for strategy in STRATEGIES:
+                            trials[strategy].append(tried[strategy])
+                if len(trials[STRATEGIES[0]]) >= most:
+                    break
     return num_windows, trials
 
 
@@ -128,28 +130,6 @@ async def _try_each(sample: Sample, teacher: Teacher, cfg: CaptionConfig) -> dic
 def _samples(cfg: CaptionConfig, data: Path) -> Iterable[Sample]:
     for flight in allot(named_flights(data), cfg)[0]:
         yield from (sample for sample in flight.samples(cfg) if sample.problem is None)
-
-
-def _batches(samples: Iterable[Sample], size: int) -> Iterable[list[Sample]]:
-    batch: list[Sample] = []
-    for sample in samples:
-        batch.append(sample)
-        if len(batch) == size:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
-
-
-@asynccontextmanager
-async def _teacher(cfg: CaptionConfig, out: Path, seed: int) -> AsyncIterator[Teacher]:
-    if cfg.teacher == "rules":
-        yield RuleTeacher(seed)
-        return
-    with AnswerBook(out / ANSWERS, lambda flight: False) as book:  # the first answer is asked once for all strategies
-        budget = first_budget(cfg.budget, cfg.endpoint, cfg.image, book)
-        async with open_teacher(cfg, book, seed, budget) as teacher:
-            yield teacher
 
 
 def comparison_table(comparisons: list[Comparison]) -> Table:

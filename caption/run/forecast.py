@@ -9,25 +9,26 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from caption.run.asking import ANSWERS, open_teacher
+from caption.run.asking import ANSWERS
 from caption.run.flights import Allotted, allot, named_flights
 from caption.run.progress import duration
 from caption.run.stage import open_stage
 from caption.schema import CaptionConfig, Sample
-from caption.teachers.answers import AnswerBook
-from caption.teachers.budget import BudgetSpent
-from caption.teachers.prompts import answer_schema, make_question
-from caption.teachers.teacher import EndpointTeacher, first_budget
+from caption.teachers.prompts import make_question
+from caption.teachers.teacher import AskingTeacher, first_budget
 from caption.truth.facts import measure_facts
 from caption.window_loop import caption_window
-from cosfly.chat.client import NoAnswer
+from cosfly.chat.answers import AnswerBook
+from cosfly.chat.budget import BudgetSpent
+from cosfly.chat.contract import NoAnswer
 from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.products.captions import Caption
+from cosfly.products.playback import flight_of
 from cosfly.stage_folder import Resume
 
 TRIAL_WINDOWS = 6
@@ -47,7 +48,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Forecast:
     """What a run will take. Cost is 0 where no price is set."""
 
     num_windows: int  # to do, without those of finished flights
@@ -82,13 +83,13 @@ class Plan:
         return rows
 
 
-def make_plan(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Plan:
+def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Forecast:
     """Estimate a run by asking about a few windows.
 
     Raises:
         ConfigError: the teacher is not an endpoint. InputError: no window. TeacherError: no trial window got an answer.
     """
-    if not cfg.teacher.startswith("http"):
+    if cfg.teacher_kind != "endpoint":
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
     stage = open_stage(cfg, data, out, seed, resume)
     allotted, _ = allot(named_flights(data), cfg)
@@ -98,12 +99,12 @@ def make_plan(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resum
     samples = _trial_samples([flight for flight in left if guesses[flight.name]], guesses, cfg)
     if not samples:
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
-    trial = asyncio.run(_try(cfg, out, seed, samples))
-    return plan_from(trial, num_windows, sum(guesses.values()) - num_windows, cfg)
+    rehearsal = asyncio.run(_rehearse(cfg, out, seed, samples))
+    return forecast_from(rehearsal, num_windows, sum(guesses.values()) - num_windows, cfg)
 
 
 @dataclass(frozen=True)
-class Trial:
+class Rehearsal:
     """What the trial windows took, each in its own place of every list."""
 
     captions: list[Caption]
@@ -111,30 +112,27 @@ class Trial:
     image_tokens: int | None  # of one question with all its pictures
 
 
-def plan_from(trial: Trial, num_windows: int, num_finished: int, cfg: CaptionConfig) -> Plan:
-    """Scale a trial to all windows."""
-    captions = trial.captions
-    prompt = estimate([caption.usage.get("prompt_tokens", 0) for caption in captions]).scaled(num_windows)
-    completion = estimate([caption.usage.get("completion_tokens", 0) for caption in captions]).scaled(num_windows)
+def forecast_from(rehearsal: Rehearsal, num_windows: int, num_finished: int, cfg: CaptionConfig) -> Forecast:
+    """Scale a rehearsal to all windows."""
+    captions = rehearsal.captions
+    prompt = estimate([caption.usage.prompt_tokens for caption in captions]).scaled(num_windows)
+    completion = estimate([caption.usage.completion_tokens for caption in captions]).scaled(num_windows)
     # Every ask but the mirror's carries the pictures; a mirror is at least one ask of an answered window.
     asks_with_pictures = [caption.attempts - (caption.zh is not None) for caption in captions]
     pictures = (
-        None if trial.image_tokens is None else estimate(asks_with_pictures).scaled(trial.image_tokens * num_windows)
+        None
+        if rehearsal.image_tokens is None
+        else estimate(asks_with_pictures).scaled(rehearsal.image_tokens * num_windows)
     )
-    budget = cfg.budget
-    cost = Estimate(
-        *(
-            (getattr(prompt, which) * budget.price_prompt + getattr(completion, which) * budget.price_completion) / 1e6
-            for which in ("low", "expected", "high")
-        )
-    )
-    per_window = estimate(trial.seconds).scaled(num_windows)
+    which = ("low", "expected", "high")
+    cost = Estimate(*(cfg.budget.cost(getattr(prompt, name), getattr(completion, name)) for name in which))
+    per_window = estimate(rehearsal.seconds).scaled(num_windows)
     in_flight = cfg.endpoint.concurrency
     # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's windows.
     seconds = Estimate(
         per_window.low / in_flight, per_window.expected / in_flight, per_window.high / min(len(captions), in_flight)
     )
-    return Plan(
+    return Forecast(
         num_windows=num_windows,
         num_finished=num_finished,
         num_trials=len(captions),
@@ -177,41 +175,39 @@ def _trial_samples(flights: list[Allotted], guesses: dict[str, int], cfg: Captio
     return list(samples.values())
 
 
-async def _try(cfg: CaptionConfig, out: Path, seed: int, samples: list[Sample]) -> Trial:
-    with AnswerBook(out / ANSWERS, lambda name: False) as book:
-        budget = first_budget(cfg.budget, cfg.endpoint, cfg.image, book)
-        async with open_teacher(cfg, book, seed, budget) as teacher:
-            assert isinstance(teacher, EndpointTeacher)
+async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, samples: list[Sample]) -> Rehearsal:
+    with AnswerBook(out / ANSWERS) as book:
+        async with AskingTeacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
             image_tokens = await _image_tokens(samples[0], teacher, cfg)
             results = await asyncio.gather(*(_answered(sample, teacher, cfg) for sample in samples))
         captions = [result for result in results if isinstance(result, Caption)]
-        seconds = [book.latency_s(caption.sample_id) for caption in captions]
+        seconds = [book.latency_s(flight_of(caption.sample_id), caption.sample_id) for caption in captions]
     if not captions:
-        raise TeacherError("no trial window got an answer", where=teacher.client.shown, got=str(results[0]))
-    return Trial(captions, seconds, image_tokens)
+        raise TeacherError("no trial window got an answer", where=teacher.engine.where, got=str(results[0]))
+    return Rehearsal(captions, seconds, image_tokens)
 
 
-async def _answered(sample: Sample, teacher: EndpointTeacher, cfg: CaptionConfig) -> Caption | str:
+async def _answered(sample: Sample, teacher: AskingTeacher, cfg: CaptionConfig) -> Caption | str:
     try:
         return await caption_window(sample, teacher, cfg)
     except (NoAnswer, BudgetSpent) as error:
         return str(error)
 
 
-async def _image_tokens(sample: Sample, teacher: EndpointTeacher, cfg: CaptionConfig) -> int | None:
+async def _image_tokens(sample: Sample, teacher: AskingTeacher, cfg: CaptionConfig) -> int | None:
     """Ask one prompt with and without its pictures, for one token each: the difference is theirs."""
-    question = make_question(sample.observed, measure_facts(sample.observed), cfg.image)
-    messages, _ = await teacher.frames.messages(question)
+    request = await teacher.request(make_question(sample.observed, measure_facts(sample.observed), cfg.image))
     counts: list[int] = []
-    for asked in (messages, [_without_images(message) for message in messages]):
-        body = teacher.body("plan", "image_tokens", asked) | {"max_tokens": 1}
+    for messages in (request.messages, [_without_images(message) for message in request.messages]):
         try:
-            found = await teacher.client.complete(body, answer_schema())
+            reply = await teacher.engine.answer(
+                replace(request, messages=messages, sampling=request.sampling | {"max_tokens": 1})
+            )
         except NoAnswer:
             return None
-        if "prompt_tokens" not in found["usage"]:
+        if reply.usage is None or not reply.usage.prompt_tokens:
             return None
-        counts.append(found["usage"]["prompt_tokens"])
+        counts.append(reply.usage.prompt_tokens)
     return counts[0] - counts[1]
 
 

@@ -4,16 +4,86 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from typing import Any
+from typing import Literal
 
-from cosfly.products.captions import ACTIONS, Caption
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.chat.contract import Usage
+from cosfly.products.captions import ACTIONS, Caption, TeacherRecord
 from cosfly.stage_folder import Tally
 from cosfly.store import sha256_bytes
 
 TEXT_FIELDS = ("critical_components", "reasoning_trace")
 BIN_CHARACTERS = {"en": 25, "zh": 10}  # a Chinese character carries about as much as two or three Latin letters
 NUM_CARDS = 24
-REPORT_SCHEMA, REPORT_VERSION = "cosfly.caption_report", "1.0"
+
+
+# --- the report -------------------------------------------------------------------------------------------------------
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+
+class RepairCounts(_Record):
+    """Rejected answers: rung or, where none mended it, outcome -> count; strategy -> the same; asks -> count."""
+
+    rejected: int
+    rungs: dict[str, int]
+    outcomes_by_strategy: dict[str, dict[str, int]]
+    asks: dict[str, int]
+
+
+class Histogram(_Record):
+    """Lengths of texts: `counts` of bins of so many characters, from length 0 on."""
+
+    bin_characters: int
+    counts: list[int]
+
+
+class KeyframeCounts(_Record):
+    """What keyframes saved and what they missed."""
+
+    windows: int
+    taken: int
+    reasons: dict[str, int]
+    calls_saved: int
+    changes_missed: int
+
+
+class CaptionReport(_Record):
+    """`caption_report.json`. Counts by a word are in falling order; `confusion`: label -> first decision -> count.
+
+    judge_tokens: of all runs into the folder; left out where no judge was asked.
+    """
+
+    schema_: Literal["cosfly.caption_report"] = Field("cosfly.caption_report", alias="schema")
+    schema_version: Literal["1.0"] = "1.0"
+    teacher: TeacherRecord | None
+    flights: Tally
+    windows: Tally
+    asks: int
+    tokens: dict[str, int]
+    structured: dict[str, int]
+    verdicts_of_first_answers: dict[str, int]
+    verdicts_of_accepted: dict[str, int]
+    labels: dict[str, int]
+    confusion: dict[str, dict[str, int]] = Field(alias="confusion_label_to_first_decision")
+    repair: RepairCounts
+    lengths: dict[str, dict[str, Histogram]]  # language -> field
+    judgements: dict[str, int]
+    keyframes: KeyframeCounts | None  # None: all windows were taken
+    bilingual: dict[str, int]
+    evidence_contradictions: dict[str, int]
+    recovered: dict[str, int]
+    judge_tokens: Usage | None = None
+
+    def as_json(self) -> dict:
+        left_out = {"judge_tokens"} if self.judge_tokens is None else set()
+        return self.model_dump(mode="json", by_alias=True, exclude=left_out)
+
+
+# --- the ledger -------------------------------------------------------------------------------------------------------
 
 
 class Shelf:
@@ -63,13 +133,13 @@ class Ledger:
         self.judgements: Counter[str] = Counter()
         self.keyframes: Counter[str] = Counter()
         self.num_skipped = self.num_missed = 0
-        self.teacher: dict[str, Any] = {}
+        self.teacher: TeacherRecord | None = None
 
     def add(self, caption: Caption) -> None:
         self.num_windows += 1
         self.num_asks += caption.attempts
-        self.teacher = {name: value for name, value in caption.teacher.items() if name != "structured"}
-        self.tokens.update(caption.usage)
+        self.teacher = caption.teacher.model_copy(update={"structured": None})
+        self.tokens.update(caption.usage.model_dump())
         self.labels[caption.label or "none"] += 1
         if caption.status == "accepted":
             self.num_accepted += 1
@@ -77,38 +147,39 @@ class Ledger:
         else:
             self.drops[str(caption.drop_reason)] += 1
         if caption.en is not None:
-            first = caption.repair or {"first_verdict": caption.verdict, "first_decision": caption.en.flight_decision}
-            self.first_verdicts[first["first_verdict"]] += 1
-            self.confusion[caption.label or "none", first["first_decision"]] += 1
+            repair = caption.repair
+            self.first_verdicts[str(repair.first_verdict if repair else caption.verdict)] += 1
+            decision = repair.first_decision if repair else caption.en.flight_decision
+            self.confusion[caption.label or "none", decision] += 1
         if caption.repair:
-            self.repairs[caption.repair["rung"] or caption.repair["outcome"]] += 1
-            self.repair_asks[caption.repair["asks"]] += 1
-            self.outcomes[caption.repair["strategy"], caption.repair["rung"] or caption.repair["outcome"]] += 1
+            became = caption.repair.rung or caption.repair.outcome
+            self.repairs[became] += 1
+            self.repair_asks[caption.repair.asks] += 1
+            self.outcomes[caption.repair.strategy, became] += 1
         for language, coc in (("en", caption.en), ("zh", caption.zh)):
             if coc is not None and caption.status == "accepted":
                 for field in TEXT_FIELDS:
                     self.lengths[language, field, len(getattr(coc, field)) // BIN_CHARACTERS[language]] += 1
         self.shelf.add(caption)
         if caption.judge:
-            self.judgements[caption.judge["verdict"]] += 1
-            if "overruled_by" in caption.judge:
-                self.judgements[f"overruled_by_{caption.judge['overruled_by']}"] += 1
-        keyframe = caption.checks.get("keyframe")
-        if keyframe:
-            self.keyframes[keyframe["reason"]] += 1
-            self.num_skipped += keyframe["skipped"]
-            self.num_missed += keyframe["missed"]
+            self.judgements[caption.judge.verdict] += 1
+            if caption.judge.overruled_by is not None:
+                self.judgements[f"overruled_by_{caption.judge.overruled_by}"] += 1
         self._add_checks(caption)
 
     def _add_checks(self, caption: Caption) -> None:
-        evidence = caption.checks.get("evidence")
-        if isinstance(evidence, list):
-            self.evidence.update({problem.partition(":")[0] for problem in evidence})
+        checks = caption.checks
+        if checks.keyframe is not None:
+            self.keyframes[checks.keyframe.reason] += 1
+            self.num_skipped += checks.keyframe.skipped
+            self.num_missed += checks.keyframe.missed
+        if isinstance(checks.evidence, list):
+            self.evidence.update({problem.partition(":")[0] for problem in checks.evidence})
             self.evidence["samples"] += 1
-        if "bilingual" in caption.checks:
-            self.bilingual[caption.checks["bilingual"]] += 1
-        self.recovered.update(caption.checks.get("recovered", ()))
-        self.structured[caption.teacher.get("structured", "none")] += 1
+        if checks.bilingual is not None:
+            self.bilingual[checks.bilingual] += 1
+        self.recovered.update(checks.recovered or ())
+        self.structured[caption.teacher.structured or "none"] += 1
 
     def tally(self, num_unanswered: int) -> Tally:
         """Give the windows' tally and check that nothing was lost."""
@@ -120,38 +191,36 @@ class Ledger:
         assert rejected == sum(self.repair_asks.values())
         return tally
 
-    def report(self, flights: Tally, windows: Tally) -> dict:
-        """Give `caption_report.json`."""
+    def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
         confusion: dict[str, dict[str, int]] = {}
         order = {token: i for i, token in enumerate((*ACTIONS, "none"))}
         for label, decision in sorted(self.confusion, key=lambda pair: (order[pair[0]], order[pair[1]])):
             confusion.setdefault(label, {})[decision] = self.confusion[label, decision]
-        return {
-            "schema": REPORT_SCHEMA,
-            "schema_version": REPORT_VERSION,
-            "teacher": self.teacher,
-            "flights": flights.model_dump(),
-            "windows": windows.model_dump(),
-            "asks": self.num_asks,
-            "tokens": dict(sorted(self.tokens.items())),
-            "structured": _sorted(self.structured),
-            "verdicts_of_first_answers": _sorted(self.first_verdicts),
-            "verdicts_of_accepted": _sorted(self.final_verdicts),
-            "labels": _sorted(self.labels),
-            "confusion_label_to_first_decision": confusion,
-            "repair": {
-                "rejected": sum(self.repairs.values()),
-                "rungs": _sorted(self.repairs),
-                "outcomes_by_strategy": self._outcomes_by_strategy(),
-                "asks": {str(asks): count for asks, count in sorted(self.repair_asks.items())},
-            },
-            "lengths": self._length_report(),
-            "judgements": _sorted(self.judgements),
-            "keyframes": self._keyframe_report(),
-            "bilingual": _sorted(self.bilingual),
-            "evidence_contradictions": _sorted(self.evidence),
-            "recovered": _sorted(self.recovered),
-        }
+        return CaptionReport(
+            teacher=self.teacher,
+            flights=flights,
+            windows=windows,
+            asks=self.num_asks,
+            tokens=dict(sorted(self.tokens.items())),
+            structured=_sorted(self.structured),
+            verdicts_of_first_answers=_sorted(self.first_verdicts),
+            verdicts_of_accepted=_sorted(self.final_verdicts),
+            labels=_sorted(self.labels),
+            confusion=confusion,
+            repair=RepairCounts(
+                rejected=sum(self.repairs.values()),
+                rungs=_sorted(self.repairs),
+                outcomes_by_strategy=self._outcomes_by_strategy(),
+                asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
+            ),
+            lengths=self._lengths(),
+            judgements=_sorted(self.judgements),
+            keyframes=self._keyframes(),
+            bilingual=_sorted(self.bilingual),
+            evidence_contradictions=_sorted(self.evidence),
+            recovered=_sorted(self.recovered),
+            judge_tokens=judge_tokens,
+        )
 
     def _outcomes_by_strategy(self) -> dict[str, dict[str, int]]:
         found: dict[str, dict[str, int]] = {}
@@ -159,29 +228,26 @@ class Ledger:
             found.setdefault(strategy, {})[outcome] = self.outcomes[strategy, outcome]
         return found
 
-    def _length_report(self) -> dict:
-        """Give, per language and field, the width of a bin in characters and the counts from length 0 on."""
-        found: dict[str, dict] = {}
+    def _lengths(self) -> dict[str, dict[str, Histogram]]:
+        found: dict[str, dict[str, Histogram]] = {}
         for language, width in BIN_CHARACTERS.items():
             for field in TEXT_FIELDS:
                 bins = {b: n for (lang, name, b), n in self.lengths.items() if (lang, name) == (language, field)}
                 counts = [bins.get(b, 0) for b in range(max(bins, default=-1) + 1)]
-                found.setdefault(language, {})[field] = {"bin_characters": width, "counts": counts}
+                found.setdefault(language, {})[field] = Histogram(bin_characters=width, counts=counts)
         return found
 
-    def _keyframe_report(self) -> dict | None:
-        """Say what keyframes saved and what they missed; None where all windows were taken."""
+    def _keyframes(self) -> KeyframeCounts | None:
         taken = sum(self.keyframes.values())
         if not taken:
             return None
-        calls = self.num_asks / taken
-        return {
-            "windows": taken + self.num_skipped,
-            "taken": taken,
-            "reasons": _sorted(self.keyframes),
-            "calls_saved": round(self.num_skipped * calls),
-            "changes_missed": self.num_missed,
-        }
+        return KeyframeCounts(
+            windows=taken + self.num_skipped,
+            taken=taken,
+            reasons=_sorted(self.keyframes),
+            calls_saved=round(self.num_skipped * (self.num_asks / taken)),
+            changes_missed=self.num_missed,
+        )
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:

@@ -16,7 +16,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from caption.teachers.budget import Budget
+from cosfly.chat.budget import Budget
 from cosfly.console import SECONDS_BETWEEN_LINES, console
 from cosfly.products.captions import Caption
 
@@ -28,12 +28,22 @@ REFRESHES_PER_S = 4
 class Display:
     """Counts outcomes and shows them. Use as a context manager."""
 
-    def __init__(self, total: int, budget: Budget, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        total: int,
+        budget: Budget,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        of_judge: Counter[str] | None = None,
+    ) -> None:
         """
         Args:
             total: windows of the run, as far as known; `correct_total` mends it.
+            of_judge: the judge's share of `budget.totals`.
         """
         self.total, self.budget = total, budget
+        self._of_judge = Counter() if of_judge is None else of_judge
+        self._of_judge_before = Counter(self._of_judge)
         self.num_before = 0  # windows of flights that were finished earlier
         self.num_accepted = self.num_repaired = self.num_unanswered = 0
         self.dropped: Counter[str] = Counter()
@@ -86,8 +96,11 @@ class Display:
 
     def tokens(self) -> tuple[int, int]:
         """Give the prompt and answer tokens of this run."""
-        used = self.budget.totals
-        return tuple(used[name] - self._answers_before[name] for name in ("prompt_tokens", "completion_tokens"))  # type: ignore[return-value]
+        return self._of_this_run(self.budget.totals, self._answers_before)
+
+    @staticmethod
+    def _of_this_run(now: Counter[str], before: Counter[str]) -> tuple[int, int]:
+        return now["prompt_tokens"] - before["prompt_tokens"], now["completion_tokens"] - before["completion_tokens"]
 
     def line(self) -> str:
         prompt, completion = self.tokens()
@@ -131,6 +144,9 @@ class Display:
         num_answers = self.budget.totals["answers"] - self._answers_before["answers"]
         table.add_row("answers", f"{num_answers:,}")
         table.add_row("tokens", f"{prompt:,} in, {completion:,} out")
+        if self._of_judge["answers"]:
+            prompt, completion = self._of_this_run(self._of_judge, self._of_judge_before)
+            table.add_row("of these the judge's", f"{prompt:,} in, {completion:,} out")
         if self._is_priced:
             spent = self.budget.spent
             table.add_row("cost", f"{spent - self._spent_before:.4f} now, {spent:.4f} in this folder so far")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
-from caption.schema import BudgetConfig
+from caption.run.ledger import CaptionReport, Histogram
+from cosfly.chat.budget import BudgetConfig
 from cosfly.frame_views import thumbnail
 from cosfly.products.captions import ACTIONS, Caption, Coc
 from cosfly.products.frames import frame_name
@@ -58,7 +58,7 @@ DIFFERENT_TEACHER = (
 
 
 def write_page(
-    path: Path, report: Mapping[str, Any], cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
+    path: Path, report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
 ) -> None:
     """Write the page.
 
@@ -69,12 +69,12 @@ def write_page(
 
 
 def page_html(
-    report: Mapping[str, Any], cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
+    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
 ) -> str:
     """Give the page's text."""
-    teacher = report["teacher"]
-    who = f"teacher: {teacher.get('kind', 'none')}, model {teacher.get('model', 'unknown')}"
-    note = f'<p class="note">{escape(DIFFERENT_TEACHER)}</p>' if teacher.get("kind") == "rules" else ""
+    teacher = report.teacher
+    who = f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown"
+    note = f'<p class="note">{escape(DIFFERENT_TEACHER)}</p>' if teacher and teacher.kind == "rules" else ""
     shown = "".join(_card(caption, folders) for caption in cards)
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -87,10 +87,10 @@ def page_html(
 <div class="panel">{_verdicts(report)}</div>
 <h2>Label against the teacher's first decision</h2>
 <p class="lead">Rows: the decision that the real flight implies. Columns: what the teacher decided before any repair. Framed: agreement.</p>
-<div class="panel">{_confusion(report["confusion_label_to_first_decision"])}</div>
+<div class="panel">{_confusion(report.confusion)}</div>
 <h2>Length of the texts</h2>
 <p class="lead">Accepted captions, characters.</p>
-<div class="grid">{_histograms(report["lengths"])}</div>
+<div class="grid">{_histograms(report.lengths)}</div>
 <h2>Re-generation, checks and cost</h2>
 <div class="grid">{_repairs(report)}{_checks(report)}{_cost(report, budget)}</div>
 <h2>{len(cards)} samples</h2>
@@ -100,39 +100,38 @@ def page_html(
 """
 
 
-def _tiles(report: Mapping[str, Any]) -> str:
-    windows = report["windows"]
-    dropped, repaired = sum(windows["dropped"].values()), report["repair"]["rejected"]
+def _tiles(report: CaptionReport) -> str:
+    windows = report.windows
+    dropped, repaired = sum(windows.dropped.values()), report.repair.rejected
     values = [
-        ("windows", windows["input"]),
-        ("accepted", windows["kept"]),
+        ("windows", windows.input),
+        ("accepted", windows.kept),
         ("dropped", dropped),
-        ("unanswered", sum(windows["failed"].values())),
+        ("unanswered", sum(windows.failed.values())),
         ("asked for again", repaired),
-        ("asks in all", report["asks"]),
+        ("asks in all", report.asks),
     ]
-    keyframes = report.get("keyframes")
+    keyframes = report.keyframes
     if keyframes:
         values += [
-            ("calls saved by keyframes", keyframes["calls_saved"]),
-            ("changes missed", keyframes["changes_missed"]),
+            ("calls saved by keyframes", keyframes.calls_saved),
+            ("changes missed", keyframes.changes_missed),
         ]
     return (
         '<div class="tiles">' + "".join(f'<div class="tile"><b>{n:,}</b>{name}</div>' for name, n in values) + "</div>"
     )
 
 
-def _verdicts(report: Mapping[str, Any]) -> str:
+def _verdicts(report: CaptionReport) -> str:
+    first, last = report.verdicts_of_first_answers, report.verdicts_of_accepted
     rows = []
-    for title, key in (("First answers", "verdicts_of_first_answers"), ("Accepted captions", "verdicts_of_accepted")):
-        counts = report[key]
+    for title, counts in (("First answers", first), ("Accepted captions", last)):
         total = sum(counts.values()) or 1
         bars = "".join(
             f'<i style="width:{100 * counts.get(name, 0) / total:.2f}%;background:{color}" title="{name}"></i>'
             for name, (color, _) in VERDICTS.items()
         )
         rows.append(f'<h3>{title} ({sum(counts.values()):,})</h3><div class="stack">{bars}</div>')
-    first, last = report["verdicts_of_first_answers"], report["verdicts_of_accepted"]
     lines = "".join(
         f'<tr><td><span class="key" style="background:{color}"></span>{name}</td><td>{meaning}</td>'
         f'<td class="n">{_share(first, name)}</td><td class="n">{_share(last, name)}</td></tr>'
@@ -171,7 +170,7 @@ def _words(token: str) -> str:
     return escape(token.replace("_", " "))
 
 
-def _histograms(lengths: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+def _histograms(lengths: Mapping[str, Mapping[str, Histogram]]) -> str:
     languages = {"en": "English", "zh": "Chinese"}
     return "".join(
         f'<div class="panel"><h3>{languages[language]}, {_words(field)}</h3>{_histogram(histogram)}</div>'
@@ -180,8 +179,8 @@ def _histograms(lengths: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     )
 
 
-def _histogram(histogram: Mapping[str, Any]) -> str:
-    counts, width = histogram["counts"], histogram["bin_characters"]
+def _histogram(histogram: Histogram) -> str:
+    counts, width = histogram.counts, histogram.bin_characters
     total = sum(counts)
     if not total:
         return "No text."
@@ -210,33 +209,35 @@ def _table(title: str, rows: Sequence[tuple[str, str]], nothing: str) -> str:
     return f'<div class="panel"><h3>{title}</h3>{f"<table>{lines}</table>" if rows else escape(nothing)}</div>'
 
 
-def _repairs(report: Mapping[str, Any]) -> str:
-    repair = report["repair"]
+def _repairs(report: CaptionReport) -> str:
     rows = [
         (f"{strategy}: {outcome.replace('_', ' ')}", f"{count:,}")
-        for strategy, outcomes in repair["outcomes_by_strategy"].items()
+        for strategy, outcomes in report.repair.outcomes_by_strategy.items()
         for outcome, count in outcomes.items()
     ]
-    rows += [(f"after {asks} more ask{'s' if asks != '1' else ''}", f"{n:,}") for asks, n in repair["asks"].items()]
-    judged = [(f"judge: {name.replace('_', ' ')}", f"{n:,}") for name, n in report["judgements"].items()]
+    rows += [(f"after {asks} more ask{'s' if asks != '1' else ''}", f"{n:,}") for asks, n in report.repair.asks.items()]
+    judged = [(f"judge: {name.replace('_', ' ')}", f"{n:,}") for name, n in report.judgements.items()]
     return _table("Re-generation, by strategy and outcome", rows + judged, "No answer was rejected.")
 
 
-def _checks(report: Mapping[str, Any]) -> str:
-    rows = [(f"dropped: {reason}", f"{count:,}") for reason, count in report["windows"]["dropped"].items()]
-    rows += [(f"languages: {name}", f"{count:,}") for name, count in report["bilingual"].items()]
-    rows += [(f"evidence: {name}", f"{count:,}") for name, count in report["evidence_contradictions"].items()]
-    rows += [(f"mended: {name.replace('_', ' ')}", f"{count:,}") for name, count in report["recovered"].items()]
+def _checks(report: CaptionReport) -> str:
+    rows = [(f"dropped: {reason}", f"{count:,}") for reason, count in report.windows.dropped.items()]
+    rows += [(f"languages: {name}", f"{count:,}") for name, count in report.bilingual.items()]
+    rows += [(f"evidence: {name}", f"{count:,}") for name, count in report.evidence_contradictions.items()]
+    rows += [(f"mended: {name.replace('_', ' ')}", f"{count:,}") for name, count in report.recovered.items()]
     return _table("Checks", rows, "Nothing was checked.")
 
 
-def _cost(report: Mapping[str, Any], budget: BudgetConfig) -> str:
-    prompt, answer = (report["tokens"].get(name, 0) for name in ("prompt_tokens", "completion_tokens"))
-    accepted = report["windows"]["kept"]
+def _cost(report: CaptionReport, budget: BudgetConfig) -> str:
+    prompt, answer = (report.tokens.get(name, 0) for name in ("prompt_tokens", "completion_tokens"))
+    accepted, judge = report.windows.kept, report.judge_tokens
     rows = [("prompt tokens", f"{prompt:,}"), ("answer tokens", f"{answer:,}")]
+    if judge is not None:
+        rows.append(("the judge's tokens", f"{judge.prompt_tokens:,} in, {judge.completion_tokens:,} out"))
+        prompt, answer = prompt + judge.prompt_tokens, answer + judge.completion_tokens
     if accepted:
         rows.append(("tokens per accepted caption", f"{(prompt + answer) / accepted:,.0f}"))
-    cost = (prompt * budget.price_prompt + answer * budget.price_completion) / 1e6
+    cost = budget.cost(prompt, answer)
     priced = bool(budget.price_prompt or budget.price_completion)
     rows.append(("cost", f"{cost:,.2f}" if priced else "no prices set"))
     if priced and accepted:
@@ -253,16 +254,16 @@ def _card(caption: Caption, folders: Mapping[str, Path]) -> str:
         tags.append(f'<span class="tag" style="background:{VERDICTS[caption.verdict][0]}">{caption.verdict}</span>')
     tags.append(f'<span class="tag plain">label: {_words(caption.label or "none")}</span>')
     if caption.repair:
-        rung = caption.repair["rung"] or caption.repair["outcome"]
-        first = f"{caption.repair['first_decision']} ({caption.repair['first_verdict']})"
+        rung = caption.repair.rung or caption.repair.outcome
+        first = f"{caption.repair.first_decision} ({caption.repair.first_verdict})"
         tags.append(f'<span class="tag plain">re-generated ({_words(rung)}); first: {_words(first)}</span>')
     if caption.judge:
-        tags.append(f'<span class="tag plain">judge: {_words(caption.judge["verdict"])}</span>')
+        tags.append(f'<span class="tag plain">judge: {_words(caption.judge.verdict)}</span>')
     if caption.status == "dropped":
         tags.append(f'<span class="tag" style="background:#c53030">dropped: {_words(str(caption.drop_reason))}</span>')
     folder = folders.get(f"{caption.trajectory}_{caption.variant}")
     pictures = "".join(_picture(folder, index) for index in caption.window[-5:])
-    problems = caption.checks.get("evidence")
+    problems = caption.checks.evidence
     found = "" if not isinstance(problems, list) else "".join(f'<p class="bad">{escape(p)}</p>' for p in problems)
     return (
         f'<article class="card"><header><b>{escape(caption.sample_id)}</b>{"".join(tags)}</header>'

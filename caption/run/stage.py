@@ -1,6 +1,6 @@
 """Stage `caption`: reads a playback tree, writes `captions.jsonl` and `caption_report.json`.
 
-The rule teacher works on flights in processes; a teacher that takes its time is asked from one process (asking.py). Each
+The rule teacher alone works on flights in processes; who takes its time is asked from one process (asking.py). Each
 finished flight is a part file; the parts are merged last, so that memory stays flat.
 """
 
@@ -17,9 +17,9 @@ from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of
 from caption.run.ledger import Ledger
 from caption.run.report import write_page
 from caption.schema import CaptionConfig
-from caption.teachers.teacher import RuleTeacher, Teacher, shown_url
-from caption.truth.judge import open_judge
+from caption.teachers.teacher import RuleTeacher, Teacher
 from caption.window_loop import caption_window
+from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.runner import Item, Outcome, Work, run_items
@@ -45,7 +45,7 @@ def run(
 
     Args:
         data: playback tree, ours or of the public layout.
-        workers: processes of the rule teacher; an endpoint's requests in flight are `endpoint.concurrency`.
+        workers: processes of the rule teacher without a judge; requests in flight are `endpoint.concurrency`.
         retry_failed: ask only about the windows that stand in `quarantine.jsonl`.
     Returns:
         `captions.jsonl`.
@@ -58,9 +58,9 @@ def run(
     if stage.is_complete and not _has_more(stage, cfg):
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data), cfg)
-    if cfg.teacher == "rules":
-        if retry_failed:
-            raise ConfigError("the rule teacher never fails to answer", where="--retry-failed", fix="give --teacher")
+    if cfg.teacher_kind == "rules" and retry_failed:
+        raise ConfigError("the rule teacher never fails to answer", where="--retry-failed", fix="give --teacher")
+    if cfg.teacher_kind == "rules" and cfg.judge.url is None:
         asked = Asked(_run_rules(stage, allotted, cfg, seed, workers))
     else:
         asked = asyncio.run(Asking(stage, cfg, seed, retry_failed=retry_failed).run(allotted))
@@ -70,14 +70,14 @@ def run(
     if tally.input == 0 and is_whole:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(asked.flights, expected=f"a flight of at least {num_frames} frames")
-    report = ledger.report(asked.flights, tally)
-    write_json(stage.path / REPORT, report)
+    report = ledger.report(asked.flights, tally, asked.judge_usage)
+    write_json(stage.path / REPORT, report.as_json())
     folders = {flight.name: flight.folder for flight in allotted}
     write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
-    outputs = [path for path in (out / PRODUCT, out / REPORT, out / PAGE, out / ANSWERS) if path.exists()]
+    outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
@@ -132,16 +132,16 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
 def _run_rules(stage: StageFolder, allotted: list[Allotted], cfg: CaptionConfig, seed: int, workers: int) -> Tally:
     items = [Item(flight.item_id, flight) for flight in allotted]
     args = (cfg, stage.path, seed)
-    return run_items(stage, items, start_rules, args, workers=workers, label="caption").tally
+    return run_items(stage, items, make_worker, args, workers=workers, label="caption").tally
 
 
-def start_rules(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
-    """Worker factory of run_items: one item is one flight."""
+def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
+    """Make what a process does with one flight."""
     teacher = RuleTeacher(seed)
 
     def work(item: Item) -> Outcome:
         flight: Allotted = item.payload
-        num_windows = asyncio.run(_caption_in_order(flight, teacher, cfg, stage_path, seed))
+        num_windows = asyncio.run(_caption_in_order(flight, teacher, cfg, stage_path))
         if num_windows == 0:
             return Outcome({}, drop_reason="too_short")
         return Outcome({"windows": num_windows})
@@ -149,9 +149,8 @@ def start_rules(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
     return work
 
 
-async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path, seed: int) -> int:
-    async with open_judge(cfg.judge, stage_path, seed) as judge:
-        captions = [await caption_window(sample, teacher, cfg, judge) for sample in flight.samples(cfg)]
+async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path) -> int:
+    captions = [await caption_window(sample, teacher, cfg) for sample in flight.samples(cfg)]
     if captions:
         write_captions(flight.part(stage_path), captions)
     return len(captions)

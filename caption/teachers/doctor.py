@@ -88,33 +88,36 @@ class _Examination:
     def __init__(self, url: str, cfg: CaptionConfig) -> None:
         self.cfg = cfg
         self.client = ChatClient(url, cfg.endpoint)
-        self.model = ""
         self.findings: list[Finding] = []
         self.tokens_per_image: int | None = None
-        frames = cfg.window.num_frames
-        self.num_images = frames if cfg.image.layout == "tiled" else frames * len(cfg.image.modalities)
+        self.num_images = cfg.num_images
 
     async def run(self) -> list[Finding]:
         try:
-            self.model = await self.client.find_model()
+            await self.client.start()
         except TeacherError as error:
             return [Finding("model", "unusable", str(error))]
         else:
-            self._add("model", "ok", self.model)
+            self._add("model", "ok", self.client.model)
             if await self._text():
                 await self._cut()
                 await self._schema()
                 if await self._image() and await self._many_images():
                     await self._largest_prompt()
         finally:
-            await self.client.aclose()
+            await self.client.close()
         return self.findings
 
     def _add(self, name: str, state: State, detail: str) -> None:
         self.findings.append(Finding(name, state, detail))
 
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Probe:
-        body: dict[str, Any] = {"model": self.model, "messages": messages, "temperature": 0.0, "max_tokens": max_tokens}
+        body: dict[str, Any] = {
+            "model": self.client.model,
+            "messages": messages,
+            "temperature": 0.0,
+            "max_tokens": max_tokens,
+        }
         body |= self.cfg.endpoint.extra_body
         if schema is not None:
             body["response_format"] = response_format(schema)

@@ -1,33 +1,33 @@
 """Teachers: who answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `EndpointTeacher` asks a chat-completions server, `VllmTeacher` (vllm_teacher.py)
-an engine in this process; both journal every answer before they hand it on, through `KeptAnswers`.
+`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/chat); every answer
+is journaled before it is handed on.
 """
 
 from __future__ import annotations
 
 import asyncio
 import os
-import time
-from collections.abc import Awaitable, Callable
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager, nullcontext
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from caption.schema import BudgetConfig, ImageConfig, Reply
-from caption.teachers.answers import AnswerBook
-from caption.teachers.budget import Budget
+from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, answer_schema, mirror_messages, mirror_schema, question_messages
 from caption.teachers.rules import MODEL, write_answers
 from cosfly.chance import rng_for
-from cosfly.chat.client import KEY_VARIABLE, ChatClient, EndpointConfig, NoAnswer
-from cosfly.chat.protocol import answer_key, base_url, shown_url, with_image_ids
+from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.budget import Budget
+from cosfly.chat.client import ChatClient
+from cosfly.chat.contract import Engine, Reply, Request
+from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.frame_views import View
-from cosfly.products.captions import Coc
+from cosfly.products.captions import Coc, TeacherRecord, TeacherSettings
+from cosfly.products.playback import flight_of
 from cosfly.store import dump_json
-
-__all__ = ["KEY_VARIABLE", "EndpointTeacher", "NoAnswer", "RuleTeacher", "Teacher", "base_url", "shown_url"]
 
 ENCODING_THREADS = 4
 CHARACTERS_PER_TOKEN = 3  # a low guess: it only bounds the first requests of a limited budget
@@ -37,7 +37,7 @@ PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders; the same
 class Teacher(Protocol):
     """`ask` answers in English, `mirror` gives the Chinese of an English answer."""
 
-    record: dict[str, Any]
+    record: TeacherRecord
 
     async def ask(self, question: Question) -> Reply: ...
 
@@ -52,7 +52,7 @@ class RuleTeacher:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.record: dict[str, Any] = {"kind": "rules", "model": MODEL, "settings": {"seed": seed}}
+        self.record = TeacherRecord(kind="rules", model=MODEL, settings=TeacherSettings(seed=seed))
         self._last: tuple[str, tuple[Coc, Coc]] | None = None
 
     def _answers(self, question: Question) -> tuple[Coc, Coc]:
@@ -70,49 +70,7 @@ class RuleTeacher:
 
 
 def _native(answer: Coc) -> Reply:
-    return Reply(dump_json(answer.model_dump()), {}, "native", "stop")
-
-
-# --- answers that are kept --------------------------------------------------------------------------------------------
-
-
-class KeptAnswers:
-    """Gives an answer from the journal, or has it made, within the budget, and journals it.
-
-    only: sample ids that may be asked about; None: all. Of the others only what the journal holds is given.
-    """
-
-    def __init__(self, book: AnswerBook, budget: Budget, where: str) -> None:
-        self.book, self.budget, self.where = book, budget, where
-        self.only: frozenset[str] | None = None
-
-    async def give(
-        self,
-        identity: dict[str, str],
-        body: dict,
-        digests: list[str],
-        schema: dict,
-        make: Callable[[], Awaitable[dict]],
-    ) -> Reply:
-        """
-        Args:
-            identity: sample_id and purpose, for the journal.
-            make: gives text, usage, structured and finish_reason.
-        Raises:
-            NoAnswer: there is none. BudgetSpent: one more request might pass a limit.
-        """
-        key = answer_key(body, digests, schema)
-        known = self.book.get(key)
-        if known is None:
-            if self.only is not None and identity["sample_id"] not in self.only:
-                raise NoAnswer("not_asked", "this run asks about other windows only")
-            with self.budget.request():
-                start_s = time.monotonic()
-                known = {"key": key, **identity, "model": body["model"], **await make()}
-                known |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
-                await self.book.put(known)  # on the disk before anything is derived from it
-            self.budget.note(known["usage"], self.where)
-        return Reply(known["text"], known["usage"], known["structured"], known["finish_reason"])
+    return Reply(dump_json(answer.model_dump()), None, "native", "stop")
 
 
 class SharedFrames:
@@ -153,71 +111,90 @@ def sampling_seed(seed: int, sample_id: str, purpose: str) -> int:
     return int(rng_for(seed, "teacher", f"{sample_id}/{purpose}").integers(1 << 31))
 
 
-def first_budget(cfg: BudgetConfig, endpoint: EndpointConfig, image: ImageConfig, book: AnswerBook) -> Budget:
-    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much text."""
-    pictures = 16 * image.max_side_px * image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
-    return Budget(
-        cfg, book.totals, first_prompt=pictures + 6000 // CHARACTERS_PER_TOKEN, first_completion=endpoint.max_tokens
-    )
+def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
+    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much text.
+
+    Args:
+        counts: `totals` of each book of answers.
+    """
+    pictures = 16 * cfg.image.max_side_px * cfg.image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
+    first = pictures + 6000 // CHARACTERS_PER_TOKEN
+    return Budget(cfg.budget, *counts, first_prompt=first, first_completion=cfg.endpoint.max_tokens)
 
 
-# --- endpoint ---------------------------------------------------------------------------------------------------------
+# --- a language model -------------------------------------------------------------------------------------------------
 
 
-class EndpointTeacher:
-    """Asks a chat-completions server. Use as an async context manager."""
+class AskingTeacher:
+    """Asks a language model. Use as an async context manager; its engine is started on entry."""
 
     def __init__(
-        self,
-        url: str,
-        cfg: EndpointConfig,
-        image: ImageConfig,
-        answers: AnswerBook,
-        seed: int,
-        budget: Budget | None = None,
+        self, cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget, only: frozenset[str] | None = None
     ) -> None:
-        self.cfg, self.seed = cfg, seed
-        self.record: dict[str, Any] = {}
-        self.client = ChatClient(url, cfg)
-        self.frames = SharedFrames(image)
-        budget = budget or first_budget(BudgetConfig(), cfg, image, answers)
-        self.kept = KeptAnswers(answers, budget, self.client.shown)
+        self.cfg, self.seed = cfg.endpoint, seed
+        self.engine = make_engine(cfg)
+        self.kept = KeptAnswers(self.engine, book, budget, only)
+        self.frames = SharedFrames(cfg.image)
 
-    async def __aenter__(self) -> EndpointTeacher:
+    async def __aenter__(self) -> AskingTeacher:
         try:
-            model = await self.client.find_model()
+            await self.engine.start()
         except BaseException:
             await self.__aexit__()
             raise
         c = self.cfg
-        settings = {"temperature": c.temperature, "top_p": c.top_p, "max_tokens": c.max_tokens, "seed": self.seed}
-        self.record = {"kind": "endpoint", "model": model, "settings": settings | {"extra_body": dict(c.extra_body)}}
+        settings = TeacherSettings(
+            temperature=c.temperature,
+            top_p=c.top_p,
+            max_tokens=c.max_tokens,
+            seed=self.seed,
+            extra_body=dict(c.extra_body),
+        )
+        self.record = TeacherRecord(kind=self.engine.kind, model=self.engine.model, settings=settings)
         return self
 
     async def __aexit__(self, *exc: object) -> None:
         self.frames.close()
-        await self.client.aclose()
+        await self.engine.close()
 
     async def ask(self, question: Question) -> Reply:
-        messages, digests = await self.frames.messages(question)
-        schema = answer_schema(question.decision)
-        return await self.complete(question.window.sample_id, question.purpose, messages, digests, schema)
+        request = await self.request(question)
+        sample_id = question.window.sample_id
+        return await self.kept.ask(request, flight_of(sample_id), sample_id, question.purpose)
 
     async def mirror(self, question: Question, english: Coc, ask: int) -> Reply:
+        sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
         schema = mirror_schema(english.flight_decision)
-        return await self.complete(question.window.sample_id, f"mirror/{ask}", mirror_messages(english), [], schema)
+        request = self.cfg.request(mirror_messages(english), [], schema, sampling_seed(self.seed, sample_id, purpose))
+        return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
-    async def complete(
-        self, sample_id: str, purpose: str, messages: list[dict], digests: list[str], schema: dict
-    ) -> Reply:
-        """Give the answer to any chat messages, from the journal or the server."""
-        body = self.body(sample_id, purpose, messages)
-        sent = body | {"messages": with_image_ids(messages, digests)} if self.cfg.image_uuid else body
-        identity = {"sample_id": sample_id, "purpose": purpose}
-        return await self.kept.give(identity, body, digests, schema, lambda: self.client.complete(sent, schema))
+    async def request(self, question: Question) -> Request:
+        """Give what is asked of the engine.
 
-    def body(self, sample_id: str, purpose: str, messages: list[dict]) -> dict[str, Any]:
-        """Give a request without its response format."""
-        c = self.cfg
-        body = {"model": self.record["model"], "messages": messages, "temperature": c.temperature, "top_p": c.top_p}
-        return body | {"max_tokens": c.max_tokens, "seed": sampling_seed(self.seed, sample_id, purpose)} | c.extra_body
+        Raises:
+            InputError, RenderError: a picture cannot be read or encoded.
+        """
+        messages, digests = await self.frames.messages(question)
+        seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
+        return self.cfg.request(messages, digests, answer_schema(question.decision), seed)
+
+
+def make_engine(cfg: CaptionConfig) -> Engine:
+    """Make the engine that the settings name.
+
+    Raises:
+        InputError: it is not a model folder.
+    """
+    if cfg.teacher_kind == "endpoint":
+        return ChatClient(cfg.teacher, cfg.endpoint)
+    folder = Path(cfg.teacher.removeprefix("vllm:"))
+    return VllmEngine(folder, cfg.vllm, cfg.endpoint, num_images=cfg.num_images, settings="caption")
+
+
+def open_teacher(
+    cfg: CaptionConfig, book: AnswerBook, seed: int, budget: Budget, only: frozenset[str] | None = None
+) -> AbstractAsyncContextManager[Teacher]:
+    """Make the teacher that the settings name; it is ready inside `async with`."""
+    if cfg.teacher_kind == "rules":
+        return nullcontext(RuleTeacher(seed))
+    return AskingTeacher(cfg, book, seed, budget, only)

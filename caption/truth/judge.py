@@ -1,7 +1,7 @@
 """Phase 4, optional: a language model judges conflicts between a decision and the label; geometry keeps the last word.
 
-A judgement that cannot be read is `unjudged`, never an acceptance. Judgements are journaled per flight, so that a run that is
-continued asks nothing twice. `check_judge` measures a judge on a small gold set before its verdicts are used.
+A judgement that cannot be read is `unjudged`, never an acceptance. Judgements are kept as a teacher's answers are, and count in the
+same budget. `check_judge` measures a judge on a small gold set before its verdicts are used.
 """
 
 from __future__ import annotations
@@ -11,24 +11,23 @@ from collections import Counter
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.teachers.answers import flight_of
 from caption.teachers.prompts import read_prompt
-from cosfly.chat.client import ChatClient, EndpointConfig, NoAnswer
-from cosfly.chat.protocol import answer_key, shown_url
+from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.budget import Budget
+from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.contract import NoAnswer, Request, started
 from cosfly.errors import InputError
-from cosfly.journal import Journal
-from cosfly.products.captions import Coc
+from cosfly.products.captions import Coc, JudgeRecord
+from cosfly.products.playback import flight_of
 from cosfly.store import dump_json
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"
-FOLDER = "judgements"
 
 _MEANINGS: dict[Judgement, str] = {
     "ACCEPT_ALTERNATIVE": "the reasoning is sound and its decision is an acceptable alternative to the label",
@@ -84,60 +83,34 @@ def parse_judgement(text: str) -> tuple[str, str]:
 class Judge:
     """Asks an endpoint about conflicts. Made by `open_judge`."""
 
-    def __init__(self, client: ChatClient, model: str, cfg: JudgeConfig, folder: Path | None, seed: int) -> None:
-        self.client, self.model, self.cfg, self.folder, self.seed = client, model, cfg, folder, seed
-        self.usage: Counter[str] = Counter()
-        self._known: dict[str, dict[str, dict]] = {}  # flight -> key -> record
-        self._journals: dict[str, Journal] = {}
+    def __init__(self, kept: KeptAnswers, cfg: JudgeConfig, seed: int) -> None:
+        self.kept, self.cfg, self.seed = kept, cfg, seed
 
-    async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> dict[str, Any]:
-        """Give {verdict, reason, model}; the verdict is `unjudged` where none could be read or the judge did not answer."""
-        body = {"model": self.model, "messages": judge_messages(case, order), "temperature": 0.0, "seed": self.seed}
-        body |= {"max_tokens": self.cfg.max_tokens, **self.cfg.extra_body}
-        schema = judge_schema(order)
-        key = answer_key(body, [], schema)
-        flight = flight_of(case.sample_id)
-        known = self._read(flight).get(key)
-        if known is None:
-            try:
-                found = await self.client.complete(body, schema)
-            except NoAnswer as error:  # not kept: a later run may ask again
-                return {"verdict": UNJUDGED, "reason": f"no answer: {error.cause}", "model": self.model}
-            known = {"key": key, "sample_id": case.sample_id, "text": found["text"], "usage": found["usage"]}
-            self._keep(flight, known)
-        self.usage.update(known["usage"])
-        verdict, reason = parse_judgement(known["text"])
-        return {"verdict": verdict, "reason": reason, "model": self.model}
+    async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
+        """Judge a case; the verdict is `unjudged` where none could be read or the judge did not answer.
 
-    def _read(self, flight: str) -> dict[str, dict]:
-        if flight not in self._known:
-            while len(self._known) >= self.cfg.open_flights:
-                oldest = next(iter(self._known))
-                del self._known[oldest]
-                if oldest in self._journals:
-                    self._journals.pop(oldest).close()
-            records = [] if self.folder is None else Journal(self.folder / f"{flight}.jsonl").read()
-            self._known[flight] = {record["key"]: record for record in records}
-        return self._known[flight]
-
-    def _keep(self, flight: str, record: dict) -> None:
-        if self.folder is not None:
-            if flight not in self._journals:
-                self._journals[flight] = Journal(self.folder / f"{flight}.jsonl")
-            self._journals[flight].append(record)
-        self._read(flight)[record["key"]] = record
-
-    def close(self) -> None:
-        for journal in self._journals.values():
-            journal.close()
+        Raises:
+            BudgetSpent: one more request might pass a limit.
+        """
+        sampling = {"temperature": 0.0, "seed": self.seed, "max_tokens": self.cfg.max_tokens, **self.cfg.extra_body}
+        request = Request(judge_messages(case, order), [], judge_schema(order), sampling)
+        try:
+            reply = await self.kept.ask(request, flight_of(case.sample_id), case.sample_id, "judge")
+        except NoAnswer as error:  # not kept: a later run may ask again
+            verdict, reason = UNJUDGED, f"no answer: {error.cause}"
+        else:
+            verdict, reason = parse_judgement(reply.text)
+        return JudgeRecord(verdict=verdict, reason=reason, model=self.kept.engine.model)
 
 
 @asynccontextmanager
-async def open_judge(cfg: JudgeConfig, stage_path: Path | None, seed: int) -> AsyncIterator[Judge | None]:
+async def open_judge(
+    cfg: JudgeConfig, seed: int, book: AnswerBook | None = None, budget: Budget | None = None
+) -> AsyncIterator[Judge | None]:
     """Connect to the judge that the settings name; None where they name none.
 
     Args:
-        stage_path: folder that keeps the judgements; None keeps none.
+        book: keeps the judgements; None: they are not kept. budget: None sets no limit.
     Raises:
         TeacherError: the endpoint cannot be used.
     """
@@ -145,15 +118,9 @@ async def open_judge(cfg: JudgeConfig, stage_path: Path | None, seed: int) -> As
         yield None
         return
     settings = {name: getattr(cfg, name) for name in ("model", "concurrency", "timeout_s", "max_tries", "json_schema")}
-    client = ChatClient(cfg.url, EndpointConfig(**settings, max_tokens=cfg.max_tokens, temperature=0.0))
-    try:
-        judge = Judge(client, await client.find_model(), cfg, stage_path / FOLDER if stage_path else None, seed)
-        try:
-            yield judge
-        finally:
-            judge.close()
-    finally:
-        await client.aclose()
+    client = ChatClient(cfg.url, EndpointConfig(**settings))
+    async with started(client):
+        yield Judge(KeptAnswers(client, book, budget), cfg, seed)
 
 
 # --- how good a judge is ----------------------------------------------------------------------------------------------
@@ -191,16 +158,16 @@ async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed
     orders = [(*JUDGEMENTS[i:], *JUDGEMENTS[:i]) for i in range(len(JUDGEMENTS))]
     confusion: Counter[tuple[str, str]] = Counter()
     num_agreed = num_moved = num_first = 0
-    async with open_judge(cfg, None, seed) as judge:
+    async with open_judge(cfg, seed) as judge:
         if judge is None:
             raise InputError("no judge to check", where="--judge", got="nothing", expected="the URL of an endpoint")
         for case, right in gold:
-            verdicts = [(await judge.judge(case, order))["verdict"] for order in orders]
+            verdicts = [(await judge.judge(case, order)).verdict for order in orders]
             confusion.update((right, verdict) for verdict in verdicts)
             num_agreed += verdicts.count(right)
             num_moved += len(set(verdicts)) > 1
             num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
-        model = f"{judge.model} at {shown_url(str(cfg.url))}"
+        model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
     num_asks = len(gold) * len(orders)
     num_unjudged = sum(count for (_, verdict), count in confusion.items() if verdict == UNJUDGED)
     first_share = num_first / max(1, num_asks - num_unjudged)

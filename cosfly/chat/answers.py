@@ -1,166 +1,207 @@
-"""`answers.jsonl`: every answer of a teacher, kept before anything is derived from it; nothing answered is asked twice.
+"""Every answer, kept before anything is derived from it; nothing answered is asked twice.
 
-One process writes it. An answer is handed to the system as it arrives, so a killed process loses none; a thread waits for the disk,
-once for all answers that arrived meanwhile. In memory are only the answers of flights that are not finished. `answers.index.jsonl` tells, for each flight that
-was worked on, which bytes of the journal hold its answers, so that a later start reads the tail and the unfinished flights
-instead of a week of answers. The index is a help, not a truth: without it the whole journal is read.
+One folder keeps the answers of one asker, in one journal a flight: `answers/<flight>.jsonl`. One process writes it. An answer is
+handed to the system as it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived
+meanwhile. In memory are only flights that are being worked on. A flight that is done ends with a line of totals, so that a later
+start reads that line instead of a week of answers.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import re
+import time
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from cosfly.chat.budget import Budget
+from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Usage
+from cosfly.chat.protocol import answer_key
 from cosfly.errors import CosflyError
 from cosfly.journal import Journal
+from cosfly.store import sha256_bytes
 
-COUNTED = ("prompt_tokens", "completion_tokens")
+log = logging.getLogger(__name__)
+
+MOST_OPEN_FILES = 64
+TOTALS = "totals"  # the key of a line of totals; an answer has none of this name
+_PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
-def flight_of(sample_id: str) -> str:
-    """Give the flight id of a sample id."""
-    return sample_id.rpartition("_frame_")[0]
+def journal_name(flight: str) -> str:
+    """Give the file name of a flight's journal: its own name where that is a plain one, else one made from its digest."""
+    is_plain = _PLAIN_NAME.fullmatch(flight) is not None and len(flight.encode()) <= 200
+    return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
+
+
+@dataclass
+class _Flight:
+    """One flight's journal, its answers by key, and what it says of their number and tokens."""
+
+    journal: Journal
+    answers: dict[str, dict[str, Any]]
+    totals: Counter[str]
+    is_closed: bool  # its last line is one of totals
 
 
 class AnswerBook:
-    """The journal with an index by key. Use as a context manager."""
+    """The journals of one folder. Use as a context manager; all methods run on one event loop."""
 
-    def __init__(self, path: Path, is_finished: Callable[[str], bool]) -> None:
-        """Read what is needed of the journal of an earlier run.
-
-        Args:
-            is_finished: tells whether a flight needs no more answers; those are not kept in memory.
-        """
+    def __init__(self, folder: Path) -> None:
+        """Count what the journals of earlier runs hold."""
+        self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
-        self.num_read = 0  # lines read at the start
-        self._journal = Journal(path)
-        self._index = Journal(path.with_name("answers.index.jsonl"))
-        self._by_flight: dict[str, dict[str, dict]] = {}
-        self._flights: dict[str, str] = {}
-        self._spans: dict[str, tuple[int, int]] = {}  # this run's bytes of each open flight
-        self._size = self._journal.start()
-        self._is_finished = is_finished
-        self._finished: dict[str, bool] = {}
-        self.num_damaged = 0
-        self._read_earlier()
-        self.num_found = len(self._flights)
-        self._waiting: list[asyncio.Future] = []  # for the disk
+        for path in sorted(folder.glob("*.jsonl")):
+            last = Journal(path).last() or {}
+            self.totals.update(last[TOTALS] if TOTALS in last else _read(path).totals)
+        self._flights: dict[str, _Flight] = {}
+        self._waiting: list[tuple[Journal, asyncio.Future]] = []  # for the disk
         self._disk = ThreadPoolExecutor(1, "journal")
         self._syncing: asyncio.Task | None = None
 
-    # --- what is known ---
+    def get(self, flight: str, key: str) -> dict[str, Any] | None:
+        return self._open(flight).answers.get(key)
 
-    def get(self, key: str) -> dict | None:
-        flight = self._flights.get(key)
-        return None if flight is None else self._by_flight[flight][key]
-
-    def latency_s(self, sample_id: str) -> float:
+    def latency_s(self, flight: str, sample_id: str) -> float:
         """Give the time that the answers about one window took, one after the other."""
-        kept = self._by_flight.get(flight_of(sample_id), {}).values()
+        kept = self._open(flight).answers.values()
         return sum(record["latency_s"] for record in kept if record["sample_id"] == sample_id)
 
-    def forget(self, flight: str) -> None:
-        """Drop a flight that was worked on from memory; its answers stay on the disk, and the index says where."""
-        for key in self._by_flight.pop(flight, {}):
-            del self._flights[key]
-        start, end = self._spans.pop(flight, (0, 0))
-        # Lines before `open_from` belong to flights that the index names; a start need not read them again.
-        open_from = min((first for first, _ in self._spans.values()), default=self._size)
-        line = {"flight": flight, "start": start, "end": end, "open_from": open_from, "size": self._size}
-        self._index.append(line | {"totals": dict(self.totals)}, sync=False)
-
-    def _read_earlier(self) -> None:
-        spans: dict[str, list[tuple[int, int]]] = {}
-        scan_from = counted_to = 0
-        for line in self._index.read():
-            if line["size"] > self._size:  # the journal was cut or replaced: its index is worth nothing
-                spans, scan_from, counted_to = {}, 0, 0
-                self.totals.clear()
-                break
-            spans.setdefault(line["flight"], []).append((line["start"], line["end"]))
-            scan_from, counted_to, self.totals = line["open_from"], line["size"], Counter(line["totals"])
-        for flight, found in spans.items():
-            if not self._needs_no_more(flight):
-                for start, end in found:
-                    self._scan(start, min(end, scan_from), flight, counted_to)
-        self._scan(scan_from, None, None, counted_to)
-        for flight in [name for name in self._spans if self._needs_no_more(name)]:
-            self.forget(flight)  # finished just before a kill, so the index does not name it yet
-
-    def _scan(self, start: int, end: int | None, wanted: str | None, counted_to: int) -> None:
-        if end is not None and end <= start:
-            return
-        for first, after, record in self._journal.lines(start, end):
-            self.num_read += 1
-            flight = flight_of(record["sample_id"])
-            if first >= counted_to:
-                self._count(record)
-            if wanted is None:
-                self._extend(flight, first, after)
-            if wanted in (None, flight) and not self._needs_no_more(flight):
-                self._remember(flight, record)
-        self.num_damaged += self._journal.num_damaged
-
-    def _needs_no_more(self, flight: str) -> bool:
-        if flight not in self._finished:
-            self._finished[flight] = self._is_finished(flight)
-        return self._finished[flight]
-
-    def _remember(self, flight: str, record: dict) -> None:
-        self._by_flight.setdefault(flight, {})[record["key"]] = record
-        self._flights[record["key"]] = flight
-
-    def _extend(self, flight: str, first: int, after: int) -> None:
-        start, end = self._spans.get(flight, (first, after))
-        self._spans[flight] = (min(start, first), max(end, after))
-
-    def _count(self, record: dict) -> None:
-        self.totals["answers"] += 1
-        self.totals.update({name: record["usage"].get(name, 0) for name in COUNTED})
-
-    # --- what is new ---
-
-    async def put(self, record: dict) -> None:
+    async def put(self, flight: str, record: dict[str, Any]) -> None:
         """Write an answer to the disk; it is there when this returns.
 
         Raises:
             StorageError: the disk is full or not writable.
         """
-        first, self._size = self._size, self._journal.append(record, sync=False)
-        flight = flight_of(record["sample_id"])
-        self._remember(flight, record)
-        self._extend(flight, first, self._size)
-        self._count(record)
+        opened = self._open(flight)
+        opened.journal.append(record, sync=False)
+        opened.answers[record["key"]], opened.is_closed = record, False
+        for totals in (opened.totals, self.totals):
+            _count(totals, record)
         on_disk = asyncio.get_running_loop().create_future()
-        self._waiting.append(on_disk)
+        self._waiting.append((opened.journal, on_disk))
         if self._syncing is None or self._syncing.done():
             self._syncing = asyncio.create_task(self._sync())
         await on_disk
+
+    def forget(self, flight: str) -> None:
+        """Drop a flight that was worked on from memory; its journal stays, with its totals at the end."""
+        opened = self._flights.pop(flight, None)
+        if opened is not None:
+            if not opened.is_closed:
+                opened.journal.append({TOTALS: dict(opened.totals)}, sync=False)
+            opened.journal.close()
+
+    def _open(self, flight: str) -> _Flight:
+        if flight not in self._flights:
+            self._flights[flight] = found = _read(self.folder / journal_name(flight))
+            if found.journal.num_damaged:
+                log.warning("%s: %d damaged lines are left out", found.journal.path, found.journal.num_damaged)
+        return self._flights[flight]
 
     async def _sync(self) -> None:
         loop = asyncio.get_running_loop()
         while self._waiting:
             batch, self._waiting = self._waiting, []
+            journals = {journal for journal, _ in batch}
             error: CosflyError | None = None
             try:
-                await loop.run_in_executor(self._disk, self._journal.sync)
+                await loop.run_in_executor(self._disk, _sync_all, journals)
             except CosflyError as found:  # a full disk: every window that waits for it is told
                 error = found
-            for on_disk in batch:
+            for _, on_disk in batch:
                 if on_disk.done():
                     continue
                 if error is None:
                     on_disk.set_result(None)
                 else:
                     on_disk.set_exception(error)
+            if len(self._flights) > MOST_OPEN_FILES:  # the next line opens its file again
+                for journal in journals - {journal for journal, _ in self._waiting}:
+                    journal.close()
 
     def __enter__(self) -> AnswerBook:
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._disk.shutdown(wait=True)
-        self._journal.close()
-        self._index.close()
+        for flight, opened in list(self._flights.items()):
+            if kind is None:
+                self.forget(flight)
+            else:  # perhaps a full disk: the lines that are there tell the totals, too
+                opened.journal.close()
+
+
+def _read(path: Path) -> _Flight:
+    found = _Flight(Journal(path), {}, Counter(), is_closed=True)
+    for record in found.journal.read():
+        found.is_closed = TOTALS in record
+        if found.is_closed:
+            found.totals = Counter(record[TOTALS])
+        else:
+            found.answers[record["key"]] = record
+            _count(found.totals, record)
+    return found
+
+
+def _count(totals: Counter[str], record: dict[str, Any]) -> None:
+    totals["answers"] += 1
+    totals.update(record["usage"])
+
+
+def _sync_all(journals: set[Journal]) -> None:
+    for journal in journals:
+        journal.sync()
+
+
+class KeptAnswers:
+    """Gives an answer from the book, or has the engine make it, within the budget, and keeps it."""
+
+    def __init__(
+        self, engine: Engine, book: AnswerBook | None, budget: Budget | None = None, only: frozenset[str] | None = None
+    ) -> None:
+        """
+        Args:
+            book: None keeps nothing. budget: None sets no limit.
+            only: sample ids that may be asked about; None: all. Of the others only what the book holds is given.
+        """
+        self.engine, self.book, self.budget, self.only = engine, book, budget, only
+
+    async def ask(self, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
+        """
+        Raises:
+            NoAnswer: there is none. BudgetSpent: one more request might pass a limit. TeacherError: none will be answered.
+        """
+        key = answer_key(self.engine.model, request)
+        known = None if self.book is None else self.book.get(flight, key)
+        if known is not None:
+            usage = Usage(**known["usage"]) if known["usage"] else None
+            return Reply(known["text"], usage, known.get("structured", ""), known.get("finish_reason"))
+        if self.only is not None and sample_id not in self.only:
+            raise NoAnswer("not_asked", "this run asks about other windows only")
+        if self.budget is None:
+            return await self._make(key, request, flight, sample_id, purpose)
+        with self.budget.request():
+            reply = await self._make(key, request, flight, sample_id, purpose)
+        self.budget.note(reply.usage, self.engine.where)
+        return reply
+
+    async def _make(self, key: str, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
+        start_s = time.monotonic()
+        reply = await self.engine.answer(request)
+        if self.book is not None:
+            record: dict[str, Any] = {
+                "key": key,
+                "sample_id": sample_id,
+                "purpose": purpose,
+                "model": self.engine.model,
+            }
+            record |= {"text": reply.text, "usage": reply.usage.model_dump() if reply.usage else {}}
+            record |= {"structured": reply.structured, "finish_reason": reply.finish_reason}
+            record |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
+            await self.book.put(flight, record)  # on the disk before anything is derived from it
+        return reply

@@ -9,11 +9,33 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Iterator
+from typing import Self
 
-from caption.schema import BudgetConfig
+from pydantic import Field, model_validator
+
+from cosfly.chat.contract import Usage
+from cosfly.config import Config
 from cosfly.errors import TeacherError
 
 MILLION = 1_000_000
+
+
+class BudgetConfig(Config):
+    """What may be used up, counted over all runs into one folder; a judge's tokens count, too."""
+
+    price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
+    price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
+    max_cost: float | None = Field(None, gt=0, description="stop before this cost is passed; empty: no limit")
+    max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are passed; empty: no limit")
+
+    @model_validator(mode="after")
+    def _priced(self) -> Self:
+        if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
+            raise ValueError("max_cost needs price_prompt and price_completion, else it could never be reached")
+        return self
+
+    def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
+        return (prompt_tokens * self.price_prompt + completion_tokens * self.price_completion) / MILLION
 
 
 class BudgetSpent(Exception):
@@ -21,14 +43,15 @@ class BudgetSpent(Exception):
 
 
 class Budget:
-    """Keeps the count. `totals` is the journal's: prompt_tokens and completion_tokens of every answer kept."""
+    """Keeps the count of all books that share a budget."""
 
-    def __init__(self, cfg: BudgetConfig, totals: Counter[str], *, first_prompt: int, first_completion: int) -> None:
+    def __init__(self, cfg: BudgetConfig, *counts: Counter[str], first_prompt: int, first_completion: int) -> None:
         """
         Args:
+            counts: `totals` of each book of answers.
             first_prompt, first_completion: tokens that a request is taken for until one was answered.
         """
-        self.cfg, self.totals = cfg, totals
+        self.cfg, self._counts = cfg, counts
         self.num_in_flight = 0
         self._largest = (first_prompt, first_completion)
         self._is_measured = False
@@ -37,12 +60,15 @@ class Budget:
     def is_limited(self) -> bool:
         return self.cfg.max_cost is not None or self.cfg.max_tokens is not None
 
-    def cost(self, prompt_tokens: int, completion_tokens: int) -> float:
-        return (prompt_tokens * self.cfg.price_prompt + completion_tokens * self.cfg.price_completion) / MILLION
+    @property
+    def totals(self) -> Counter[str]:
+        """Answers, prompt_tokens and completion_tokens of every answer kept."""
+        return sum(self._counts, Counter())
 
     @property
     def spent(self) -> float:
-        return self.cost(self.totals["prompt_tokens"], self.totals["completion_tokens"])
+        totals = self.totals
+        return self.cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
 
     @contextlib.contextmanager
     def request(self) -> Iterator[None]:
@@ -53,10 +79,11 @@ class Budget:
         """
         reserved = self.num_in_flight + 1
         prompt, completion = (count * reserved for count in self._largest)
-        tokens = self.totals["prompt_tokens"] + self.totals["completion_tokens"]
+        totals = self.totals
+        tokens = totals["prompt_tokens"] + totals["completion_tokens"]
         if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
             raise BudgetSpent(f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used")
-        if self.cfg.max_cost is not None and self.spent + self.cost(prompt, completion) > self.cfg.max_cost:
+        if self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
             raise BudgetSpent(f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent")
         self.num_in_flight += 1
         try:
@@ -64,18 +91,18 @@ class Budget:
         finally:
             self.num_in_flight -= 1
 
-    def note(self, usage: dict[str, int], where: str) -> None:
+    def note(self, usage: Usage | None, where: str) -> None:
         """Learn from an answer how large requests are.
 
         Raises:
             TeacherError: a limit is set and the server does not say what it used, so the limit could not be kept.
         """
-        if not usage and self.is_limited:
+        if usage is None and self.is_limited:
             raise TeacherError(
                 "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept",
                 where=where,
                 fix="leave out --max-cost and --max-tokens, and use --limit",
             )
-        seen = usage.get("prompt_tokens", 0), usage.get("completion_tokens", 0)
+        seen = (usage.prompt_tokens, usage.completion_tokens) if usage else (0, 0)
         self._largest = (max(self._largest[0], seen[0]), max(self._largest[1], seen[1])) if self._is_measured else seen
         self._is_measured = True

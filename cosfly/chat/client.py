@@ -1,4 +1,4 @@
-"""The HTTP client of a chat-completions server: it retries what may pass and names what cannot.
+"""Engine `endpoint`: the HTTP client of a chat-completions server. It retries what may pass and names what cannot.
 
 The key comes from the environment variable COSFLY_API_KEY and goes into the request header only.
 """
@@ -12,17 +12,19 @@ import os
 import random
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import httpx
 from pydantic import Field
 
+from cosfly.chat.contract import NoAnswer, Reply, Request
 from cosfly.chat.protocol import (
     base_url,
     encode_body,
     read_completion,
     read_models,
+    request_body,
     response_format,
     retry_after_s,
     shown_url,
@@ -81,20 +83,19 @@ class EndpointConfig(Config):
         default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"
     )
 
-
-class NoAnswer(Exception):
-    """A window got no answer; `cause` is a word for the tally. `is_final`: asking again later would not help."""
-
-    def __init__(self, cause: str, detail: str, *, is_final: bool = False) -> None:
-        super().__init__(f"{cause}: {detail}")
-        self.cause, self.detail, self.is_final = cause, detail, is_final
+    def request(self, messages: list[dict], digests: list[str], schema: dict, seed: int) -> Request:
+        """Give a conversation as these settings sample it."""
+        sampling = {"temperature": self.temperature, "top_p": self.top_p, "max_tokens": self.max_tokens, "seed": seed}
+        return Request(messages, digests, schema, sampling | self.extra_body)
 
 
 class ChatClient:
-    """Sends requests to one server. Close it with `aclose`."""
+    """Sends requests to one server."""
+
+    kind: Literal["endpoint"] = "endpoint"
 
     def __init__(self, url: str, cfg: EndpointConfig) -> None:
-        self.url, self.shown = base_url(url), shown_url(base_url(url))
+        self.url, self.where, self.model = base_url(url), shown_url(base_url(url)), ""
         self.cfg = cfg
         self.throttle = Throttle(cfg.concurrency)
         self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
@@ -107,7 +108,7 @@ class ChatClient:
         self._tls = httpx.create_ssl_context()
         self._free = [self._connect()]
 
-    async def aclose(self) -> None:
+    async def close(self) -> None:
         """Close all connections; none may be in use."""
         for connection in self._free:
             await connection.aclose()
@@ -144,13 +145,14 @@ class ChatClient:
                     f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS
                 )
 
-    async def complete(self, body: dict, schema: dict) -> dict:
-        """Send a request until it is answered; gives text, usage, structured and finish_reason.
+    async def answer(self, request: Request) -> Reply:
+        """Send a request until it is answered.
 
         Raises:
             NoAnswer: not within the tries and the time that the settings allow.
             TeacherError: no request will get an answer.
         """
+        body = request_body(self.model, request, with_ids=self.cfg.image_uuid)
         cause, detail = "no_answer", ""
         deadline_s = float("inf")
         for attempt in range(self.cfg.max_tries):
@@ -158,7 +160,7 @@ class ChatClient:
             try:
                 async with self.throttle.slot() as given_s:
                     is_structured = not self._is_schema_refused  # another answer may have told meanwhile
-                    payload = body | ({"response_format": response_format(schema)} if is_structured else {})
+                    payload = body | ({"response_format": response_format(request.schema)} if is_structured else {})
                     deadline_s = min(deadline_s, time.monotonic() + self.cfg.total_timeout_s)
                     response = await self.send(payload)
             except (TimeoutError, httpx.TimeoutException):
@@ -170,10 +172,10 @@ class ChatClient:
             else:
                 status = response.status_code
                 if status == 200:
-                    found = read_completion(response)
-                    if isinstance(found, dict):
+                    found = read_completion(response, "json_schema" if is_structured else "plain")
+                    if isinstance(found, Reply):
                         self.throttle.succeeded()
-                        return found | {"structured": "json_schema" if is_structured else "plain"}
+                        return found
                     cause, detail = "bad_reply", found
                 elif status in RETRIED_STATUS:
                     cause, detail = f"http_{status}", self.detail(response)
@@ -197,7 +199,7 @@ class ChatClient:
 
     def _refuse_schema(self, response: httpx.Response) -> None:
         if not self._is_schema_refused:
-            log.warning("%s: refuses a JSON schema (%s); asking without one", self.shown, self.detail(response))
+            log.warning("%s: refuses a JSON schema (%s); asking without one", self.where, self.detail(response))
         self._is_schema_refused = True
 
     def _wait_s(self, attempt: int) -> float:
@@ -206,8 +208,8 @@ class ChatClient:
 
     # --- errors ---
 
-    async def find_model(self) -> str:
-        """Ask which models there are and check ours.
+    async def start(self) -> None:
+        """Ask which models there are and find ours among them.
 
         Raises:
             TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
@@ -228,14 +230,15 @@ class ChatClient:
         entries = read_models(response)
         if entries is None:
             if wanted:
-                return wanted  # some hosts list no models; the first request will tell
+                self.model = wanted  # some hosts list no models; the first request will tell
+                return
             what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
             raise self.error(what, got=f"HTTP {response.status_code}", fix="check the URL, or give --model")
         names = [entry["id"] for entry in entries]
         if wanted in names or (wanted is None and len(names) == 1):
-            found = wanted or names[0]
-            self.model_entry = entries[names.index(found)]
-            return str(found)
+            self.model = wanted or names[0]
+            self.model_entry = entries[names.index(self.model)]
+            return
         listed = ", ".join(names[:8]) or "none"
         raise self.error(
             "the endpoint does not have this model" if wanted else "the endpoint has several models",
@@ -257,7 +260,7 @@ class ChatClient:
             raise self.error("not a chat endpoint", got=f"HTTP {status} {detail}", fix="check the URL")
 
     def error(self, what: str, **parts: Any) -> TeacherError:
-        return TeacherError(what, where=self.shown, **parts)
+        return TeacherError(what, where=self.where, **parts)
 
     def detail(self, response: httpx.Response) -> str:
         """Give a server's error text, short and without the key."""

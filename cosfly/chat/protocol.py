@@ -8,6 +8,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 import httpx
 
+from cosfly.chat.contract import Reply, Request, Usage
 from cosfly.store import dump_json, parse_json, sha256_bytes
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
@@ -59,6 +60,12 @@ def _marked_part(part: dict, urls: list[str]) -> dict:
     return part | {"image_url": part["image_url"] | {"url": f"\x00{len(urls) - 1}"}}
 
 
+def request_body(model: str, request: Request, *, with_ids: bool = False) -> dict[str, Any]:
+    """Give a request's body without its response format; `with_ids` as in with_image_ids."""
+    messages = with_image_ids(request.messages, request.digests) if with_ids else request.messages
+    return {"model": model, "messages": messages, **request.sampling}
+
+
 def with_image_ids(messages: list[dict], digests: list[str]) -> list[dict]:
     """Give each image its digest as `uuid`, by which vLLM finds it in its cache."""
     left = iter(digests)
@@ -75,7 +82,7 @@ def with_image_ids(messages: list[dict], digests: list[str]) -> list[dict]:
     ]
 
 
-def answer_key(body: dict, digests: list[str], schema: dict) -> str:
+def answer_key(model: str, request: Request) -> str:
     """Hash image bytes, prompt, model and sampling: what an answer depends on."""
     texts = [
         {
@@ -84,17 +91,17 @@ def answer_key(body: dict, digests: list[str], schema: dict) -> str:
             if isinstance(message["content"], str)
             else [part.get("text", "image") for part in message["content"]],
         }
-        for message in body["messages"]
+        for message in request.messages
     ]
-    sampling = {name: value for name, value in body.items() if name != "messages"}
-    return sha256_bytes(dump_json([texts, digests, sampling, schema]).encode())
+    sampling = {"model": model, **request.sampling}
+    return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
 
 
 # --- responses --------------------------------------------------------------------------------------------------------
 
 
-def read_completion(response: httpx.Response) -> dict | str:
-    """Give text, usage and finish_reason of a completion, or a word on what is wrong with it."""
+def read_completion(response: httpx.Response, structured: str) -> Reply | str:
+    """Give the reply of a completion that was asked for in this way, or a word on what is wrong with it."""
     try:
         value = parse_json(response.content)
     except ValueError:
@@ -110,7 +117,7 @@ def read_completion(response: httpx.Response) -> dict | str:
         return "no text in the message"
     usage = value.get("usage") if isinstance(value.get("usage"), dict) else {}
     counts = {name: usage[name] for name in ("prompt_tokens", "completion_tokens") if type(usage.get(name)) is int}
-    return {"text": text, "usage": counts, "finish_reason": choices[0].get("finish_reason")}
+    return Reply(text, Usage(**counts) if counts else None, structured, choices[0].get("finish_reason"))
 
 
 def read_models(response: httpx.Response) -> list[dict[str, Any]] | None:

@@ -77,13 +77,13 @@ def caption(
     cfg = resolve(config, [*(overrides or []), *extra], seed, workers)
     tree = data_folder(data)
     target = out or tree.resolve().parent / "caption"
-    if check and cfg.caption.teacher.startswith("http") and not (target / "answers.jsonl").exists():
+    if check and cfg.caption.teacher_kind == "endpoint" and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption)
     if plan_only:
-        from caption.run.plan import make_plan
+        from caption.run.forecast import make_forecast
 
-        planned = make_plan(cfg.caption, tree, target, seed=cfg.seed, resume=resume.value)
-        _print_rows("What this run will take", planned.rows())
+        forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume.value)
+        _print_rows("What this run will take", forecast.rows())
         return
     tell_product(
         caption.run.stage.run(

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
+from cosfly.chat.contract import Usage
 from cosfly.store import dump_json, model_lines, storage_errors
 
 # tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
@@ -36,6 +37,7 @@ MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
 MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
 
 Language = Literal["en", "zh"]
+TeacherKind = Literal["rules", "endpoint", "vllm"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
 CAPTION_VERSION: Literal["1.0"] = "1.0"
 
@@ -143,6 +145,82 @@ class Prompt(BaseModel):
     user: str
 
 
+class _Sparse(BaseModel):
+    """A record in which a key without a value is left out."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in handler(self).items() if value is not None}
+
+
+class TeacherSettings(_Sparse):
+    """How a teacher was asked; the rule teacher has a seed only."""
+
+    temperature: float | None = None
+    top_p: float | None = None
+    max_tokens: int | None = None
+    seed: int
+    extra_body: dict[str, Any] | None = None
+
+
+class TeacherRecord(_Sparse):
+    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked."""
+
+    kind: TeacherKind
+    model: str
+    settings: TeacherSettings
+    structured: str | None = None
+
+
+class JudgeRecord(_Sparse):
+    """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text, where it was."""
+
+    verdict: str
+    reason: str
+    model: str
+    overruled_by: str | None = None
+
+
+class RepairRecord(BaseModel):
+    """What became of a rejected answer.
+
+    rung: the ask that mended it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    strategy: str
+    rung: str | None = None
+    outcome: str = "no_label"
+    asks: int = 0
+    first_decision: str
+    first_verdict: Verdict | None
+
+
+class KeyframeRecord(BaseModel):
+    """Why a window was taken (start, change, stride); windows left out up to the next; changes of the label among them."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    reason: str
+    skipped: int
+    missed: int
+
+
+class Checks(_Sparse):
+    """What was checked. structure, bilingual: `ok` or a reason. evidence: `ok` or the contradictions. recovered: what was mended
+    in the answers' text. frame: what is wrong with a picture."""
+
+    keyframe: KeyframeRecord | None = None
+    structure: str | None = None
+    bilingual: str | None = None
+    evidence: Literal["ok"] | list[str] | None = None
+    recovered: list[str] | None = None
+    frame: str | None = None
+
+
 class Caption(BaseModel):
     """One line of `captions.jsonl`: one window, its answers, and everything that was found out about them.
 
@@ -161,16 +239,16 @@ class Caption(BaseModel):
     future: list[int]
     prompt: dict[str, Prompt]  # language -> prompt
     prompt_hash: str
-    teacher: dict[str, Any]  # kind: rules | endpoint | vllm, model, settings
-    usage: dict[str, int]  # prompt_tokens, completion_tokens
+    teacher: TeacherRecord
+    usage: Usage  # of the teacher, all asks
     attempts: int
     en: Coc | None = None
     zh: Coc | None = None
     label: str | None  # ground-truth decision from the future geometry; None: geometry cannot tell
     verdict: Verdict | None = None
-    judge: dict[str, Any] | None = None
-    repair: dict[str, Any] | None = None  # strategy, asks, first_decision
-    checks: dict[str, Any] = {}  # structure, evidence, bilingual: "ok" or a reason
+    judge: JudgeRecord | None = None
+    repair: RepairRecord | None = None
+    checks: Checks = Checks()
     status: Literal["accepted", "dropped"]
     drop_reason: str | None = None
 

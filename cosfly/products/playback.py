@@ -94,6 +94,11 @@ def sample_id(flight_id: str, frame_index: int) -> str:
     return f"{flight_id}_frame_{frame_index:05d}"
 
 
+def flight_of(sample_id: str) -> str:
+    """Give the flight id of a sample id."""
+    return sample_id.rpartition("_frame_")[0]
+
+
 def find_flights(root: Path) -> list[Path]:
     """Find the folders that hold a `trajectory.json`, sorted.
 

@@ -1,0 +1,103 @@
+"""What is asked of a language model and what it gives: the contract of every engine.
+
+An engine knows no captions, journals or budgets: it is started, answers requests, many at once, and is closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+
+class Usage(BaseModel):
+    """Tokens of one answer or of several; 0 where a server does not count them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+
+    def __add__(self, other: Usage) -> Usage:
+        return Usage(
+            prompt_tokens=self.prompt_tokens + other.prompt_tokens,
+            completion_tokens=self.completion_tokens + other.completion_tokens,
+        )
+
+    @property
+    def total(self) -> int:
+        return self.prompt_tokens + self.completion_tokens
+
+
+@dataclass(frozen=True)
+class Request:
+    """One conversation and how it is sampled, in plain values.
+
+    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in their order. schema: of the
+    answer. sampling: temperature, max_tokens, seed and whatever else stands in a request beside model and messages.
+    """
+
+    messages: list[dict]
+    digests: list[str]
+    schema: dict
+    sampling: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
+
+    usage: None where the server does not tell.
+    """
+
+    text: str
+    usage: Usage | None
+    structured: str
+    finish_reason: str | None = None
+
+
+class NoAnswer(Exception):
+    """A request got no answer; `cause` is a word for the tally. `is_final`: asking again later would not help."""
+
+    def __init__(self, cause: str, detail: str, *, is_final: bool = False) -> None:
+        super().__init__(f"{cause}: {detail}")
+        self.cause, self.detail, self.is_final = cause, detail, is_final
+
+
+class Engine(Protocol):
+    """What answers requests: a server, or a model in this process. `close` is called whatever came of `start`."""
+
+    @property
+    def kind(self) -> Literal["endpoint", "vllm"]: ...
+
+    where: str  # its address, for messages; holds no secret
+    model: str  # the model's name; known once it is started
+
+    async def start(self) -> None:
+        """Get ready.
+
+        Raises:
+            TeacherError, EnvironmentMissing, ConfigError: it cannot be used.
+        """
+
+    async def answer(self, request: Request) -> Reply:
+        """Answer one request.
+
+        Raises:
+            NoAnswer: this one gets none. TeacherError: none will.
+        """
+
+    async def close(self) -> None: ...
+
+
+@asynccontextmanager
+async def started(engine: Engine) -> AsyncIterator[None]:
+    """Start an engine and close it at the end."""
+    try:
+        await engine.start()
+        yield
+    finally:
+        await engine.close()
