@@ -100,12 +100,13 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
     return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
 
 
-def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, ground_z_m: float = 0.0) -> np.ndarray:
+def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.ndarray:
     """Tell which boxes stand in a person's way, (n,) bool.
 
-    A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval does not
+    A box does if it reaches into the interval from the map's ground to `height_m` above it; touching an end of the interval does not
     count. Surfaces (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
     """
+    ground_z_m = box_map.header.ground_z_m
     is_in_interval = (box_map.maxs[:, 2] > ground_z_m + TOUCH_M) & (
         box_map.mins[:, 2] < ground_z_m + height_m - TOUCH_M
     )
@@ -118,7 +119,6 @@ def occupancy(
     *,
     resolution_m: float = RESOLUTION_M,
     height_m: float = HUMAN_HEIGHT_M,
-    ground_z_m: float = 0.0,
     like: OccupancyGrid | None = None,
 ) -> OccupancyGrid:
     """Mark the cells that boxes stand on.
@@ -134,17 +134,15 @@ def occupancy(
     Source: Step 3 of the paper (sec:step3).
     """
     grid = empty_grid(box_map, resolution_m) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
-    boxes = box_map.select(blocks_walking(box_map, height_m=height_m, ground_z_m=ground_z_m))
-    is_water = boxes.kinds == WATER
+    boxes = box_map.select(blocks_walking(box_map, height_m=height_m))
+    is_water, ground_z_m = boxes.kinds == WATER, box_map.header.ground_z_m
     lows = np.where(is_water, -np.inf, ground_z_m)
     highs = np.where(is_water, np.inf, ground_z_m + height_m)
     _mark(boxes, lows, highs, grid)
     return grid
 
 
-def surface(
-    box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: OccupancyGrid, ground_z_m: float = 0.0
-) -> np.ndarray | None:
+def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: OccupancyGrid) -> np.ndarray | None:
     """Tell over which cells of a grid the map has ground to stand on.
 
     Args:
@@ -152,7 +150,7 @@ def surface(
     Returns:
         (ny, nx) bool, cells that such a box overlaps; None if the map holds no such box, so that it does not say.
     """
-    is_level = np.abs(box_map.maxs[:, 2] - ground_z_m) <= SURFACE_REACH_M
+    is_level = np.abs(box_map.maxs[:, 2] - box_map.header.ground_z_m) <= SURFACE_REACH_M
     boxes = box_map.select(is_level & np.isin(box_map.kinds, np.array(sorted(kinds), dtype=np.uint8)))
     if len(boxes) == 0:
         return None

@@ -6,7 +6,7 @@ from cosfly import kernels
 from cosfly.geometry import DT_S
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import make_scenario
-from cosfly.products.boxes import make_box_map
+from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import Walk
 
@@ -27,7 +27,7 @@ def town_of(*rows):
     rows = [ground, *((*row, 0) if len(row) == 2 else row for row in rows)]
     kinds = [KINDS["Ground"]] + [KINDS["Buildings"]] * (len(rows) - 1)
     return make_box_map(
-        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header={"name": "hand"}
+        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header=MapHeader(name="hand")
     )
 
 

@@ -160,14 +160,14 @@ def test_sizes_scale_and_placeholders_get_plausible_sizes(tmp_path: Path):
     np.testing.assert_allclose(tree.half_extents[0, :2], (8, 6))
     np.testing.assert_allclose((tree.mins[0, 2], tree.maxs[0, 2]), (0, 24.2))  # lets its foot down 20 cm
     assert can.half_extents.max() < 0.6
-    assert city.header["extent_sources"] == {"road": 0, "bbox": 1, "engine": 0, "default": 1}
+    assert city.header.extent_sources == {"road": 0, "bbox": 1, "engine": 0, "default": 1}
 
 
 def test_roads_take_their_width_from_what_stands_beside_them(tmp_path: Path):
     houses = [node("BP_Building_01_C", x, side * 2500) for x in (-6000, 0, 6000) for side in (-1, 1)]
     cans = [node("BP_Can_C", x, side * 900) for x in (-5000, -2000, 2000, 5000) for side in (-1, 1)]
     city = simworld(write_world(tmp_path, node("BP_Road1_C", 0, 0), *houses, *cans))
-    assert city.header["roads"] == {"carriageway_m": 17.0, "front_to_front_m": 40.0}
+    assert city.header.roads == {"carriageway_m": 17.0, "front_to_front_m": 40.0}
     roads, pavements = boxes_of(city, "Roads"), boxes_of(city, "Sidewalks")
     for one, other in combinations([footprint(m, k) for m in (roads, pavements) for k in range(len(m))], 2):
         assert one.intersection(other).area < 1e-6, "slabs overlap"
@@ -221,7 +221,7 @@ def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
         simworld(cfg)
     cfg = cfg.model_copy(update={"unknown": "drop"})
-    assert simworld(cfg).header["dropped_objects"] == {"unknown_asset": 1}
+    assert simworld(cfg).header.dropped_objects == {"unknown_asset": 1}
     run(MapsConfig(source="simworld", simworld=cfg), tmp_path / "out")
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"] == {"input": 2, "kept": 1, "dropped": {"unknown_asset": 1}, "failed": {}}
@@ -264,7 +264,7 @@ def test_known_answer_no_buildings_overlap_with_yaw_and_19_pairs_without(shared_
     assert overlapping_pairs(buildings, with_yaw=True) == 0
     assert overlapping_pairs(buildings, with_yaw=False) == 19
     assert city.counts()["Vegetation"] == 214
-    assert city.header["extent_sources"] | {"road": 0} == {"road": 0, "bbox": 280, "engine": 0, "default": 155}
+    assert city.header.extent_sources | {"road": 0} == {"road": 0, "bbox": 280, "engine": 0, "default": 155}
 
 
 @pytest.mark.parametrize(("world", "pairs"), [("middle_mode_road_20", 24), ("sample_task_dist_11", 27)])
@@ -324,7 +324,7 @@ def test_covered_ground_has_holes_where_there_is_nothing():
     for low, high in (((0, 0), (40, 10)), ((0, 30), (40, 40)), ((0, 10), (10, 30)), ((30, 10), (40, 30))):
         boxes.add_span("Roads", low, high, -0.3, 0.0)
     boxes.add_span("Static", (60, 60), (70, 70), 0.0, 1.0)
-    (ring,) = covered_ground(boxes.box_map({})).rings()
+    (ring,) = covered_ground(boxes.box_map()).rings()
     assert Polygon(ring.points_world, ring.holes).area == pytest.approx(1600 - 400, abs=1.0)
 
 
@@ -378,10 +378,10 @@ def city(tmp_path: Path, model: dict) -> BoxMap:
 
 def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     boxes = city(tmp_path, city_model())
-    assert boxes.header["offset_m"] == {"x": 110.0, "y": 65.0, "z": 2.0}
+    assert boxes.header.offset_m == {"x": 110.0, "y": 65.0, "z": 2.0}
     house = boxes_of(boxes, "Buildings")
     np.testing.assert_allclose(np.r_[house.mins[0], house.maxs[0]], (-10, -15, 0, 0, -9, 12), atol=1e-6)
-    assert boxes.header["building_area_ratio"] == pytest.approx(1.0, abs=1e-3)
+    assert boxes.header.building_area_ratio == pytest.approx(1.0, abs=1e-3)
     roads = boxes_of(boxes, "Roads")
     assert roads.maxs[:, 2].max() <= 0
     assert roads.half_extents.max() <= 30
@@ -391,8 +391,8 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     assert (trees.mins[:, 2] == 0).all()
     assert 2.5 < trees.maxs[:, 2].min() < trees.maxs[:, 2].max() <= 8.0
     assert trees.half_extents[:, :2].max() <= 3.0
-    assert boxes.header["dropped_objects"] == {"no_geometry": 1}
-    assert boxes.header["num_objects"] == 4
+    assert boxes.header.dropped_objects == {"no_geometry": 1}
+    assert boxes.header.num_objects == 4
 
 
 def test_versions_gzip_and_nesting_give_the_same_map(tmp_path: Path):
@@ -424,7 +424,7 @@ def test_courtyards_stay_open(tmp_path: Path):
     boxes = city(tmp_path, model)
     houses = boxes_of(boxes, "Buildings")
     union = united([footprint(houses, k) for k in range(len(houses))])
-    court = Point(20 - boxes.header["offset_m"]["x"], 20 - boxes.header["offset_m"]["y"])
+    court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1259.9 < union.area < 1260 / 0.9
 
@@ -503,17 +503,17 @@ def delft() -> BoxMap:
 
 
 def test_delft_is_cut_up(delft: BoxMap):
-    assert delft.header["num_objects"] == 570
-    assert delft.header["dropped_objects"] == {}
-    assert delft.header["building_covered_share"] > 0.995
-    assert 1.0 <= delft.header["building_area_ratio"] < 1.08
+    assert delft.header.num_objects == 570
+    assert delft.header.dropped_objects == {}
+    assert delft.header.building_covered_share > 0.995
+    assert 1.0 <= delft.header.building_area_ratio < 1.08
     assert 2 * delft.half_extents.max() < 100
     obstacles = boxes_of(delft, "Walls", "Vegetation", "Static")
     standing = obstacles.select(obstacles.maxs[:, 2] > 0.1)
     assert 2 * standing.half_extents[:, :2].max() < 30
     surfaces = boxes_of(delft, "Roads", "Sidewalks", "Ground", "Terrain", "Water", "Bridge")
     assert surfaces.maxs[:, 2].max() <= 0
-    assert 0.1 < delft.header["offset_m"]["z"] < 0.5
+    assert 0.1 < delft.header.offset_m["z"] < 0.5
     np.testing.assert_allclose(sum(delft.bounds())[:2], 0, atol=25)
 
 
@@ -540,7 +540,7 @@ def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     assert first == [(tmp_path / "one" / name).read_bytes() for name in names]
     with pytest.raises(ResumeError, match="seed was 5, is 6"):
         run(MapsConfig(), tmp_path / "one", seed=6)
-    assert read_boxes(product).header["source"]["seed"] == 5
+    assert read_boxes(product).header.source.seed == 5
     assert read_roi(tmp_path / "one/roi_polygon.json").rings()
 
 
@@ -562,7 +562,7 @@ def test_the_overview_is_north_up():
     boxes = BoxList()
     boxes.add_span("Terrain", (0, 0), (100, 100), -1, 0)
     boxes.add_span("Water", (60, 80), (100, 100), -1, 0.1)
-    box_map = boxes.box_map({})
+    box_map = boxes.box_map()
     picture = draw_map(box_map, TopView.around(np.stack(box_map.bounds()), 104)).astype(int)
     assert picture[12, 90, 2] > picture[12, 90, 0] + 50  # blue, top right
     assert picture[90, 90, 1] > picture[90, 90, 2] + 20  # green, bottom right

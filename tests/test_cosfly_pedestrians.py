@@ -21,7 +21,7 @@ from cosfly.pedestrians.stage import (
     sample_start,
     walkable_ground,
 )
-from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.roi import Roi
 from cosfly.products.walks import read_paths
@@ -39,7 +39,9 @@ def town(size_m: float = 160.0, *, walls: list = (), seed: int = 4):
     centers += [center for center, _ in walls]
     extents += [half_extents for _, half_extents in walls]
     rotations = np.column_stack([np.zeros(len(yaws)), yaws, np.zeros(len(yaws))])
-    return make_box_map(centers, extents, rotations, [ROADS] + [BUILDINGS] * (len(yaws) - 1), header={"name": "Town"})
+    return make_box_map(
+        centers, extents, rotations, [ROADS] + [BUILDINGS] * (len(yaws) - 1), header=MapHeader(name="Town")
+    )
 
 
 def plain(size_m: float, *walls):
@@ -59,7 +61,7 @@ def ground_of(text: str) -> WalkableGround:
     """Make a ground from rows of part numbers, row 0 first."""
     parts = np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32)
     grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
-    return WalkableGround(grid, grid, parts)
+    return WalkableGround(grid, grid, parts, 0.0)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from cosfly.errors import InputError
-from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.roi import read_roi
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import Walk, read_paths, write_paths
@@ -19,7 +19,7 @@ def some_boxes(n=3, seed=0):
     rng = np.random.default_rng(seed)
     return make_box_map(
         rng.uniform(-100, 100, (n, 3)), rng.uniform(0, 5, (n, 3)), rng.uniform(-180, 180, (n, 3)),
-        rng.integers(1, 28, n), header={"name": "T", "ground_z_m": 0.0},
+        rng.integers(1, 28, n), header=MapHeader(name="T", ground_z_m=0.0),
     )  # fmt: skip
 
 
@@ -46,9 +46,23 @@ def test_the_papers_bare_list_loads(tmp_path):
     assert len(read_boxes(path)) == 3
 
 
+def test_a_foreign_header_survives(tmp_path):
+    path = tmp_path / "boxes_3d.json"
+    write_boxes(path, some_boxes())
+    value = json.loads(path.read_text())
+    value |= {"weather": {"rain": None}, "ground_z_m": 2, "source": {"tool": "x", "engine": [1, None]}, "num_boxes": 9}
+    path.write_text(json.dumps(value))
+    write_boxes(path, read_boxes(path))
+    back = json.loads(path.read_text())
+    assert back == value | {"num_boxes": 3}
+    assert read_boxes(path).header.licence == "unknown"
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (lambda v: v.update(ground_z_m="low"), r"boxes_3d.json: ground_z_m.*low"),
+        (lambda v: v.update(licence="CC BY 4.0"), r"licence.*CC BY 4.0"),
         (lambda v: v["boxes"][1].update(extent=[1, -2, 1]), r"box 2: extent.*-2"),
         (lambda v: v["boxes"][1].update(center=[1, "x", 1]), r"boxes\[1\].center"),
         (lambda v: v["boxes"][1].update(center=[1, "2", 1]), r"boxes\[1\].center"),

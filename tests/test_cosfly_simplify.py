@@ -264,7 +264,7 @@ def test_the_simworld_variants_work_together():
     assert [name for name, _ in result.passes] == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
     solid = result.box_map.select(result.box_map.kinds != ROADS)
     assert solid.mins[:, 2].min() >= -1e-9
-    assert "trunks" not in result.box_map.header
+    assert "trunks" not in result.box_map.header.model_dump()
 
 
 # --- removal ----------------------------------------------------------------------------------------------------------
@@ -278,7 +278,7 @@ def test_below_ground_goes_by_the_top_face_and_spares_surfaces():
         ("Roads", (0, 0, -1), (9, 9, -0.06)),
         ("Water", (0, 0, -2), (9, 9, -0.5)),
     )
-    assert crop_below_ground(boxes, 0.0).ids.tolist() == [2, 3, 4, 5]
+    assert crop_below_ground(boxes).ids.tolist() == [2, 3, 4, 5]
 
 
 def test_clipping_cuts_off_what_lies_below_the_ground():
@@ -288,12 +288,12 @@ def test_clipping_cuts_off_what_lies_below_the_ground():
         ("Static", (0, 0, 1), (1, 1, 2)),
         ("Roads", (0, 0, -1), (9, 9, 0.5)),  # a surface stays whole
     )
-    result = crop_below_ground(boxes, 0.0, clip=True)
+    result = crop_below_ground(boxes, clip=True)
     assert result.ids.tolist() == [2, 3, 4]
     np.testing.assert_allclose(result.mins[:, 2], [0, 1, -1])
     np.testing.assert_allclose(result.maxs[:, 2], [0.2, 2, 0.5])
     leaning = replace(boxes, rotations_deg=np.full((4, 3), [20.0, 0, 0]))
-    stays = crop_below_ground(leaning, 0.0, clip=True)
+    stays = crop_below_ground(leaning, clip=True)
     np.testing.assert_array_equal(stays.half_extents, leaning.select(leaning.maxs[:, 2] > 0).half_extents)
 
 
@@ -389,7 +389,7 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     write_boxes(source, boxes)
     product = run(SimplifyConfig(), source, tmp_path / "out")
     simplified = read_boxes(product)
-    assert [p["pass"] for p in simplified.header["passes"]] == [
+    assert [p.name for p in simplified.header.passes] == [
         "input",
         "merge",
         "crop_tree",

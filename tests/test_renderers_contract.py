@@ -21,7 +21,7 @@ from cosfly.config import build
 from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, look_at, rotation_matrices, world_from_camera
 from cosfly.products import playback
-from cosfly.products.boxes import BoxMap, make_box_map, write_boxes
+from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
 from cosfly.products.kinds import KINDS
 from cosfly.products.traces import DroneTrace, write_traces
@@ -59,7 +59,12 @@ def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
     centers = np.array([row[1] for row in rows], dtype=float) + offset_m
     rotations = [(0.0, row[3], 0.0) for row in rows]
     return make_box_map(
-        centers, [row[2] for row in rows], rotations, [KINDS[row[0]] for row in rows], ids, {"name": "street"}
+        centers,
+        [row[2] for row in rows],
+        rotations,
+        [KINDS[row[0]] for row in rows],
+        ids,
+        MapHeader(name="street", ground_z_m=offset_m[2]),
     )
 
 

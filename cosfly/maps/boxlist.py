@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from cosfly.products.boxes import BoxMap, make_box_map
+from cosfly.products.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.products.kinds import KINDS
 
 Pair = Sequence[float] | np.ndarray  # x and y
@@ -44,7 +43,7 @@ class BoxList:
         center = ((low_xy[0] + high_xy[0]) / 2, (low_xy[1] + high_xy[1]) / 2)
         self.add(kind, center, (high_xy[0] - low_xy[0], high_xy[1] - low_xy[1]), low_m, high_m)
 
-    def box_map(self, header: dict[str, Any]) -> BoxMap:
+    def box_map(self, header: MapHeader | None = None) -> BoxMap:
         """Give the map of everything added so far."""
         rows = np.array(self._rows, dtype=np.float64).reshape(-1, 7)
         rotations_deg = np.zeros((len(rows), 3))

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosfly.chance import rng_for
 from cosfly.maps.boxlist import BoxList
-from cosfly.products.boxes import BoxMap
+from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.
 CENSUS = {
@@ -54,8 +54,8 @@ def census_town(name: str, seed: int) -> BoxMap:
     kerbs = _street_furniture(boxes, kerbs, rng_for(seed, "maps", "census furniture"))
     _kiosks(boxes, squares, rng_for(seed, "maps", "census kiosks"))
     _trees(boxes, parks, kerbs, rng_for(seed, "maps", "census trees"))
-    source = {"tool": "cosfly maps synthetic, preset town10", "version": "1", "seed": seed, "licence": "Apache-2.0"}
-    box_map = boxes.box_map({"name": name, "source": source, "ground_z_m": 0.0})
+    source = MapSource(tool="cosfly maps synthetic, preset town10", version="1", seed=seed)
+    box_map = boxes.box_map(MapHeader(name=name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
     assert box_map.counts() == CENSUS, "the town misses its census"
     return box_map
 

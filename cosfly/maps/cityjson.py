@@ -3,7 +3,7 @@
 One box round an object can be hundreds of metres wide, so everything is cut up: solids into rectangles that cover their footprint,
 surfaces into thin slabs that never stand in anybody's way, walls along their course. Vegetation is a surface in such models, with the
 heights of its canopy in the vertices: it becomes a lawn, and trees where it rises well over the ground.
-The middle of the map becomes the origin, and the usual height of its roads z = 0; `header["offset_m"]` leads back.
+The middle of the map becomes the origin, and the usual height of its roads z = 0; `header.offset_m` leads back.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.footprints import cover, polygons_of, rectangle_polygon, united
-from cosfly.products.boxes import BoxMap
+from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 
 SLAB_M = 0.3
 STEEP = 0.02  # a surface whose projection is less than this share of its area is a wall: it has no footprint
@@ -43,9 +43,10 @@ class CityJsonConfig(Config):
 
     name: str = Field("CityJson", min_length=1, description="map name, the head of the playback tree's folder names")
     path: Path | None = Field(None, description="the CityJSON file, .json or .json.gz")
-    licence: str = Field(
-        "unknown: see the source", description="licence line for the records of everything made from the map"
+    licence: LicenceId = Field(
+        UNKNOWN_LICENCE, description="licence of the model, as the hub spells it (cc-by-4.0); goes into every release"
     )
+    credits: str = Field("", description="who must be named: the model's makers, one sentence or more")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solid_fill: float = Field(
         0.9, gt=0.0, le=1.0, description="share of each box of a building that its footprint fills"
@@ -119,22 +120,19 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         if item.rule.form == "green":
             _add_trees(boxes, cfg, item, facets[item.object_id])
     _add_water(boxes, cfg, objects, footprints)
-    header = {
-        "name": cfg.name,
-        "source": {
-            "tool": cfg.tool,
-            "version": f"CityJSON {model.version}",
-            "file": cfg.path.name,
-            "licence": cfg.licence,
-        },
-        "ground_z_m": 0.0,
-        "offset_m": {axis: float(offset[k]) for k, axis in enumerate("xyz")},
-        "building_footprint_m2": round(footprint_m2, 1),
-        "building_area_ratio": round(boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
-        "building_covered_share": round(covered_m2 / footprint_m2, 4) if footprint_m2 else None,
-        "num_objects": model.num_objects,
-        "dropped_objects": model.dropped,
-    }
+    header = MapHeader(
+        name=cfg.name,
+        source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=cfg.path.name),
+        licence=cfg.licence,
+        credits=cfg.credits,
+        ground_z_m=0.0,
+        offset_m={axis: float(offset[k]) for k, axis in enumerate("xyz")},
+        building_footprint_m2=round(footprint_m2, 1),
+        building_area_ratio=round(boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
+        building_covered_share=round(covered_m2 / footprint_m2, 4) if footprint_m2 else None,
+        num_objects=model.num_objects,
+        dropped_objects=model.dropped,
+    )
     return boxes.box_map(header)
 
 

@@ -3,7 +3,7 @@
 The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise; it is converted here and nowhere else. A box stands
 with its foot at the node's location, its size is the table's full size times the node's scale. What the source does not hold:
 street furniture has placeholder cubes in the size table, so ASSETS gives plausible sizes (counted as `default`); roads have no size,
-so carriageway and pavement come from what stands beside them (counted as `road`). `header["extent_sources"]` holds the counts.
+so carriageway and pavement come from what stands beside them (counted as `road`). `header.extent_sources` holds the counts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
-from cosfly.products.boxes import BoxMap
+from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.store import read_json
 
@@ -75,10 +75,10 @@ class SimWorldConfig(Config):
         [], description="asset size tables, the first that knows an asset counts; none: Bbox.json beside the world"
     )
     tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
-    licence: str = Field(
-        "Apache-2.0, SimWorld, maitrix-org and contributors",
-        description="licence line for the records of everything made from the map",
+    licence: LicenceId = Field(
+        "apache-2.0", description="licence of the world, as the hub spells it; goes into every release"
     )
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the world's makers")
     road_length_m: float = Field(200.0, gt=0.0, description="length of a road piece, m: the generator's default")
     unknown: Literal["error", "drop"] = Field(
         "error", description="what an asset without a kind or a size is: an error, or left out and counted"
@@ -183,16 +183,18 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     sources["road"] = widths.pop("num_boxes")
     num_asset_boxes = len(boxes)
     _add_unsourced(boxes, cfg, lines, widths)
-    header = {
-        "name": cfg.name,
-        "source": {"tool": cfg.tool, "version": "world file", "file": cfg.world.name, "licence": cfg.licence},
-        "ground_z_m": 0.0,
-        "extent_sources": sources,
-        "roads": widths,
-        "added_boxes": len(boxes) - num_asset_boxes,
-        "num_objects": len(nodes),
-        "dropped_objects": {"unknown_asset": dropped} if dropped else {},
-    }
+    header = MapHeader(
+        name=cfg.name,
+        source=MapSource(tool=cfg.tool, version="world file", file=cfg.world.name),
+        licence=cfg.licence,
+        credits=cfg.credits,
+        ground_z_m=0.0,
+        extent_sources=sources,
+        roads=widths,
+        added_boxes=len(boxes) - num_asset_boxes,
+        num_objects=len(nodes),
+        dropped_objects={"unknown_asset": dropped} if dropped else {},
+    )
     return boxes.box_map(header)
 
 
@@ -327,7 +329,7 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     Both are what nearly all objects keep clear of (tenth percentile): fronts from the nearest points of buildings, the kerb from the
     middles of street furniture.
     """
-    box_map = boxes.box_map({})
+    box_map = boxes.box_map()
     kinds = np.array([KIND_NAMES[int(kind)] for kind in box_map.kinds])
     fronts = [DEFAULT_FRONT_M]
     rows = np.flatnonzero(kinds == "Buildings")
@@ -399,7 +401,7 @@ def _slab(boxes: BoxList, kind: str, middle: np.ndarray, size: tuple[float, floa
 
 def _add_unsourced(boxes: BoxList, cfg: SimWorldConfig, lines: list[Centerline], widths: dict) -> None:
     """Add the ground below everything, and paint: neither is in the source."""
-    low, high = boxes.box_map({}).bounds()
+    low, high = boxes.box_map().bounds()
     boxes.add_span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     if not cfg.paint:
         return

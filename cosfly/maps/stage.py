@@ -69,8 +69,8 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
     write_json(out / "roi_polygon.json", covered_ground(box_map).model_dump())
-    dropped = {str(k): int(v) for k, v in box_map.header.get("dropped_objects", {}).items()}
-    num_objects = int(box_map.header.get("num_objects", len(box_map)))
+    dropped = box_map.header.dropped_objects
+    num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     outputs = [product, out / "roi_polygon.json", out / "map.png"]
     stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())

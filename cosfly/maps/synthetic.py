@@ -32,7 +32,7 @@ from cosfly.maps.town_blocks import (
     ring,
     tree,
 )
-from cosfly.products.boxes import BoxMap
+from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 
 GENERATOR_VERSION = "1"
 
@@ -111,8 +111,8 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
             high = np.array([strips[column + 1].low_m, strips[row + 1].low_m])
             kind = kinds[row * cfg.num_blocks + column]
             BLOCKS[kind](boxes, low, high, rng_for(seed, "maps", f"block {row} {column}"))
-    source = {"tool": "cosfly maps synthetic", "version": GENERATOR_VERSION, "seed": seed, "licence": "Apache-2.0"}
-    return boxes.box_map({"name": cfg.name, "source": source, "ground_z_m": 0.0})
+    source = MapSource(tool="cosfly maps synthetic", version=GENERATOR_VERSION, seed=seed)
+    return boxes.box_map(MapHeader(name=cfg.name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
 
 
 def _strips(cfg: SyntheticConfig) -> list[Strip]:

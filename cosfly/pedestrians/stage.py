@@ -26,7 +26,7 @@ from cosfly.config import Config
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.overview import draw_overview
-from cosfly.pedestrians.walkable import GROUND_Z_M, Clock, WalkableGround, find_ground, sample_goal, sample_start
+from cosfly.pedestrians.walkable import Clock, WalkableGround, find_ground, sample_goal, sample_start
 from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.roi import Roi, read_roi
@@ -130,7 +130,7 @@ def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng:
             max_speed_mps=cfg.max_speed_mps,
         )
         time_s, positions_m, sampled_mps = resample(polyline_m, speeds_mps, arrival_times(polyline_m, speeds_mps))
-        on_ground = np.column_stack([positions_m, np.full(len(time_s), GROUND_Z_M)])
+        on_ground = np.column_stack([positions_m, np.full(len(time_s), ground.z_m)])
     return MadeWalk(Walk(path_id, polyline_m, time_s, on_ground, sampled_mps), retries, clock.seconds)
 
 

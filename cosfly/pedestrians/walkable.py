@@ -35,7 +35,6 @@ from cosfly.products.roi import Roi
 
 log = logging.getLogger(__name__)
 
-GROUND_Z_M = 0.0  # tab:ped_params
 PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
 
 
@@ -44,12 +43,13 @@ class WalkableGround:
     """Where people may walk.
 
     grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one cell
-    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, small components.
+    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, small components. z_m: its height.
     """
 
     grid: OccupancyGrid
     inflated: OccupancyGrid
     parts: np.ndarray
+    z_m: float
     is_in_roi: np.ndarray | None = None
     counts: dict[str, Any] = field(default_factory=dict)
 
@@ -110,7 +110,7 @@ def find_ground(
     with clock("grid"):
         empty = empty_grid(box_map, resolution_m)
     with clock("project"):
-        grid = occupancy(box_map, height_m=human_height_m, ground_z_m=GROUND_Z_M, like=empty)
+        grid = occupancy(box_map, height_m=human_height_m, like=empty)
         has_surface = _surface(box_map, surfaces, grid)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
     with clock("inflate"):
@@ -122,7 +122,7 @@ def find_ground(
                 free &= mask
     counts: dict[str, Any] = {
         "boxes": len(box_map),
-        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=human_height_m, ground_z_m=GROUND_Z_M)),
+        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=human_height_m)),
         "grid": list(grid.size),
         "cells": free.size,
         "cells_occupied": _count(grid.occupied),
@@ -136,7 +136,7 @@ def find_ground(
     with clock("connectivity"):
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, min_component_cells, counts, place)
-    return WalkableGround(grid, inflated, parts, is_in_roi, counts)
+    return WalkableGround(grid, inflated, parts, box_map.header.ground_z_m, is_in_roi, counts)
 
 
 def _count(mask: np.ndarray) -> int:
@@ -147,13 +147,13 @@ def _surface(box_map: BoxMap, surfaces: str, grid: OccupancyGrid) -> np.ndarray 
     """Tell where there is ground as the settings want it; None for everywhere, also if the map has no ground at all."""
     if surfaces == "anywhere":
         return None
-    found = surface(box_map, GROUND_KINDS, like=grid, ground_z_m=GROUND_Z_M)
+    found = surface(box_map, GROUND_KINDS, like=grid)
     if found is None:
         log.warning("%s has no ground boxes: people walk wherever nothing stands", box_map.name)
         return None
     if surfaces == "surfaces":
         return found
-    paved = surface(box_map, PAVED_KINDS, like=grid, ground_z_m=GROUND_Z_M)
+    paved = surface(box_map, PAVED_KINDS, like=grid)
     return np.zeros_like(found) if paved is None else paved
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
@@ -15,6 +16,63 @@ from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.store import check_schema, dump_json, read_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
+COMPUTED = (
+    "schema",
+    "schema_version",
+    "axes",
+    "bounds",
+    "num_boxes",
+    "counts",
+)  # written from the boxes, never carried
+
+UNKNOWN_LICENCE, OUR_LICENCE = "unknown", "apache-2.0"  # the latter: of maps that cosfly invents
+LicenceId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9.+-]*$")]  # as the hub spells it: apache-2.0, cc-by-4.0
+
+
+class _Kept(BaseModel):
+    """Keys that only a foreign file has are kept and written again."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, populate_by_name=True)
+
+
+class MapSource(_Kept):
+    """What a map was made with, and of which file or seed."""
+
+    tool: str = ""
+    version: str = ""
+    file: str = ""
+    seed: int = 0
+
+
+class SimplifyPass(_Kept):
+    """What one pass of step 2 left; the first entry of a list is the input."""
+
+    name: str = Field(alias="pass")
+    counts: dict[str, int]
+
+
+class MapHeader(_Kept):
+    """What a map says about itself; what is not set is not written.
+
+    ground_z_m is the one height of the ground: people walk on it, and every stage counts heights from it.
+    """
+
+    name: str = "map"
+    source: MapSource = MapSource()
+    licence: LicenceId = UNKNOWN_LICENCE
+    credits: str = ""  # who must be named, one sentence or more
+    ground_z_m: float = Field(0.0, allow_inf_nan=False)
+    extent_sources: dict[str, int] = {}  # where a box's size comes from -> boxes
+    roads: dict[str, float] = {}
+    added_boxes: int = 0  # boxes that the source does not hold
+    offset_m: dict[str, float] = {}  # from this map's coordinates to the source's
+    building_footprint_m2: float | None = None
+    building_area_ratio: float | None = None
+    building_covered_share: float | None = None
+    num_objects: int | None = None  # of the source, those that were dropped included
+    dropped_objects: dict[str, int] = {}
+    passes: list[SimplifyPass] = []
+    simplify: dict[str, Any] = {}  # the settings of step 2
 
 
 @dataclass(frozen=True)
@@ -22,7 +80,7 @@ class BoxMap:
     """A map of boxes, the product of stages 1 and 2.
 
     centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. `header` holds name, source, axes, ground height, and what a stage adds (passes).
+    ids: (n,) uint64, unique and stable. `header`: what the map says about itself.
     """
 
     centers: np.ndarray
@@ -30,14 +88,14 @@ class BoxMap:
     rotations_deg: np.ndarray
     kinds: np.ndarray
     ids: np.ndarray
-    header: dict[str, Any] = field(default_factory=dict)
+    header: MapHeader = field(default_factory=MapHeader)
 
     def __len__(self) -> int:
         return len(self.centers)
 
     @property
     def name(self) -> str:
-        return str(self.header.get("name", "map"))
+        return self.header.name
 
     @property
     def mins(self) -> np.ndarray:
@@ -71,7 +129,7 @@ class BoxMap:
 
 
 def make_box_map(
-    centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: dict | None = None
+    centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: MapHeader | None = None
 ) -> BoxMap:
     """Make a BoxMap from anything array-like; ids default to 1..n."""
     centers = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
@@ -83,7 +141,7 @@ def make_box_map(
         np.arange(1, len(centers) + 1, dtype=np.uint64)
         if ids is None
         else np.asarray(ids, dtype=np.uint64).reshape(-1),
-        dict(header or {}),
+        header or MapHeader(),
     )
 
 
@@ -123,14 +181,17 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
     mins, maxs = box_map.mins, box_map.maxs
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
-    header = {
+    told = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    passes: dict[str, Any] = {name: told.pop(name) for name in ("passes", "simplify") if name in told}
+    header: dict[str, Any] = {
         "schema": BOXES_SCHEMA,
         "schema_version": BOXES_VERSION,
-        **box_map.header,
+        **told,
         "axes": "right-handed, metres, x east, y north, z up; degrees",
         "bounds": {"min": rounded(low), "max": rounded(high)},
         "num_boxes": len(box_map),
         "counts": box_map.counts(),
+        **passes,
     }
     lines = []
     for i in range(len(box_map)):
@@ -161,11 +222,11 @@ def read_boxes(path: Path) -> BoxMap:
         InputError: names the file, the box and the field.
     """
     value = read_json(path, what="map")
-    header: dict[str, Any] = {"name": path.stem}
+    header = MapHeader(name=path.stem)
     records: Any = value
     if not isinstance(value, list):
-        header = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path)
-        records = header.pop("boxes", None)
+        records = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path).pop("boxes", None)
+        header = _read_header(value, path)
         if not isinstance(records, list):
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:
@@ -194,6 +255,15 @@ def read_boxes(path: Path) -> BoxMap:
     box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
     check_boxes(box_map, path)
     return box_map
+
+
+def _read_header(value: dict, path: Path) -> MapHeader:
+    try:
+        return MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
+    except ValidationError as error:
+        detail = error.errors()[0]
+        field = ".".join(str(part) for part in detail["loc"])
+        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
 
 
 def _vectors(records: list[dict], name: str, path: Path) -> np.ndarray:

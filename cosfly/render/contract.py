@@ -131,14 +131,9 @@ def scene_origin(box_map: BoxMap) -> np.ndarray:
 
 
 def ground_z_m(box_map: BoxMap) -> float:
-    """Height of the ground: the map's own figure where it has one, but never above a slab that covers it."""
+    """Height of the ground plane: the map's own figure, but never above a slab that covers it."""
     tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
-    if len(tops):
-        return float(tops.min())
-    given = box_map.header.get("ground_z_m")
-    if isinstance(given, int | float):
-        return float(given)
-    return float(box_map.mins[:, 2].min()) if len(box_map) else 0.0
+    return float(tops.min(initial=box_map.header.ground_z_m))
 
 
 def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
-from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
+from cosfly.products.boxes import BoxMap, SimplifyPass, read_boxes, write_boxes
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.simplify.merge import MergeRule, merge
 from cosfly.stage_folder import Resume, StageFolder, Tally
@@ -90,7 +90,6 @@ class SimplifyConfig(Config):
     below_ground: Literal["drop", "clip"] = Field(
         "drop", description="clip: also cut off what a box has below the ground (SimWorld); drop: leave boxes whole"
     )
-    ground_z_m: float = Field(0.0, description="height of the ground, m")
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
     picture_px: int = Field(
@@ -124,18 +123,16 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
         result = crop_tree(result, cfg, used_ids, feet) if fixed else crop_tree_adaptive(result, cfg, used_ids)
         passes.append(("crop_tree", result.counts()))
     if cfg.crop_below_ground:
-        result = crop_below_ground(result, cfg.ground_z_m, clip=cfg.below_ground == "clip")
+        result = crop_below_ground(result, clip=cfg.below_ground == "clip")
         passes.append(("crop_below_ground", result.counts()))
     if cfg.prune_nested:
         result = prune_nested(result, cfg.nested_tolerance_m)
         passes.append(("prune_nested", result.counts()))
-    settings = cfg.model_dump(mode="json", exclude={"picture_px"})
-    header = {
-        **result.header,
-        "passes": [{"pass": name, "counts": counts} for name, counts in passes],
-        "simplify": settings,
+    told = {
+        "passes": [SimplifyPass(name=name, counts=counts) for name, counts in passes],
+        "simplify": cfg.model_dump(mode="json", exclude={"picture_px"}),
     }
-    return Simplified(replace(result, header=header), passes)
+    return Simplified(replace(result, header=box_map.header.model_copy(update=told)), passes)
 
 
 def _concatenate(one: BoxMap, other: BoxMap) -> BoxMap:
@@ -155,7 +152,7 @@ def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     """Groups that never merge with each other, (n,). With stems, bushes and hedges must not vanish below the cut of a tree."""
     if not _has_stems(cfg):
         return np.zeros(len(box_map), dtype=bool)
-    return box_map.maxs[:, 2] > cfg.ground_z_m + cfg.cut_height_m
+    return box_map.maxs[:, 2] > box_map.header.ground_z_m + cfg.cut_height_m
 
 
 def _has_stems(cfg: SimplifyConfig) -> bool:
@@ -171,10 +168,11 @@ def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     Taken before the merge, because a merged grove still has one stem for each of its trees.
     """
     mins, maxs = box_map.mins[:, 2], box_map.maxs[:, 2]
-    cut = cfg.ground_z_m + cfg.cut_height_m
-    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (mins < cut) & (maxs > cut) & (maxs > cfg.ground_z_m))
+    ground_z_m = box_map.header.ground_z_m
+    cut = ground_z_m + cfg.cut_height_m
+    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (mins < cut) & (maxs > cut))
     # A box that hangs above the ground is a part of a crown, not a tree that stands, unless it comes down to a metre.
-    rows = rows[mins[rows] <= cfg.ground_z_m + 1.0]
+    rows = rows[mins[rows] <= ground_z_m + 1.0]
     half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
     return np.column_stack([box_map.centers[rows, :2], half, half])
 
@@ -188,7 +186,8 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
         used_ids: ids that new boxes may not take. feet: (k, 4) stems to stand below the canopies; None: full footprints.
     Source: sec:step2, "Crop tree operation"; stems are ours.
     """
-    cut = cfg.ground_z_m + cfg.cut_height_m
+    ground_z_m = box_map.header.ground_z_m
+    cut = ground_z_m + cfg.cut_height_m
     rows = np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut))
     is_tilted = (box_map.rotations_deg[rows][:, [0, 2]] != 0).any(axis=1)
     rotations = np.where(is_tilted[:, None], 0.0, box_map.rotations_deg[rows])
@@ -210,7 +209,7 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
         places, widths, turns = feet[:, :2], feet[:, 2:], np.zeros((len(feet), 3))
     count = len(places)
     trunks = BoxMap(
-        np.column_stack([places, np.full(count, cfg.ground_z_m + cfg.cut_height_m / 2)]),
+        np.column_stack([places, np.full(count, ground_z_m + cfg.cut_height_m / 2)]),
         np.column_stack([widths, np.full(count, cfg.cut_height_m / 2)]),
         turns,
         np.full(count, VEGETATION, dtype=np.uint8),
@@ -229,9 +228,10 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
         used_ids: ids that new boxes may not take.
     Source: app:simworld:step3, "crop_tree".
     """
-    split = cfg.ground_z_m + cfg.split_z_m
+    ground_z_m = box_map.header.ground_z_m
+    split = ground_z_m + cfg.split_z_m
     low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
-    is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, cfg.ground_z_m) > cfg.adaptive_height_m)
+    is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
     rows, is_first, lows, highs = [], [], [], []
     for row in np.flatnonzero(is_tall):
         cuts = [float(low[row])]
@@ -248,7 +248,7 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
     is_tilted = (box_map.rotations_deg[pieces][:, [0, 2]] != 0).any(axis=1)[:, None]
     bounds = axis_aligned_half_extents(box_map.half_extents[pieces], box_map.rotations_deg[pieces])
     half = np.where(is_tilted, bounds, box_map.half_extents[pieces])
-    is_stem = ((low_z < split) & (low_z <= cfg.ground_z_m + 1.0))[:, None]
+    is_stem = ((low_z < split) & (low_z <= ground_z_m + 1.0))[:, None]
     half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
     half[:, 2] = (high_z - low_z) / 2
     keeps_id = np.array(is_first, dtype=bool)
@@ -273,13 +273,14 @@ def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
 # --- removal ----------------------------------------------------------------------------------------------------------
 
 
-def crop_below_ground(box_map: BoxMap, ground_z_m: float, *, clip: bool = False) -> BoxMap:
+def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
     """Drop boxes whose top face lies below the ground; surfaces stay (sec:step2, "Below-ground removal").
 
     Args:
         clip: also cut off what upright boxes, surfaces apart, have below the ground; what only just reaches it goes too
             (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
     """
+    ground_z_m = box_map.header.ground_z_m
     is_surface = np.isin(box_map.kinds, SURFACE_KINDS)
     lows, tops = box_map.mins[:, 2], box_map.maxs[:, 2]
     if not clip:
@@ -353,13 +354,13 @@ def _sweep_nested(
 # --- report and stage -------------------------------------------------------------------------------------------------
 
 
-def cross_validate(raw: BoxMap, simplified: BoxMap, ground_z_m: float = 0.0) -> dict:
+def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     """Compare two maps on the pedestrian-height grid of Step 3: cell agreement, IoU, and the walkable area of each.
 
     The walkable area counts cells that stay free after the safety radius; its largest part is what paths are sampled from.
     """
     grid = empty_grid(raw)
-    before, after = (occupancy(m, like=grid, ground_z_m=ground_z_m) for m in (raw, simplified))
+    before, after = (occupancy(m, like=grid) for m in (raw, simplified))
     agreement = compare(before, after)
     facts: dict = {
         "cells": list(grid.size),
@@ -382,11 +383,11 @@ def report(raw: BoxMap, result: Simplified, cfg: SimplifyConfig) -> dict:
         "name": raw.name,
         "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
         "obstacles_at_walking_height": {
-            "raw": int(blocks_walking(raw, ground_z_m=cfg.ground_z_m).sum()),
-            "simplified": int(blocks_walking(result.box_map, ground_z_m=cfg.ground_z_m).sum()),
+            "raw": int(blocks_walking(raw).sum()),
+            "simplified": int(blocks_walking(result.box_map).sum()),
         },
         "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
-        "grid": cross_validate(raw, result.box_map, cfg.ground_z_m),
+        "grid": cross_validate(raw, result.box_map),
         "trunks": _compare_trunks(raw, cfg),
     }
 
@@ -397,7 +398,7 @@ def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
         return {}
     results = {trunk: simplify(raw, cfg.model_copy(update={"trunk": trunk})) for trunk in ("stem", "full")}
     names = ("cell_agreement", "iou", "simplified_walkable_m2", "simplified_largest_part_m2")
-    grids = {trunk: cross_validate(raw, result.box_map, cfg.ground_z_m) for trunk, result in results.items()}
+    grids = {trunk: cross_validate(raw, result.box_map) for trunk, result in results.items()}
     return {trunk: {name: grid[name] for name in names} for trunk, grid in grids.items()}
 
 
@@ -411,7 +412,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     result = simplify(raw, cfg)
     if len(result.box_map) == 0:
         raise InputError(
-            "every box lies below the ground", where=maps, expected="boxes above it", fix="check ground_z_m"
+            "every box lies below the ground", where=maps, expected="boxes above it", fix="check the map's ground_z_m"
         )
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)

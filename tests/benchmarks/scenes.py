@@ -50,7 +50,7 @@ def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
         np.tile(box_map.rotations_deg, (tiles, 1)),
         np.tile(box_map.kinds, tiles),
         np.arange(1, count * tiles + 1, dtype=np.uint64),
-        {**box_map.header, "name": f"{box_map.name}{columns}x{rows}"},
+        box_map.header.model_copy(update={"name": f"{box_map.name}{columns}x{rows}"}),
     )
 
 
