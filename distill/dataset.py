@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -21,7 +20,7 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import Caption, Language, Prompt, parse_answer, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import dump_json, model_lines, storage_errors
+from cosfly.store import atomic_file, dump_json, model_lines
 
 log = logging.getLogger(__name__)
 
@@ -221,7 +220,7 @@ def run(
     Returns:
         `out`, the training set.
     Raises:
-        InputError: no caption can be used, or there are too few trajectories to split.
+        NothingKept: no caption can be used. InputError: there are too few trajectories to split.
     """
     stage = StageFolder.open(
         out,
@@ -243,12 +242,8 @@ def run(
         else:
             groups.add(sample.group(cfg.split_by))
     if not groups:
-        raise InputError(
-            "no caption can be learned from",
-            where=captions,
-            got=", ".join(f"{reason} {count}" for reason, count in sorted(excluded.items())) or "an empty file",
-            fix="check --data when images are missing, and the settings languages and repaired",
-        )
+        tally = Tally(input=excluded.total(), dropped=dict(excluded))
+        raise stage.nothing_kept(tally, expected="accepted captions whose images stand below --data")
     split_of = assign_splits(groups, cfg, seed)
     facts = _write_splits(cfg, captions, data, out, split_of)
     counts = check_no_leak({split: read_split(out, split) for split in SPLITS}, cfg.split_by)
@@ -269,23 +264,18 @@ def _write_splits(
     counters: dict[str, dict[str, Counter[str]]] = {
         split: {"language": Counter(), "decision": Counter(), "repair": Counter()} for split in SPLITS
     }
-    partials = {split: out / f".{split}.jsonl.partial" for split in SPLITS}
-    with storage_errors(out), ExitStack() as stack:
-        files = {split: stack.enter_context(open(path, "w", encoding="utf-8")) for split, path in partials.items()}
+    with ExitStack() as stack:
+        files = {split: stack.enter_context(atomic_file(split_path(out, split))) for split in SPLITS}
         for sample in _samples(cfg, captions, data):
             if isinstance(sample, str):
                 continue
             split = split_of[sample.group(cfg.split_by)]
-            files[split].write(dump_json(sample.model_dump(mode="json")) + "\n")
+            files[split].write((dump_json(sample.model_dump(mode="json")) + "\n").encode())
             counter = counters[split]
             counter["language"][sample.language] += 1
             counter["decision"][sample.decision] += 1
             counter["repair"][sample.repair or "none"] += 1
-        for file in files.values():
-            file.flush()
-            os.fsync(file.fileno())
-    for split, path in partials.items():
-        path.replace(split_path(out, split))
+    for split in SPLITS:
         facts[split] = {
             "samples": counters[split]["language"].total(),
             **{f"by_{name}": dict(sorted(counter.items())) for name, counter in counters[split].items()},

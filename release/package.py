@@ -11,7 +11,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -23,13 +23,13 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.products.inspection import FlightInspection, Inspection, read_inspection
 from cosfly.products.playback import read_flight
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import (
     CHECKSUMS,
+    atomic_file,
     atomic_folder,
     inside,
     sha256_file,
-    storage_errors,
     write_bytes,
     write_checksums,
     write_json,
@@ -115,17 +115,10 @@ def write_part(path: Path, folder: Path, captions: dict[int, ReleasedCaption], c
         raise InputError("a caption belongs to no frame", where=folder, got=f"frame {beyond[0]}", expected=expected)
     selected = select_frames(len(flight), cfg.num_frames).tolist()
     schema = columns.schema(cfg.modalities)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open_writer(partial, schema) as writer:
-                for rows in _batches((columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected), cfg):
-                    writer.write_table(pa.Table.from_pylist(rows, schema=schema), row_group_size=len(rows))
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)  # on a full disk it would hold the space that is needed
-            raise
+    rows = (columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected)
+    with atomic_file(path) as file, open_writer(file, schema) as writer:
+        for batch in _batches(rows, cfg):
+            writer.write_table(pa.Table.from_pylist(batch, schema=schema), row_group_size=len(batch))
     num_captions = sum(i in captions for i in selected)
     return {
         "frames": len(selected),
@@ -152,7 +145,7 @@ def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[lis
         yield batch
 
 
-def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+def open_writer(file: Path | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
     """Open a parquet file whose bytes depend on the rows alone.
 
     PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
@@ -166,7 +159,7 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
             small.append(name)
     repeated = [name for name in small if schema.field(name.split(".")[0]).type == pa.string()]
     return pq.ParquetWriter(
-        path, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6"
+        file, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6"
     )
 
 
@@ -269,8 +262,8 @@ def run(
     inspection = read_inspection(inspect)
     chosen, left_out = choose_flights(inspection, cfg)
     if not chosen:
-        got = ", ".join(f"{reason} {count}" for reason, count in left_out.items()) or "no flights"
-        raise InputError("there is no flight to release", where=inspect, got=got, fix="look at report.html beside it")
+        tally = Tally(input=len(inspection.flights), dropped=left_out)
+        raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
     loaded = load_captions(captions)
     items = [
         Item(flight.folder, loaded.by_flight.get((flight.town, flight.trajectory, flight.variant), {}))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.errors import InputError
-from cosfly.store import check_schema, read_json
+from cosfly.store import check_schema, read_json, validation_errors
 from release.columns import Modality
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
@@ -68,10 +67,6 @@ def read_record(path: Path) -> dict[str, Any]:
         InputError: names the file and the field.
     """
     record = check_schema(read_json(path, what="release record"), RELEASE_SCHEMA, RELEASE_VERSION, path)
-    try:
+    with validation_errors(path):
         ReleaseRecord.model_validate(record)
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(str(part) for part in detail["loc"])
-        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
     return record

@@ -181,12 +181,12 @@ def broken_worlds() -> list:
     good = node("BP_Building_01_C", 0, 0)
     cases = []
     for field, change in {
-        "nodes[0] (GEN_BP_Building_01_C).properties.location.x": lambda n: n["properties"]["location"].update(x="far"),
-        "nodes[0] (GEN_BP_Building_01_C).properties.scale": lambda n: n["properties"]["scale"].update(x=-1.0),
-        "nodes[0] (GEN_BP_Building_01_C).properties.orientation.yaw": lambda n: n["properties"]["orientation"].pop(
+        "nodes[0] (GEN_BP_Building_01_C): properties.location.x": lambda n: n["properties"]["location"].update(x="far"),
+        "nodes[0] (GEN_BP_Building_01_C): properties.scale": lambda n: n["properties"]["scale"].update(x=-1.0),
+        "nodes[0] (GEN_BP_Building_01_C): properties.orientation.yaw": lambda n: n["properties"]["orientation"].pop(
             "yaw"
         ),
-        "nodes[0] (GEN_BP_Building_01_C).properties.orientation": lambda n: n["properties"]["orientation"].update(
+        "nodes[0] (GEN_BP_Building_01_C): properties.orientation": lambda n: n["properties"]["orientation"].update(
             roll=9
         ),
         "GEN_BP_Building_01_C.instance_name": lambda n: n.update(instance_name="BP_Spaceship_C"),

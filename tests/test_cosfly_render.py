@@ -14,7 +14,7 @@ from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly import gallery
 from cosfly.config import build
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept, ResumeError
 from cosfly.geometry import focal_px, intrinsic_matrix, rotation_matrices, world_from_camera
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products import playback
@@ -489,7 +489,7 @@ def test_other_settings_do_not_continue_a_finished_tree(finished):
 
 def test_no_flight_to_draw(tmp_path):
     inputs = write_inputs(tmp_path, [circling(3, drop_reason="not_smooth")])
-    with pytest.raises(InputError, match="no flight to draw"):
+    with pytest.raises(NothingKept, match=r"1 dropped \(not_smooth 1\) of 1"):
         run(RenderConfig(), *inputs, tmp_path / "out")
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions
 
-from cosfly.errors import InputError, ResumeError, VerifyError
+from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
 from distill.dataset import (
     SPLITS,
@@ -205,7 +205,7 @@ def test_run_counts_what_it_leaves_out(tree, tmp_path):
 
 def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
     bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
-    with pytest.raises(InputError, match=r"no caption can be learned from.*missing_image 80.*--data"):
+    with pytest.raises(NothingKept, match=r"kept nothing.*missing_image 80.*--data"):
         run(PrepareConfig(), captions, bare, tmp_path / "set")
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError
+from cosfly.errors import InputError, NothingKept
 from cosfly.issues import Issue
 from cosfly.products.captions import Caption, Coc, Prompt, write_captions
 from cosfly.products.frames import read_depth, read_instance, read_rgb
@@ -336,7 +336,7 @@ def test_no_accepted_flight_is_one_clear_error(inputs, tmp_path):
     names = [folder.relative_to(inputs / "tree").as_posix() for folder in find_flights(inputs / "tree")]
     everything = make_inspection(inputs / "tree", dict.fromkeys(names, ("rejected", "jerk")))
     write_inspection(tmp_path / "inspect.json", everything)
-    with pytest.raises(InputError, match="no flight to release") as caught:
+    with pytest.raises(NothingKept, match="release kept nothing") as caught:
         run(CFG, inputs / "tree", inputs / "captions.jsonl", tmp_path / "inspect.json", tmp_path / "r")
     assert "jerk 6" in str(caught.value)
 

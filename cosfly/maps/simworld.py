@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
@@ -23,7 +23,7 @@ from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.store import read_json
+from cosfly.store import read_json, validation_errors
 
 log = logging.getLogger(__name__)
 
@@ -206,16 +206,6 @@ def asset_of(name: str) -> Asset | None:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def _parsed(model: type[BaseModel], value: object, where: str):
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(map(str, detail["loc"]))
-        got = type(detail["input"]).__name__ if isinstance(detail["input"], dict | list) else repr(detail["input"])[:60]
-        raise InputError(detail["msg"].lower(), where=f"{where}.{field}", got=got) from None
-
-
 def _group(value: object, name: str, kind: type, path: Path):
     group = value.get(name) if isinstance(value, dict) else None
     if not isinstance(group, kind) or not group:
@@ -233,15 +223,18 @@ def _read_nodes(path: Path) -> list[_Node]:
     nodes = []
     for number, value in enumerate(_group(read_json(path, what="SimWorld world"), "nodes", list, path)):
         name = value.get("id", "?") if isinstance(value, dict) else "?"
-        node = _parsed(_Node, value, f"{path}: nodes[{number}] ({name})")
+        where = f"{path}: nodes[{number}] ({name})"
+        with validation_errors(where):
+            node = _Node.model_validate(value)
         scale, turn = node.properties.scale, node.properties.orientation
-        where = f"{path}: nodes[{number}] ({name}).properties"
         if min(scale.x, scale.y, scale.z) <= 0:
-            raise InputError("a scale is not positive", where=f"{where}.scale", got=str([scale.x, scale.y, scale.z]))
+            raise InputError(
+                "a scale is not positive", where=f"{where}: properties.scale", got=str([scale.x, scale.y, scale.z])
+            )
         if turn.pitch or turn.roll:
             raise InputError(
                 "a tilted object",
-                where=f"{where}.orientation",
+                where=f"{where}: properties.orientation",
                 got=f"pitch {turn.pitch}, roll {turn.roll}",
                 expected="0 and 0",
             )
@@ -258,11 +251,11 @@ def _read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
             raise InputError("not an asset size table", where=path, expected="an object of groups of assets")
         for group in table:
             for name, value in _group(table, group, dict, path).items():
-                box = _parsed(_Size, value, f"{path}: {group}.{name}").bbox
+                where = f"{path}: {group}.{name}"
+                with validation_errors(where):
+                    box = _Size.model_validate(value).bbox
                 if min(box.x, box.y, box.z) <= 0:
-                    raise InputError(
-                        "a size is not positive", where=f"{path}: {group}.{name}.bbox", got=str([box.x, box.y, box.z])
-                    )
+                    raise InputError("a size is not positive", where=f"{where}: bbox", got=str([box.x, box.y, box.z]))
                 sizes.setdefault(name, np.array([box.x, box.y, box.z]))
     return sizes
 

@@ -7,7 +7,6 @@ caption/truth/actions.py; here is only what an answer must look like.
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
 from cosfly.chat.contract import Usage
-from cosfly.store import dump_json, model_lines, storage_errors
+from cosfly.store import atomic_file, dump_json, model_lines
 
 # tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
 ACTION_GROUPS: dict[str, tuple[str, ...]] = {
@@ -263,17 +262,11 @@ def write_captions(path: Path, captions: Iterable[Caption]) -> int:
 
 def write_caption_lines(path: Path, lines: Iterable[str]) -> int:
     """The same for captions that are text already, as `caption_lines` gives them."""
-    partial = path.with_name(f".{path.name}.partial")
     count = 0
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "w", encoding="utf-8") as file:
-            for line in lines:
-                file.write(line)
-                count += 1
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+    with atomic_file(path) as file:
+        for line in lines:
+            file.write(line.encode())
+            count += 1
     return count
 
 

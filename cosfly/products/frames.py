@@ -10,12 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
-from cosfly.store import check_schema, dump_json, read_json
+from cosfly.store import check_schema, dump_json, read_json, validation_errors
 
 FRAMES_DIR = "frames_playback"
 FRAME_FILES = ("rgb.png", "depth.npy", "instance.png", "meta.json")
@@ -197,12 +197,8 @@ def read_meta(frame: Path) -> FrameMeta:
     """
     path = frame / "meta.json"
     value = check_schema(read_json(path, what="frame annotation"), META_SCHEMA, META_VERSION, path)
-    try:
+    with validation_errors(path):
         return FrameMeta.model_validate(value)
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(str(part) for part in detail["loc"])
-        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
 
 
 # --- the files --------------------------------------------------------------------------------------------------------

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from cosfly.errors import InputError
 from cosfly.issues import Issue
-from cosfly.store import check_schema, read_json, write_json
+from cosfly.store import read_model, write_model
 
 INSPECT_SCHEMA, INSPECT_VERSION = "cosfly.inspect", "1.0"
 
@@ -81,7 +80,7 @@ class Funnel(BaseModel):
 class Inspection(BaseModel):
     """The whole file."""
 
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(extra="forbid")
 
     settings: dict[str, Any]
     funnel: Funnel
@@ -90,8 +89,7 @@ class Inspection(BaseModel):
 
 def write_inspection(path: Path, inspection: Inspection) -> None:
     """Write `inspect.json`."""
-    header = {"schema": INSPECT_SCHEMA, "schema_version": INSPECT_VERSION}
-    write_json(path, {**header, **inspection.model_dump(mode="json")})
+    write_model(path, inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION)
 
 
 def read_inspection(path: Path) -> Inspection:
@@ -100,11 +98,4 @@ def read_inspection(path: Path) -> Inspection:
     Raises:
         InputError: names the file and the field.
     """
-    value = check_schema(read_json(path, what="inspection"), INSPECT_SCHEMA, INSPECT_VERSION, path)
-    body = {key: item for key, item in value.items() if key not in ("schema", "schema_version")}
-    try:
-        return Inspection.model_validate(body)
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(str(part) for part in detail["loc"])
-        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
+    return read_model(path, Inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION, what="inspection")

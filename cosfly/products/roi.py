@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
-from cosfly.store import read_json
+from cosfly.store import read_json, validation_errors
 
 
 class RoiPolygon(BaseModel):
@@ -42,13 +42,8 @@ def read_roi(path: Path) -> Roi:
         InputError: malformed, not closed, or a ring of fewer than three finite points.
     """
     value = read_json(path, what="region of interest")
-    try:
+    with validation_errors(path):
         roi = Roi.model_validate(value)
-    except ValidationError as error:
-        detail = error.errors()[0]
-        place = ".".join(map(str, detail["loc"])) or "top level"
-        what = "not an object" if detail["type"] == "model_type" else detail["msg"]
-        raise InputError(what, where=f"{path}: {place}", got=repr(detail["input"])[:80]) from None
     if not roi.closed:
         raise InputError(
             "the polygon is not closed",

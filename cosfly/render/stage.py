@@ -9,6 +9,7 @@ import importlib
 import logging
 import os
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -27,7 +28,7 @@ from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import CHECKSUMS, atomic_folder, write_json
 
 log = logging.getLogger(__name__)
@@ -181,7 +182,7 @@ def run(
     Flights that the planner's prefilter dropped are not drawn; the manifest counts them. Gives the tree's root, `out`.
 
     Raises:
-        InputError: an input is missing or malformed, or no flight is left to draw. EnvironmentMissing: no renderer here.
+        InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no renderer here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces}
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
@@ -192,10 +193,8 @@ def run(
     _check_ids(all_traces, traces)
     passed = [(number, trace) for number, trace in enumerate(all_traces) if trace.drop_reason is None]
     if not passed:
-        raise InputError(
-            "no flight to draw", where=traces, got=f"{len(all_traces)} flights, all dropped by the planner",
-            fix="plan again with other settings, or more paths",
-        )  # fmt: skip
+        tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
+        raise stage.nothing_kept(tally, expected="a flight that the planner kept")
     instances = instance_ids(box_map)
     if instances.num_shared:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", instances.num_shared, SHARED_ID)
