@@ -43,7 +43,7 @@ class RunConfig(Config):
         0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
     )
     roi: Path | None = Field(
-        None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
+        None, description="region of interest for the pedestrians (a roi_polygon.json of yours); none: the whole map"
     )
     maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
     simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")

@@ -17,12 +17,11 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
 from cosfly.maps.cityjson_file import read_model, rule_of
-from cosfly.maps.footprints import Rectangle, cover, covered_ground, oriented_rectangle, rectangle_polygon, united
+from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
 from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.products.roi import read_roi
 from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
 from cosfly.topview import TopView, draw_map
 
@@ -319,15 +318,6 @@ def test_covers_reject_bad_settings():
         cover(box(0, 0, 1, 1), min_fill=0.0, min_size_m=1.0)
 
 
-def test_covered_ground_has_holes_where_there_is_nothing():
-    boxes = BoxList()
-    for low, high in (((0, 0), (40, 10)), ((0, 30), (40, 40)), ((0, 10), (10, 30)), ((30, 10), (40, 30))):
-        boxes.add_span("Roads", low, high, -0.3, 0.0)
-    boxes.add_span("Static", (60, 60), (70, 70), 0.0, 1.0)
-    (ring,) = covered_ground(boxes.box_map()).rings()
-    assert Polygon(ring.points_world, ring.holes).area == pytest.approx(1600 - 400, abs=1.0)
-
-
 def test_boxes_without_a_size_are_refused():
     with pytest.raises(ValueError, match="empty box"):
         BoxList().add("Roads", (0, 0), (1, 0), 0, 1)
@@ -531,7 +521,7 @@ def test_delft_stays_walkable(delft: BoxMap):
 def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     product = run(MapsConfig(), tmp_path / "one", seed=5)
     run(MapsConfig(), tmp_path / "two", seed=5)
-    names = ("boxes_3d.json", "roi_polygon.json", "map.png")
+    names = ("boxes_3d.json", "map.png")
     first = [(tmp_path / "one" / name).read_bytes() for name in names]
     assert first == [(tmp_path / "two" / name).read_bytes() for name in names]
     for name in ("manifest.json", "map.png"):  # as a kill before the end leaves it
@@ -541,7 +531,6 @@ def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     with pytest.raises(ResumeError, match="seed was 5, is 6"):
         run(MapsConfig(), tmp_path / "one", seed=6)
     assert read_boxes(product).header.source.seed == 5
-    assert read_roi(tmp_path / "one/roi_polygon.json").rings()
 
 
 def test_stage_notices_a_changed_world(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Polygons to oriented rectangles, cut in two, again and again, until the rectangle round a piece is nearly full; and back."""
+"""Polygons to oriented rectangles, cut in two, again and again, until the rectangle round a piece is nearly full."""
 
 from __future__ import annotations
 
@@ -9,13 +9,7 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.roi import Roi, RoiPolygon
-
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
-JOIN_M = 0.3  # slabs this close hang together
-MIN_REGION_M2 = 100.0
 MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
 
 
@@ -124,36 +118,3 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: tuple[float, ...]) -> lis
 def united(polygons: list[Polygon]) -> BaseGeometry:
     """Unite polygons that may be invalid."""
     return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object))) if polygons else MultiPolygon()
-
-
-def covered_ground(box_map: BoxMap) -> Roi:
-    """Give the region that a map has ground for: what its surfaces and bridges cover, hairline gaps closed.
-
-    Buildings and water need no holes here, for the occupancy grid knows them; a map without surfaces gives its bounds.
-    """
-    kinds = np.array(sorted(GROUND_KINDS | {KINDS["Bridge"], KINDS["Buildings"]}), dtype=np.uint8)
-    has_ground = np.isin(box_map.kinds, np.array(sorted(GROUND_KINDS), dtype=np.uint8)).any()
-    rows = np.flatnonzero(np.isin(box_map.kinds, kinds)) if has_ground else np.empty(0, dtype=int)
-    slabs = []
-    for row in rows:
-        center, size = box_map.centers[row, :2], 2 * box_map.half_extents[row, :2]
-        rectangle = Rectangle((center[0], center[1]), (size[0], size[1]), float(box_map.rotations_deg[row, 1]))
-        slabs.append(rectangle_polygon(rectangle))
-    if not slabs:
-        low, high = box_map.bounds()
-        slabs = [shapely.box(low[0], low[1], high[0], high[1])]
-    region = shapely.buffer(united(slabs), JOIN_M, join_style="mitre")
-    region = shapely.simplify(shapely.buffer(region, -JOIN_M, join_style="mitre"), 0.1)
-    rings = [
-        RoiPolygon(
-            points_world=_ring_points(part.exterior),
-            holes=[_ring_points(r) for r in part.interiors if Polygon(r).area > 4.0],
-        )
-        for part in polygons_of(region)
-        if part.area >= MIN_REGION_M2
-    ]
-    return Roi(description=f"ground of {box_map.name}", polygons=rings)
-
-
-def _ring_points(ring) -> list[tuple[float, float]]:
-    return [(round(x, 3), round(y, 3)) for x, y in ring.coords[:-1]]

@@ -12,12 +12,11 @@ from pydantic import Field
 
 from cosfly.config import Config
 from cosfly.maps.cityjson import CityJsonConfig
-from cosfly.maps.footprints import covered_ground
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.products.boxes import BoxMap, write_boxes
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import write_bytes, write_json
+from cosfly.store import write_bytes
 from cosfly.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
@@ -55,10 +54,7 @@ def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
-    """Reads the source's files, if it has any; writes `boxes_3d.json`, `roi_polygon.json` and the overview `map.png`.
-
-    The region of interest is what the map has ground for: real maps are not rectangles, and outside of them there is nothing.
-    """
+    """Reads the source's files, if it has any; writes `boxes_3d.json` and the overview `map.png`."""
     inputs = getattr(cfg, cfg.source).inputs()
     stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "boxes_3d.json"
@@ -68,10 +64,8 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     write_boxes(product, box_map)
     view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
-    write_json(out / "roi_polygon.json", covered_ground(box_map).model_dump())
     dropped = box_map.header.dropped_objects
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
-    outputs = [product, out / "roi_polygon.json", out / "map.png"]
-    stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
+    stage.finish([product, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product
