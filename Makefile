@@ -6,6 +6,7 @@ SHELL := /bin/bash
 VENV ?= .venv
 BIN := $(VENV)/bin
 RUN ?= runs/quickstart
+SLOW ?=
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
 .PHONY: quickstart test lint format clean
@@ -13,8 +14,8 @@ GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
 
-test: lint  ## Everything that must hold
-	$(BIN)/python -m pytest
+test: lint  ## What must hold, without the tests that take long; with SLOW=1 everything
+	$(BIN)/python -m pytest $(if $(SLOW),,-m "not slow")
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

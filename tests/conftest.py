@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile(
+    "cosfly", deadline=None
+)  # a busy machine is not a failure; pytest-timeout ends what hangs
+hypothesis.settings.load_profile("cosfly")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

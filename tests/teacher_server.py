@@ -144,6 +144,9 @@ def _answer(server: TeacherServer, body: dict, fault: str | None) -> dict:
 def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = (
+            True  # headers and body are two writes: else each answer waits 40 ms for an acknowledgement
+        )
 
         def do_GET(self) -> None:
             if self.path == "/v1/models":

@@ -331,6 +331,7 @@ run(CaptionConfig.model_validate(json.loads(sys.argv[3])), Path(sys.argv[1]), Pa
 """
 
 
+@pytest.mark.slow
 def test_nothing_answered_is_asked_twice_after_kill_9(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 2, 20, with_augmented=False)
     with TeacherServer() as undisturbed:

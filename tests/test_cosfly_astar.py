@@ -107,7 +107,7 @@ def test_the_checker_finds_planted_faults():
     assert "blocked: (1, 1)" in problems(free, np.array([[0, 1], [1, 1]]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10**9), st.integers(1, 24), st.integers(1, 24), st.floats(0.0, 0.55))
 def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density):
     rng = np.random.default_rng(seed)

@@ -127,7 +127,7 @@ def test_what_lies_outside_the_grid_is_left_out():
     assert not occupancy(one_box((90, 90, 1), (2, 2, 1)), like=free_grid(3, 3)).occupied.any()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(-3, 15), st.floats(-3, 15), st.floats(0.05, 6), st.floats(0.05, 6), st.floats(-180, 180))
 def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, yaw_deg):
     grid = occupancy(one_box((x, y, 1), (half_x, half_y, 1), (0, yaw_deg, 0)), like=free_grid(12, 12))
@@ -211,7 +211,7 @@ def test_inflation_by_hand(radius_m, expected):
     np.testing.assert_array_equal(grown.occupied, grid_of(expected).occupied)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.floats(0, 4))
 def test_inflation_equals_all_distances(seed, radius_m):
     occupied = np.random.default_rng(seed).random((13, 17)) < 0.03

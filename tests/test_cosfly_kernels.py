@@ -215,7 +215,7 @@ def test_ground_and_water_are_no_obstacles():
     assert kernels.obstacle_index(box_map).num_boxes == 2
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.floats(-np.pi, np.pi), st.floats(-200, 200), st.floats(-200, 200))
 def test_a_rigid_motion_changes_nothing(seed, yaw_rad, east_m, north_m):
     rng = np.random.default_rng(seed)
@@ -234,7 +234,7 @@ def test_a_rigid_motion_changes_nothing(seed, yaw_rad, east_m, north_m):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_more_boxes_never_uncover_anything(seed):
     rng = np.random.default_rng(seed)

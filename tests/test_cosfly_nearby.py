@@ -22,7 +22,7 @@ def random_boxes(rng, count, size_m=40.0):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), count=st.sampled_from([0, 1, 8, 40, 400]), far=st.booleans())
 def test_memory_answers_as_the_index_does(seed, count, far):
     rng = np.random.default_rng(seed)

@@ -159,7 +159,7 @@ def test_ground_plane_is_below_every_slab():
 @given(
     heading=st.floats(-7, 7), phase=st.floats(0, 500), swing=st.floats(0, 1), x=st.floats(-500, 500), z=st.floats(-20, 60)
 )  # fmt: skip
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, swing, x, z):
     hip = np.array([x, 3.0, z + 0.9])
     body = make_body(PosedPerson(hip, heading, phase, swing, choose_clothes(np.random.default_rng(0))))
@@ -472,6 +472,7 @@ def test_both_tracks_share_camera_and_clothes_and_the_report_adds_up(finished):
         assert report["num_perturbed"] == int(shaken.is_perturbed.sum())
 
 
+@pytest.mark.slow
 @needs_gl
 def test_two_workers_give_the_same_files(finished, tmp_path):
     tree, inputs = finished

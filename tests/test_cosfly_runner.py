@@ -135,7 +135,7 @@ def test_kill_and_resume(tmp_path):
         from pathlib import Path
         from test_cosfly_runner import _stage, make_slow_worker
         from cosfly.runner import Item, run_items
-        run_items(_stage(Path({str(tmp_path / "s")!r})), [Item(str(k), k) for k in range(60)], make_slow_worker)
+        run_items(_stage(Path({str(tmp_path / "s")!r})), [Item(str(k), k) for k in range(40)], make_slow_worker)
         """
     )
     child = subprocess.Popen([sys.executable, "-c", program])
@@ -148,11 +148,11 @@ def test_kill_and_resume(tmp_path):
     child.kill()
     child.wait()
     done = {r["id"] for r in journal.read()}
-    assert 5 <= len(done) < 60
-    items = [Item(str(k), k) for k in range(60)]
+    assert 5 <= len(done) < 40
+    items = [Item(str(k), k) for k in range(40)]
     finished = run_items(_stage(tmp_path / "s"), items, make_slow_worker)
-    assert [r.result["value"] for r in finished.kept] == list(range(60))
-    assert sum(1 for _ in journal.read()) == 60  # nothing was done twice
+    assert [r.result["value"] for r in finished.kept] == list(range(40))
+    assert sum(1 for _ in journal.read()) == 40  # nothing was done twice
 
 
 STUCK = """

@@ -93,7 +93,7 @@ def slow_clusters(mins, maxs, gap_m):
         labels = spread
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 60), gap_m=st.sampled_from([0.0, 0.5, 2.0, 5.0]))
 def test_clusters_equal_the_slow_version(seed, count, gap_m):
     boxes = random_map(seed, count, 60.0)
@@ -107,7 +107,7 @@ def test_clusters_reject_bad_arguments():
         clusters(np.zeros((1, 2)), np.ones((1, 2)), 1.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), min_fill=st.sampled_from([0.0, 0.5, 0.85, 1.0]))
 def test_merged_boxes_enclose_their_members_and_fill_enough(seed, min_fill):
     boxes = random_map(seed, 60)
@@ -239,7 +239,7 @@ def test_adaptive_cropping_cuts_tall_trees_into_a_stem_and_low_pieces():
     assert sorted(again.ids.tolist()) == sorted(result.ids.tolist())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6))
 def test_adaptive_cropping_keeps_heights_and_leaves_nothing_high(seed):
     boxes = random_map(seed, 60)
@@ -319,7 +319,7 @@ def test_the_empty_corner_of_a_turned_box_holds_nothing():
     assert len(prune_nested(middle, 0.01)) == 1
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 60))
 def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
     boxes = random_map(seed, count, 8.0)
@@ -344,7 +344,7 @@ def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
 # --- all passes -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), paper=st.booleans())
 def test_the_whole_keeps_its_books(seed, paper):
     boxes = random_map(seed, 80)

@@ -102,7 +102,7 @@ def test_a_walk_that_ends_on_a_step_has_no_second_last_point():
     np.testing.assert_allclose(positions[-1], [1.0, 0.0])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6), st.integers(2, 12))
 def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     rng = np.random.default_rng(seed)

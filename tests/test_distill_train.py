@@ -293,6 +293,7 @@ def test_stopped_and_continued_is_the_same(place, trained, tmp_path):
     assert_same_training(out, trained)
 
 
+@pytest.mark.slow
 def test_killed_and_continued_is_the_same(place, trained, tmp_path):
     """kill -9 in the middle, a log line cut short and the newest checkpoint damaged: the same log and adapter."""
     out, log = tmp_path / "out", tmp_path / "out" / "log.jsonl"

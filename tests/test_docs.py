@@ -64,3 +64,8 @@ def test_links_and_pictures_exist():
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_ci_runs_a_command_of_the_readme():
+    (command,) = [line for line in (ROOT / ".ci/run").read_text().splitlines() if line.startswith("make")]
+    assert f"`{command}`" in README
