@@ -16,14 +16,14 @@ from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, projec
 from cosfly.products.frames import (
     SKY_DEPTH_M,
     Camera,
-    CameraMeta,
     FrameMeta,
     PerturbationMeta,
     TargetMeta,
-    TreeAngles,
-    TreePose,
-    TreePosition,
+    camera_meta,
     frame_name,
+    tree_angles,
+    tree_pose,
+    tree_position,
 )
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
@@ -277,9 +277,9 @@ def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
 
 
 def _meta(flight: Flight, i: int, num_pixels: int) -> FrameMeta:
-    nowhere = TreePosition.of(np.zeros(3))
+    nowhere = tree_position(np.zeros(3))
     target = TargetMeta(
-        world_location=TreePosition.of(flight.targets_m[i]),
+        world_location=tree_position(flight.targets_m[i]),
         half_extents_m=PERSON_HALF_EXTENTS_M,
         instance_id=PERSON_ID,
         semantic_id=KINDS["Pedestrians"],
@@ -297,14 +297,14 @@ def _meta(flight: Flight, i: int, num_pixels: int) -> FrameMeta:
         town=flight.town,
         trajectory=flight.trajectory,
         variant=flight.variant,
-        camera=CameraMeta.of(flight.camera, 0.3, SKY_DEPTH_M),
-        drone_pose=TreePose.of(flight.positions_m[i], flight.rotations_deg[i]),
+        camera=camera_meta(flight.camera, 0.3, SKY_DEPTH_M),
+        drone_pose=tree_pose(flight.positions_m[i], flight.rotations_deg[i]),
         target=target,
         perturbation=PerturbationMeta(
             position="none",
             rotation="none",
             drone_position=nowhere,
             target_position=nowhere,
-            drone_rotation=TreeAngles.of(np.zeros(3)),
+            drone_rotation=tree_angles(np.zeros(3)),
         ),
     )

@@ -499,7 +499,7 @@ def test_scripts_depend_on_the_seed_only():
     fovs = {script_flight(circling(3), 0, "clean", "T", around, cfg, seed).camera.fov_deg for seed in range(30)}
     assert {round(fov) for fov in fovs} == {110, 90, 60, 30}
     a, b = (script_flight(circling(9), 0, "perturbed", "T", around, cfg, 3) for _ in range(2))
-    np.testing.assert_array_equal(a.poses.positions_m, b.poses.positions_m)
+    np.testing.assert_array_equal(a.perturbed.poses.positions_m, b.perturbed.poses.positions_m)
     fixed = script_flight(circling(3), 4, "clean", "T", around, RenderConfig(fovs_deg=(60.0,)), 1)
     assert fixed.camera.fov_deg == pytest.approx(60.0)
     assert fixed.trajectory == "trajectory_1776000004"

@@ -1,6 +1,6 @@
 """The files of one frame folder of the playback tree: rgb.png, depth.npy, instance.png, meta.json, and what `meta.json` holds.
 
-Axes inside the tree are CARLA's (left-handed); `.of(...)` of the groups below takes the project's right-handed values.
+Axes inside the tree are CARLA's (left-handed); `tree_...` below take the project's right-handed values.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
-from cosfly.store import check_schema, dump_json, read_json, validation_errors
+from cosfly.store import dump_json, read_model
 
 FRAMES_DIR = "frames_playback"
 FRAME_FILES = ("rgb.png", "depth.npy", "instance.png", "meta.json")
@@ -80,10 +80,6 @@ class TreePosition(_Group):
     y: float
     z: float
 
-    @classmethod
-    def of(cls, position_m: np.ndarray) -> TreePosition:
-        return cls(**_tree_position(position_m))
-
 
 class TreeAngles(_Group):
     """A turn in the tree's axes, degrees."""
@@ -92,32 +88,27 @@ class TreeAngles(_Group):
     yaw: float
     roll: float
 
-    @classmethod
-    def of(cls, rotation_deg: np.ndarray) -> TreeAngles:
-        return cls(**_tree_angles(rotation_deg))
 
-
-class TreePose(_Group):
+class TreePose(TreePosition):
     """The camera's pose in the tree's axes, m and degrees."""
 
-    x: float
-    y: float
-    z: float
     pitch: float
     yaw: float
     roll: float
 
-    @classmethod
-    def of(cls, position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
-        return cls(**_tree_position(position_m), **_tree_angles(rotation_deg))
+
+def tree_position(position_m: np.ndarray) -> TreePosition:
+    return TreePosition(
+        **dict(zip(XYZ, (mirror_positions(position_m) + 0.0).tolist(), strict=True))
+    )  # + 0.0: no minus zero
 
 
-def _tree_position(position_m: np.ndarray) -> dict[str, float]:
-    return dict(zip(XYZ, (mirror_positions(position_m) + 0.0).tolist(), strict=True))  # + 0.0: no minus zero
+def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:
+    return TreeAngles(**dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True)))
 
 
-def _tree_angles(rotation_deg: np.ndarray) -> dict[str, float]:
-    return dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True))
+def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
+    return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
 
 
 class CameraMeta(_Group):
@@ -131,12 +122,12 @@ class CameraMeta(_Group):
     near_m: float
     far_m: float
 
-    @classmethod
-    def of(cls, camera: Camera, near_m: float, far_m: float) -> CameraMeta:
-        return cls(
-            width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
-            focal_length_px=camera.focal_px, intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
-        )  # fmt: skip
+
+def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
+    return CameraMeta(
+        width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
+        focal_length_px=camera.focal_px, intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
+    )  # fmt: skip
 
 
 class TargetMeta(_Group):
@@ -168,10 +159,6 @@ class PerturbationMeta(_Group):
 class FrameMeta(_Group):
     """`meta.json`: what a loader needs to know of one frame without opening anything else."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
-
-    schema_name: str = Field(META_SCHEMA, alias="schema")
-    schema_version: str = META_VERSION
     coordinates: dict[str, str] = COORDINATES
     index: int
     time_s: float
@@ -186,7 +173,8 @@ class FrameMeta(_Group):
 
     def to_bytes(self) -> bytes:
         """The content of the file."""
-        return (dump_json(self.model_dump(by_alias=True), indent=1) + "\n").encode()
+        record = {"schema": META_SCHEMA, "schema_version": META_VERSION, **self.model_dump()}
+        return (dump_json(record, indent=1) + "\n").encode()
 
 
 def read_meta(frame: Path) -> FrameMeta:
@@ -196,9 +184,7 @@ def read_meta(frame: Path) -> FrameMeta:
         InputError: missing, or not such a file; names the field.
     """
     path = frame / "meta.json"
-    value = check_schema(read_json(path, what="frame annotation"), META_SCHEMA, META_VERSION, path)
-    with validation_errors(path):
-        return FrameMeta.model_validate(value)
+    return read_model(path, FrameMeta, schema=META_SCHEMA, version=META_VERSION, what="frame annotation")
 
 
 # --- the files --------------------------------------------------------------------------------------------------------

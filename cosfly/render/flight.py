@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,15 +15,15 @@ from cosfly.errors import RenderError
 from cosfly.geometry import world_from_camera
 from cosfly.products.frames import (  # fmt: skip
     Camera,
-    CameraMeta,
     FrameMeta,
     Look,
     PerturbationMeta,
     TargetMeta,
-    TreeAngles,
-    TreePose,
-    TreePosition,
+    camera_meta,
     frame_name,
+    tree_angles,
+    tree_pose,
+    tree_position,
 )
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
@@ -31,7 +31,7 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import TargetView, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Gait
-from cosfly.render.perturbation import Poses
+from cosfly.render.perturbation import Perturbed
 from cosfly.store import dump_json, sha256_bytes, sha256_file, storage_errors, write_checksums
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
@@ -41,27 +41,19 @@ FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 M
 
 @dataclass(frozen=True)
 class FlightScript:
-    """All that is drawn in one flight, n frames.
-
-    states: per frame {"position", "rotation"} of the perturbation; offsets (n, 3) as in Flight. source: who planned it.
-    """
+    """All that is drawn in one flight, n frames, before a pixel is drawn. source: who planned it."""
 
     town: str
     trajectory: str
     variant: str
     camera: Camera
     time_s: np.ndarray
-    poses: Poses
+    perturbed: Perturbed
     gait: Gait
     clothes: Clothes
-    is_perturbed: np.ndarray
-    drone_offsets_m: np.ndarray
-    target_offsets_m: np.ndarray
-    rotation_offsets_deg: np.ndarray
-    states: list[dict[str, str]]
-    is_original: bool
     look: Look
-    source: dict = field(default_factory=dict)
+    is_original: bool
+    source: dict
 
 
 @dataclass(frozen=True)
@@ -93,15 +85,15 @@ def render_flight(
     Raises:
         StorageError: a file cannot be written. RenderError: a picture cannot be encoded.
     """
-    places = np.concatenate([script.poses.positions_m, script.poses.targets_m])
+    poses = script.perturbed.poses
+    places = np.concatenate([poses.positions_m, poses.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
     seen: list[_Seen] = []
     digests: dict[str, str] = {}
     pending: list[Future] = []
     with ThreadPoolExecutor(num_threads) as pool:
         for i in range(len(script.time_s)):
-            pose = world_from_camera(script.poses.positions_m[i], script.poses.rotations_deg[i])
-            target = script.poses.targets_m[i]
+            pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
             person = script.gait.posed(i, target, script.clothes)
             frame = renderer.render(pose, script.camera.intrinsic, person)
             seen.append(_look(frame, target, pose, script.camera, writing.visible_threshold))
@@ -113,7 +105,7 @@ def render_flight(
             digests.update(future.result())
     flight = _flight(script, seen)
     write_flight(folder, flight)
-    _write_text(folder / "perturbation_report.json", dump_json(_report(script), indent=1) + "\n")
+    _write_text(folder / "perturbation_report.json", dump_json(_report(script.perturbed), indent=1) + "\n")
     for name in ("trajectory.json", "perturbation_report.json"):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)
@@ -177,16 +169,17 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
+    perturbed = script.perturbed
     return FrameMeta(
         index=i,
         time_s=float(script.time_s[i]),
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=CameraMeta.of(script.camera, NEAR_M, FAR_M),
-        drone_pose=TreePose.of(script.poses.positions_m[i], script.poses.rotations_deg[i]),
+        camera=camera_meta(script.camera, NEAR_M, FAR_M),
+        drone_pose=tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
         target=TargetMeta(
-            world_location=TreePosition.of(script.poses.targets_m[i]),
+            world_location=tree_position(perturbed.poses.targets_m[i]),
             half_extents_m=PERSON_HALF_EXTENTS_M,
             instance_id=PERSON_ID,
             semantic_id=KINDS["Pedestrians"],
@@ -199,10 +192,10 @@ def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
             num_pixels=seen.num_person_px,
         ),
         perturbation=PerturbationMeta(
-            **script.states[i],
-            drone_position=TreePosition.of(script.drone_offsets_m[i]),
-            target_position=TreePosition.of(script.target_offsets_m[i]),
-            drone_rotation=TreeAngles.of(script.rotation_offsets_deg[i]),
+            **perturbed.states[i],
+            drone_position=tree_position(perturbed.drone_offsets_m[i]),
+            target_position=tree_position(perturbed.target_offsets_m[i]),
+            drone_rotation=tree_angles(perturbed.rotation_offsets_deg[i]),
         ),
         look=script.look,
     )
@@ -212,43 +205,43 @@ def _list_or_none(values: np.ndarray) -> list[float] | None:
     return None if np.isnan(values).any() else values.tolist()
 
 
-def _report(script: FlightScript) -> dict:
+def _report(perturbed: Perturbed) -> dict:
     """`perturbation_report.json`: how often each event happened."""
     counts: dict[str, dict[str, int]] = {"position": {}, "rotation": {}}
-    for state in script.states:
+    for state in perturbed.states:
         for event, outcome in state.items():
             counts[event][outcome] = counts[event].get(outcome, 0) + 1
     return {
         "schema": REPORT_SCHEMA,
         "schema_version": REPORT_VERSION,
-        "num_frames": len(script.states),
-        "num_perturbed": int(script.is_perturbed.sum()),
+        "num_frames": len(perturbed.states),
+        "num_perturbed": int(perturbed.is_perturbed.sum()),
         **{event: dict(sorted(outcomes.items())) for event, outcomes in counts.items()},
     }
 
 
 def _flight(script: FlightScript, seen: list[_Seen]) -> Flight:
-    raw_points = [{"perturbation": dict(state)} for state in script.states]
+    perturbed = script.perturbed
     return Flight(
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
         camera=script.camera,
         time_s=script.time_s,
-        positions_m=script.poses.positions_m,
-        rotations_deg=script.poses.rotations_deg,
-        targets_m=script.poses.targets_m,
+        positions_m=perturbed.poses.positions_m,
+        rotations_deg=perturbed.poses.rotations_deg,
+        targets_m=perturbed.poses.targets_m,
         target_in_view=np.array([s.view.in_view for s in seen]),
         target_visible=np.array([s.is_visible for s in seen]),
         target_depth_m=np.array([s.view.depth_m for s in seen]),
         target_uv=np.array([s.view.uv for s in seen]),
         target_bbox=np.array([s.view.bbox_px for s in seen]),
         visibility=np.array([s.visibility for s in seen]),
-        is_perturbed=script.is_perturbed,
-        drone_offsets_m=script.drone_offsets_m,
-        rotation_offsets_deg=script.rotation_offsets_deg,
-        target_offsets_m=script.target_offsets_m,
+        is_perturbed=perturbed.is_perturbed,
+        drone_offsets_m=perturbed.drone_offsets_m,
+        rotation_offsets_deg=perturbed.rotation_offsets_deg,
+        target_offsets_m=perturbed.target_offsets_m,
         source=script.source,
         is_original=script.is_original,
-        raw={"points": raw_points},
+        raw={"points": [{"perturbation": dict(state)} for state in perturbed.states]},
     )

@@ -73,6 +73,14 @@ class Perturbed:
     rotation_offsets_deg: np.ndarray
     states: list[dict[str, str]]
 
+    @classmethod
+    def nothing(cls, planned: Poses) -> Perturbed:
+        """The poses as they were planned."""
+        n = len(planned.positions_m)
+        poses = Poses(planned.positions_m.copy(), planned.rotations_deg.copy(), planned.targets_m.copy())
+        states = [{"position": "none", "rotation": "none"} for _ in range(n)]
+        return cls(poses, np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
+
     @property
     def is_perturbed(self) -> np.ndarray:
         return np.array(["applied" in state.values() for state in self.states])
@@ -104,12 +112,8 @@ def perturb(
     rng: np.random.Generator,
 ) -> Perturbed:
     """Perturb every frame of a flight. The same number of random draws is used for every frame, whatever happens in it."""
-    n = len(planned.positions_m)
-    result = Perturbed(
-        Poses(planned.positions_m.copy(), planned.rotations_deg.copy(), planned.targets_m.copy()),
-        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), [{"position": "none", "rotation": "none"} for _ in range(n)],
-    )  # fmt: skip
-    for i in range(n):
+    result = Perturbed.nothing(planned)
+    for i in range(len(result.states)):
         events = rng.random(2)
         person_offset = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
         drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)

@@ -13,7 +13,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from cosfly.chance import rng_for
@@ -129,31 +128,22 @@ def script_flight(
     clothes = choose_clothes(shared)
     camera = Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
     planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m)
-    n = len(trace.time_s)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
-        drawn = perturb(planned, camera, surroundings, cfg.perturbation, rng)
+        perturbed = perturb(planned, camera, surroundings, cfg.perturbation, rng)
     else:
-        nothing = np.zeros((n, 3))
-        drawn = Perturbed(
-            planned, nothing, nothing, nothing, [{"position": "none", "rotation": "none"} for _ in range(n)]
-        )
+        perturbed = Perturbed.nothing(planned)
     return FlightScript(
         town=town,
         trajectory=f"trajectory_{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
         camera=camera,
         time_s=trace.time_s,
-        poses=drawn.poses,
+        perturbed=perturbed,
         gait=gait_of(trace.targets_m, trace.time_s),
         clothes=clothes,
-        is_perturbed=drawn.is_perturbed,
-        drone_offsets_m=drawn.drone_offsets_m,
-        target_offsets_m=drawn.target_offsets_m,
-        rotation_offsets_deg=drawn.rotation_offsets_deg,
-        states=drawn.states,
-        is_original=track == "clean",
         look=cfg.look,
+        is_original=track == "clean",
         source={
             "path_index": number,
             "scenario_id": trace.path_id,
