@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.vllm_engine import VllmConfig
-from cosfly.config import MAY_DIFFER, Config
+from cosfly.config import Config, MayDiffer
 from cosfly.frame_views import DEPTH_RANGE_M, View
 from cosfly.products.captions import KeyframeRecord, TeacherKind, Verdict
 
@@ -158,11 +158,9 @@ class JudgeConfig(Config):
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
     max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
-    concurrency: int = Field(16, ge=1, le=4096, json_schema_extra=MAY_DIFFER, description="most requests in flight")
-    timeout_s: float = Field(120.0, gt=0, json_schema_extra=MAY_DIFFER, description="limit of one request")
-    max_tries: int = Field(
-        6, ge=1, json_schema_extra=MAY_DIFFER, description="tries of one request when the server is busy or fails"
-    )
+    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
+    timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
+    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
     json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
@@ -199,19 +197,13 @@ class CaptionConfig(Config):
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
-    vllm: VllmConfig = Field(
-        VllmConfig(), json_schema_extra=MAY_DIFFER, description="the engine of teacher vllm:MODEL_DIR"
-    )
-    budget: BudgetConfig = Field(
-        BudgetConfig(), json_schema_extra=MAY_DIFFER, description="prices and limits of tokens and money"
-    )
+    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
+    budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
-    limit: int | None = Field(
-        None, ge=1, json_schema_extra=MAY_DIFFER, description="caption at most this many windows; empty takes all"
-    )
+    limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty takes all")
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:

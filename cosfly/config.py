@@ -5,19 +5,22 @@ from __future__ import annotations
 import importlib.resources
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cosfly.errors import ConfigError, nearest
 
 MOST_LISTED = 15  # names of settings in a message
 
 
-# The mark of a setting that changes how a stage works and not what it makes, as in Field(..., json_schema_extra=MAY_DIFFER):
-# it does not stand in `stage.json`, and a stage may be resumed with another value.
-MAY_DIFFER: dict[str, JsonValue] = {"may_differ_on_resume": True}
+T = TypeVar("T")
+
+# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it does not stand in `stage.json`, and a
+# stage may be resumed with another value.
+_MAY_DIFFER = "may differ on resume"
+MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
 class Config(BaseModel):
@@ -26,13 +29,10 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
-        """Give the settings that decide what a stage makes, JSON-able: all but those marked MAY_DIFFER."""
-        fields = {
-            name: field for name, field in type(self).model_fields.items() if field.json_schema_extra != MAY_DIFFER
-        }
-        values = self.model_dump(mode="json", include=set(fields))
-        groups = {name: getattr(self, name) for name in fields}
-        return values | {name: group.recorded() for name, group in groups.items() if isinstance(group, Config)}
+        """Give the settings that decide what a stage makes, JSON-able: all but those that are MayDiffer."""
+        fields = {name for name, field in type(self).model_fields.items() if _MAY_DIFFER not in field.metadata}
+        groups = {name: getattr(self, name) for name in fields if isinstance(getattr(self, name), Config)}
+        return self.model_dump(mode="json", include=fields) | {name: group.recorded() for name, group in groups.items()}
 
 
 C = TypeVar("C", bound=BaseModel)

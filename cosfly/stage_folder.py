@@ -201,7 +201,7 @@ class StageFolder:
         """Start or continue a stage.
 
         Args:
-            config: the stage's settings; those marked MAY_DIFFER are not put on record.
+            config: the stage's settings; those that are MayDiffer are not put on record.
             inputs: name -> file or folder that the stage reads.
             resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed;
                 `force` continues with the finished items in spite of a difference, which stays on record.

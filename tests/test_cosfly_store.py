@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import Field
 
 from cosfly import store
-from cosfly.config import MAY_DIFFER, Config
+from cosfly.config import Config, MayDiffer
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.journal import Journal
 from cosfly.stage_folder import Failed, StageFolder, Tally, write_failures
@@ -92,7 +92,7 @@ def test_a_tally_that_does_not_add_up_is_a_bug():
 
 class Demo(Config):
     a: dict[str, int] = Field({"b": 1})
-    threads: int = Field(1, json_schema_extra=MAY_DIFFER)
+    threads: MayDiffer[int] = 1
 
 
 def _open(out, **changes):

@@ -30,7 +30,7 @@ from cosfly.chat.protocol import (
     shown_url,
 )
 from cosfly.chat.throttle import Throttle
-from cosfly.config import MAY_DIFFER, Config
+from cosfly.config import Config, MayDiffer
 from cosfly.errors import TeacherError
 from cosfly.store import parse_json
 
@@ -47,37 +47,24 @@ class EndpointConfig(Config):
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
     top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
     max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
-    concurrency: int = Field(
-        16,
-        ge=1,
-        le=4096,
-        json_schema_extra=MAY_DIFFER,
-        description="most requests in flight; fewer while the server says it is busy",
+    concurrency: MayDiffer[int] = Field(
+        16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
     )
-    timeout_s: float = Field(
-        120.0, gt=0, json_schema_extra=MAY_DIFFER, description="limit of one request, from its first byte to its last"
+    timeout_s: MayDiffer[float] = Field(
+        120.0, gt=0, description="limit of one request, from its first byte to its last"
     )
-    total_timeout_s: float = Field(
-        900.0,
-        gt=0,
-        json_schema_extra=MAY_DIFFER,
-        description="limit of one answer with all its tries, from the first request on",
+    total_timeout_s: MayDiffer[float] = Field(
+        900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
     )
-    max_tries: int = Field(
-        6, ge=1, json_schema_extra=MAY_DIFFER, description="tries of one request when the server is busy or fails"
-    )
-    backoff_s: float = Field(
-        1.0, gt=0, json_schema_extra=MAY_DIFFER, description="first wait after a failure; doubles, with jitter"
-    )
-    max_backoff_s: float = Field(60.0, gt=0, json_schema_extra=MAY_DIFFER, description="longest wait between two tries")
-    stop_after_failures: int = Field(
-        20, ge=1, json_schema_extra=MAY_DIFFER, description="windows in a row without an answer that end the run"
+    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    backoff_s: MayDiffer[float] = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
+    max_backoff_s: MayDiffer[float] = Field(60.0, gt=0, description="longest wait between two tries")
+    stop_after_failures: MayDiffer[int] = Field(
+        20, ge=1, description="windows in a row without an answer that end the run"
     )
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
-    image_uuid: bool = Field(
-        False,
-        json_schema_extra=MAY_DIFFER,
-        description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it",
+    image_uuid: MayDiffer[bool] = Field(
+        False, description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it"
     )
     extra_body: dict[str, Any] = Field(
         default_factory=dict, description="further fields of the request, for instance chat_template_kwargs"

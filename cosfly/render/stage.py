@@ -16,7 +16,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from cosfly.chance import rng_for
-from cosfly.config import MAY_DIFFER, Config
+from cosfly.config import Config, MayDiffer
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
@@ -73,8 +73,8 @@ class RenderConfig(Config):
         lt=1,
         description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
     )
-    encoder_threads: int = Field(
-        2, ge=1, le=64, json_schema_extra=MAY_DIFFER, description="threads that encode and write beside the drawing"
+    encoder_threads: MayDiffer[int] = Field(
+        2, ge=1, le=64, description="threads that encode and write beside the drawing"
     )
 
     @field_validator("fovs_deg")
