@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -137,3 +138,17 @@ def test_help_is_instant():
     assert time.monotonic() - start_s < 5
     loaded = set(result.stdout.split("LOADED")[1].split())
     assert not loaded & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow"}
+
+
+def test_an_installed_cosfly_has_every_package_and_every_data_file():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    folders = {path.parent for path in SOURCES.values()}
+    assert set(setup["packages"]) == {".".join(f.relative_to(ROOT).parts) for f in folders} | {"cosfly_configs"}
+    data = {p for f in folders for p in f.rglob("*") if p.is_file() and p.suffix not in (".py", ".pyc")}
+    packed = {
+        path
+        for package, patterns in setup["package-data"].items()
+        for pattern in patterns
+        for path in (ROOT / package.replace(".", "/").replace("cosfly_configs", "configs")).glob(pattern)
+    }
+    assert data <= packed

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
-from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement
-from caption.truth.judge_gold import read_gold
+from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement, read_gold
 from cosfly.cli import app
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import read_captions

@@ -20,37 +20,7 @@ VERDICTS = {  # color, what it means
     "HARD_CONFLICT": ("#c53030", "the flight contradicts the decision"),
     "ABSTAIN": ("#718096", "geometry cannot tell"),
 }
-STYLE = """
-:root { --line: #e2e8f0; --soft: #4a5568; }
-* { box-sizing: border-box; }
-body { font: 15px/1.5 system-ui, "Segoe UI", "Noto Sans", "Noto Sans CJK SC", sans-serif; margin: 28px auto; padding: 0 20px;
-  max-width: 1340px; color: #1a202c; background: #f7fafc; }
-h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 19px; margin: 34px 0 8px; } h3 { font-size: 14px; margin: 0 0 6px; }
-p.lead { color: var(--soft); margin: 0 0 12px; max-width: 900px; } small, .small { color: #718096; font-size: 12.5px; }
-.note { border-left: 4px solid #d69e2e; background: #fffaf0; padding: 8px 12px; margin: 10px 0; max-width: 900px; }
-.tiles { display: flex; flex-wrap: wrap; gap: 12px; } .tile, .panel, .card { background: #fff; border: 1px solid var(--line);
-  border-radius: 8px; } .tile { padding: 10px 18px; min-width: 130px; } .tile b { display: block; font-size: 24px; line-height: 1.2;
-  font-variant-numeric: tabular-nums; } .panel { padding: 14px 18px; overflow-x: auto; }
-.grid { display: grid; grid-template-columns: repeat(auto-fit, minmax(310px, 1fr)); gap: 12px; }
-.stack { display: flex; height: 22px; border-radius: 4px; overflow: hidden; margin: 3px 0 10px; } .stack i { display: block; }
-.key { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin-right: 5px; }
-table { border-collapse: collapse; } th { text-align: left; font-weight: 600; color: var(--soft); } th, td { padding: 4px 12px 4px 0; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
-table.confusion td { width: 46px; height: 30px; padding: 0; text-align: center; border: 1px solid #fff; font-size: 13px;
-  font-variant-numeric: tabular-nums; } table.confusion td.total { border: 0; color: var(--soft); padding-left: 8px; }
-table.confusion th.row { text-align: right; padding-right: 10px; white-space: nowrap; font-weight: 500; font-size: 13px; }
-table.confusion th.column { height: 170px; vertical-align: bottom; padding: 0 0 6px; text-align: left; font-weight: 500; font-size: 13px; }
-table.confusion th.column span { writing-mode: vertical-rl; transform: rotate(180deg); white-space: nowrap; margin-left: 12px; }
-table.confusion td.right { outline: 2px solid #2f855a; outline-offset: -2px; }
-.card { padding: 14px 16px; margin: 0 0 14px; } .card header { display: flex; flex-wrap: wrap; gap: 8px; align-items: center;
-  margin-bottom: 8px; } .card header b { margin-right: 6px; overflow-wrap: anywhere; }
-.tag { padding: 1px 9px; border-radius: 9px; color: #fff; font-size: 12px; font-weight: 600; } .tag.plain { background: #edf2f7; color: #2d3748; }
-.frames { display: grid; grid-template-columns: repeat(5, 1fr); gap: 6px; margin-bottom: 10px; } .frames figure { margin: 0; }
-.frames img { width: 100%; border-radius: 4px; display: block; } .frames figcaption { font-size: 12px; color: #718096; }
-.gone { aspect-ratio: 16 / 9; background: #edf2f7; color: #718096; display: grid; place-items: center; border-radius: 4px; font-size: 12px; }
-.texts { display: grid; grid-template-columns: 1fr 1fr; gap: 22px; } .texts p { margin: 0 0 6px; overflow-wrap: anywhere; }
-.texts .what { color: #718096; font-size: 12px; display: block; } .bad { color: #c53030; }
-"""
+STYLE = "\n" + Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 DIFFERENT_TEACHER = (
     "The rule teacher is a deterministic baseline: it looks at the flight data of five frames and at no picture. It is a "
     "different teacher than the paper's, so these shares say nothing about the paper's 21.5 / 57.5 / 21.0 %."

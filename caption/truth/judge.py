@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 from rich.table import Table
@@ -21,6 +22,7 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, started
+from cosfly.config import read_yaml
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord
 from cosfly.products.playback import flight_of
@@ -28,6 +30,7 @@ from cosfly.store import dump_json
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"
+GOLD_FILE = Path(__file__).with_name("judge_gold.yaml")
 
 _MEANINGS: dict[Judgement, str] = {
     "ACCEPT_ALTERNATIVE": "the reasoning is sound and its decision is an acceptable alternative to the label",
@@ -124,6 +127,21 @@ async def open_judge(
 
 
 # --- how good a judge is ----------------------------------------------------------------------------------------------
+
+
+def read_gold() -> list[tuple[Case, Judgement]]:
+    """Give the conflicts of the gold set with their right judgements."""
+    gold = read_yaml(GOLD_FILE)
+    found: list[tuple[Case, Judgement]] = []
+    for number, case in enumerate(gold["cases"]):
+        answer = Coc(
+            critical_components=case["critical_components"],
+            reasoning_trace=case["reasoning_trace"],
+            flight_decision=case["decision"],
+        )
+        sample_id = f"gold_{number:02d}_frame_00000"
+        found.append((Case(sample_id, gold["flights"][case["flight"]], answer, case["label"]), case["judgement"]))
+    return found
 
 
 @dataclass(frozen=True)

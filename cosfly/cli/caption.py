@@ -141,8 +141,7 @@ def caption_judge_check(
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
-    from caption.truth.judge import check_judge, judge_check_table
-    from caption.truth.judge_gold import read_gold
+    from caption.truth.judge import check_judge, judge_check_table, read_gold
     from cosfly.console import console
 
     chosen = {"caption.judge.url": url, "caption.judge.model": model}

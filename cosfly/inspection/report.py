@@ -16,35 +16,7 @@ from cosfly.store import write_bytes
 
 CURVE_POINTS = 160
 
-STYLE = """
-:root { --accepted: #2f855a; --review: #b7791f; --rejected: #c53030; --other: #718096; --line: #e2e8f0; }
-* { box-sizing: border-box; }
-body { font: 14px/1.45 system-ui, "Noto Sans", "Noto Sans CJK SC", sans-serif; color: #1a202c; background: #f7fafc;
-  margin: 0 auto; padding: 24px 28px 60px; max-width: 1500px; }
-h1 { font-size: 22px; margin: 0 0 2px; } h2 { font-size: 16px; margin: 28px 0 8px; }
-p.lead { color: #4a5568; margin: 0 0 8px; }
-.funnel { background: #fff; border: 1px solid var(--line); border-radius: 8px; padding: 14px 18px; max-width: 860px; }
-.bar { display: grid; grid-template-columns: 330px 1fr 64px; align-items: center; gap: 12px; margin: 3px 0; }
-.bar.sub span:first-child { padding-left: 18px; color: #4a5568; }
-.bar i { display: block; height: 14px; border-radius: 3px; background: var(--other); min-width: 2px; }
-.bar i.zero { visibility: hidden; } .bar b { text-align: right; font-variant-numeric: tabular-nums; }
-i.accepted { background: var(--accepted); } i.review { background: var(--review); } i.rejected { background: var(--rejected); }
-.scroll { overflow-x: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
-table { border-collapse: collapse; width: 100%; }
-th { text-align: left; font-weight: 600; color: #4a5568; background: #edf2f7; position: sticky; top: 0; }
-th, td { padding: 7px 8px; border-bottom: 1px solid var(--line); vertical-align: top; white-space: nowrap; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
-td.pictures img { height: 72px; border-radius: 4px; margin-right: 4px; vertical-align: top; }
-td.pictures .gone { display: inline-block; width: 128px; height: 72px; line-height: 72px; margin-right: 4px; border-radius: 4px;
-  background: #edf2f7; color: #718096; text-align: center; font-size: 12px; }
-.tag { display: inline-block; padding: 1px 8px; border-radius: 9px; color: #fff; font-size: 12px; font-weight: 600; }
-.tag.accepted { background: var(--accepted); } .tag.review { background: var(--review); } .tag.rejected { background: var(--rejected); }
-tr.open td { border-bottom: 0; } tr.wide td { padding-top: 0; }
-ul.issues { margin: 0; padding: 0 0 0 14px; font-size: 12.5px; white-space: normal; max-width: 1150px; color: #4a5568; }
-ul.issues li { overflow-wrap: anywhere; } ul.issues li.error b { color: var(--rejected); }
-ul.issues li.warning b { color: var(--review); }
-svg { display: block; } small { color: #718096; }
-"""
+STYLE = "\n" + Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 
 # column title, metric, format
 COLUMNS = (
