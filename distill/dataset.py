@@ -13,19 +13,18 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
-from cosfly.products.captions import Caption, Language, Prompt, parse_answer, read_captions
+from cosfly.products.captions import Caption, Language, parse_answer, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import atomic_file, dump_json, model_lines
+from cosfly.store import atomic_file, dump_json
+from distill.schema import SPLITS, Sample, Split, read_split, split_path
 
 log = logging.getLogger(__name__)
 
-SAMPLE_VERSION: Literal["1.0"] = "1.0"
-SPLITS = ("train", "val", "test")  # the order in which scarce trajectories are handed out
 Modality = Literal["rgb", "depth", "instance"]
 MODALITY_FILES: dict[Modality, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
 
@@ -65,48 +64,15 @@ class PrepareConfig(Config):
         return self
 
     @property
-    def wanted_splits(self) -> tuple[str, ...]:
+    def wanted_splits(self) -> tuple[Split, ...]:
         fractions = {"train": 1.0, "val": self.val_fraction, "test": self.test_fraction}
         return tuple(name for name in SPLITS if fractions[name] > 0)
-
-
-class Sample(BaseModel):
-    """One line of a split file: what the student sees, and what it should answer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    schema_version: Literal["1.0"] = SAMPLE_VERSION
-    sample_id: str
-    language: Language
-    town: str
-    trajectory: str
-    variant: str
-    images: list[str]  # files of the playback tree, frame by frame, the modalities of a frame together
-    prompt: Prompt
-    answer: str  # JSON text of the three fields
-    decision: str  # the answer's flight_decision
-    label: str | None  # the decision that the future geometry calls for; None: it cannot tell
-    repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
-    weight: float
-
-    @property
-    def key(self) -> str:
-        """Unique name of the sample: window and language."""
-        return f"{self.sample_id}/{self.language}"
-
-    def group(self, split_by: Literal["trajectory", "town"]) -> str:
-        return group_of(self.town, self.trajectory, split_by)
-
-
-def group_of(town: str, trajectory: str, split_by: Literal["trajectory", "town"]) -> str:
-    """Name what may not be shared by two splits. `Town03` and `Town03_Opt` are one town: the same map in two builds."""
-    return town.removesuffix("_Opt") if split_by == "town" else trajectory
 
 
 # --- splits -----------------------------------------------------------------------------------------------------------
 
 
-def assign_splits(groups: Iterable[str], cfg: PrepareConfig, seed: int) -> dict[str, str]:
+def assign_splits(groups: Iterable[str], cfg: PrepareConfig, seed: int) -> dict[str, Split]:
     """Hand out groups to splits: group -> split.
 
     Groups are ranked by a hash of (seed, group); the first go to test, the next to val, the rest to train, in numbers as near
@@ -130,7 +96,8 @@ def assign_splits(groups: Iterable[str], cfg: PrepareConfig, seed: int) -> dict[
     num_val = max(1, round(cfg.val_fraction * len(ranked))) if cfg.val_fraction else 0
     while num_test + num_val >= len(ranked):  # rounding took all: the larger share gives one back
         num_test, num_val = (num_test - 1, num_val) if num_test >= num_val else (num_test, num_val - 1)
-    names = ["test"] * num_test + ["val"] * num_val + ["train"] * (len(ranked) - num_test - num_val)
+    counts: dict[Split, int] = {"test": num_test, "val": num_val, "train": len(ranked) - num_test - num_val}
+    names = [split for split, count in counts.items() for _ in range(count)]
     return dict(zip(ranked, names, strict=True))
 
 
@@ -257,7 +224,7 @@ def run(
 
 
 def _write_splits(
-    cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, str]
+    cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, Split]
 ) -> dict[str, dict]:
     """Write the three files and give the counts of each: samples, by language, by decision, repaired."""
     facts: dict[str, dict] = {}
@@ -281,20 +248,3 @@ def _write_splits(
             **{f"by_{name}": dict(sorted(counter.items())) for name, counter in counters[split].items()},
         }
     return facts
-
-
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def split_path(dataset: Path, split: str) -> Path:
-    return dataset / f"{split}.jsonl"
-
-
-def read_split(dataset: Path, split: str) -> Iterator[Sample]:
-    """Yield the samples of a split.
-
-    Raises:
-        InputError: names the file, the line and the field.
-    """
-    lines = model_lines(split_path(dataset, split), Sample, what="training set", fix="run cosfly distill prepare first")
-    return (sample for _, sample in lines)

@@ -18,7 +18,7 @@ from cosfly.errors import InputError
 from cosfly.frame_views import VIEW_FILES, read_view
 from cosfly.products.frames import read_depth
 from cosfly.store import inside
-from distill.dataset import Sample
+from distill.schema import Sample
 from distill.student import IMAGE_TOKEN, Student
 
 IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy

@@ -26,8 +26,7 @@ from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
 from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts
-from distill.dataset import Sample, read_split
-from distill.infer import Prediction, read_predictions
+from distill.schema import Prediction, Sample, read_predictions, read_split
 from distill.student import require
 
 log = logging.getLogger(__name__)

@@ -1,63 +1,75 @@
-"""Let a student answer the samples of a split: greedy, left-padded batches, resumable by batch."""
+"""Let a student answer the samples of a split: here in left-padded batches, or through an engine as teachers are asked."""
 
 from __future__ import annotations
 
+import asyncio
+import base64
 import logging
+import math
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from PIL import Image
+from pydantic import Field
 
-from cosfly.config import Config
-from cosfly.errors import InputError
-from cosfly.products.captions import Coc, Language, parse_answer
+from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.contract import Engine, NoAnswer, Request, started
+from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
+from cosfly.config import Config, MayDiffer
+from cosfly.errors import ConfigError, InputError, TeacherError
+from cosfly.frame_views import encode_picture
+from cosfly.products.captions import answer_schema, parse_answer
+from cosfly.products.playback import flight_of
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder, Tally
-from cosfly.store import dump_json, model_lines, write_bytes
+from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
+from cosfly.store import dump_json, inside, sha256_bytes, write_bytes
 from distill.checkpoint import read_adapter_facts
-from distill.dataset import Sample, read_split, split_path
-from distill.encoding import encode, prompt_batch
+from distill.encoding import encode, load_image, messages_of, prompt_batch
+from distill.schema import PREDICTIONS, Prediction, Sample, Split, read_split, split_path
 from distill.student import Device, Student, load_student, require, weight_files
 
 log = logging.getLogger(__name__)
 
 STAGE = "distill.infer"
-PREDICTIONS = "predictions.jsonl"
 DEFAULT_MAX_PIXELS = 640 * 352
+
+
+class StudentEndpointConfig(EndpointConfig):
+    """How a student is asked: greedily and without thinking, as it was taught. `max_tokens` is `max_new_tokens`."""
+
+    temperature: float = Field(0.0, ge=0, le=2, description="sampling temperature; 0 is greedy")
+    top_p: float = Field(1.0, gt=0, le=1, description="nucleus sampling")
+    extra_body: dict[str, Any] = Field(
+        {"chat_template_kwargs": {"enable_thinking": False}}, description="further fields of the request"
+    )
 
 
 class InferConfig(Config):
     """Settings of `distill infer`."""
 
-    split: Literal["train", "val", "test"] = Field("test", description="samples to answer")
+    split: Split = Field("test", description="samples to answer")
     max_samples: int = Field(0, ge=0, description="answer only the first so many; 0: all")
     max_new_tokens: int = Field(512, ge=1, description="longest answer, tokens; a longer one is cut and will not parse")
-    batch_size: int = Field(8, ge=1, description="samples answered together; part of the result where rounding matters")
+    engine: Literal["transformers", "endpoint", "vllm"] = Field(
+        "transformers",
+        description="who computes: transformers in this process, a server at the URL --model, or vLLM in this process",
+    )
+    batch_size: int = Field(
+        8, ge=1, description="samples that transformers answers together; part of the result where rounding matters"
+    )
     max_pixels: int = Field(
         0, ge=0, description=f"pixels of one image; 0: as in training ({DEFAULT_MAX_PIXELS} if none)"
     )
-    device: Device = Field("auto", description="auto, cpu or cuda; bfloat16 on cuda, float32 on a CPU")
+    device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
+    endpoint: StudentEndpointConfig = Field(
+        StudentEndpointConfig(), description="how the engines endpoint and vllm are asked"
+    )
+    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine vllm")
 
 
-class Prediction(BaseModel):
-    """One line of `predictions.jsonl`. `coc` is None when the answer is not of the right structure, for the `reason`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    schema_version: Literal["1.0"] = "1.0"
-    sample_id: str
-    language: Language
-    split: Literal["train", "val", "test"]
-    raw: str
-    num_tokens: int
-    is_finished: bool  # False: cut at max_new_tokens
-    coc: Coc | None
-    reason: str | None
-    recovered: list[str]
-
-    @property
-    def key(self) -> str:
-        return f"{self.sample_id}/{self.language}"
+# --- transformers -----------------------------------------------------------------------------------------------------
 
 
 def generate(student: Student, samples: list[Sample], data: Path, max_new_tokens: int) -> list[tuple[str, int, bool]]:
@@ -91,13 +103,13 @@ def generate(student: Student, samples: list[Sample], data: Path, max_new_tokens
     return answers
 
 
-def make_prediction(sample: Sample, split: str, text: str, num_tokens: int, is_finished: bool) -> Prediction:
+def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
     """Check an answer and give its record."""
     parsed = parse_answer(text, sample.language)
     return Prediction(
         sample_id=sample.sample_id,
         language=sample.language,
-        split=split,  # type: ignore[arg-type]  # checked by the model
+        split=split,
         raw=text,
         num_tokens=num_tokens,
         is_finished=is_finished,
@@ -107,12 +119,12 @@ def make_prediction(sample: Sample, split: str, text: str, num_tokens: int, is_f
     )
 
 
-def failed_prediction(sample: Sample, split: str, code: str) -> Prediction:
+def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
     """Give the record of a sample that could not be answered: an empty answer, which evaluation counts as wrong."""
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"failed_{code}"})
 
 
-def _batch_factory(cfg: InferConfig, data: Path, model: Path, adapter: Path | None, max_pixels: int) -> Work:
+def make_worker(cfg: InferConfig, data: Path, model: Path, adapter: Path | None, max_pixels: int) -> Work:
     student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=adapter)
 
     def work(item: Item) -> Outcome:
@@ -124,29 +136,141 @@ def _batch_factory(cfg: InferConfig, data: Path, model: Path, adapter: Path | No
     return work
 
 
+def _infer(
+    cfg: InferConfig, stage: StageFolder, samples: list[Sample], data: Path, model: Path, adapter: Path | None
+) -> tuple[list[Prediction], Tally]:
+    facts = read_adapter_facts(adapter, model) if adapter else {}
+    # Whole batches are the unit of resumption: rounding may depend on what else is in a batch.
+    batches = [samples[start : start + cfg.batch_size] for start in range(0, len(samples), cfg.batch_size)]
+    items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
+    max_pixels = cfg.max_pixels or int(facts.get("max_pixels", DEFAULT_MAX_PIXELS))
+    finished = run_items(stage, items, make_worker, (cfg, data, model, adapter, max_pixels), label=STAGE)
+    tally = Tally(input=len(samples))
+    predictions: list[Prediction] = []
+    for record, batch in zip(finished.records, batches, strict=True):
+        if isinstance(record, Failed):
+            tally.fail(record.code, len(batch))
+            predictions += [failed_prediction(sample, cfg.split, record.code) for sample in batch]
+        else:
+            tally.kept += len(batch)
+            predictions += [Prediction.model_validate(prediction) for prediction in record.result["predictions"]]
+    return predictions, tally
+
+
+# --- engines ----------------------------------------------------------------------------------------------------------
+
+
+def make_request(sample: Sample, data: Path, cfg: InferConfig) -> Request:
+    """Give a sample as chat messages: its pictures as the student was taught to see them, then the question.
+
+    Raises:
+        InputError: a picture of the playback tree `data` cannot be read.
+    """
+    pictures = [
+        encode_picture(np.asarray(_bounded(load_image(inside(data, name)), cfg)), "png", 0) for name in sample.images
+    ]
+    urls = [f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}" for picture in pictures]
+    parts = [{"type": "image_url", "image_url": {"url": url}} for url in urls]
+    system, user = messages_of(sample)
+    question = user | {"content": [*parts, *(part for part in user["content"] if part["type"] == "text")]}
+    sampling = cfg.endpoint.model_copy(update={"max_tokens": cfg.max_new_tokens})
+    digests = [sha256_bytes(picture) for picture in pictures]
+    return sampling.request([system, question], digests, answer_schema(language=sample.language), 0)
+
+
+def _bounded(image: Image.Image, cfg: InferConfig) -> Image.Image:
+    scale = math.sqrt((cfg.max_pixels or DEFAULT_MAX_PIXELS) / (image.width * image.height))
+    if scale >= 1.0:
+        return image
+    return image.resize((max(1, int(image.width * scale)), max(1, int(image.height * scale))), Image.Resampling.BICUBIC)
+
+
+async def _ask(
+    cfg: InferConfig, stage: StageFolder, engine: Engine, samples: list[Sample], data: Path
+) -> tuple[list[Prediction], Tally]:
+    """Ask an engine about every sample; answers are kept in `answers/`, so nothing answered is asked twice.
+
+    Raises:
+        TeacherError: it cannot be used, or a sample got no answer.
+    """
+    in_flight = asyncio.Semaphore(cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency)
+    tally, failures = Tally(input=len(samples)), list[Failed]()
+
+    async def answer(sample: Sample) -> Prediction:
+        async with in_flight:
+            try:
+                request = await asyncio.to_thread(make_request, sample, data, cfg)
+                reply = await kept.ask(request, flight_of(sample.sample_id), sample.sample_id, sample.language)
+            except InputError as error:
+                failed = Failed(id=sample.key, code=error.code, message=str(error))
+            except NoAnswer as error:
+                if not error.is_final:
+                    fix = "see to the server, then run the same command again: nothing answered is asked twice"
+                    raise TeacherError("a sample got no answer", where=engine.where, got=str(error), fix=fix) from None
+                failed = Failed(id=sample.key, code=error.cause, message=str(error))
+            else:
+                tally.kept += 1
+                num_tokens = reply.usage.completion_tokens if reply.usage else 0
+                return make_prediction(sample, cfg.split, reply.text, num_tokens, reply.finish_reason != "length")
+            tally.fail(failed.code)
+            failures.append(failed)
+            return failed_prediction(sample, cfg.split, failed.code)
+
+    with AnswerBook(stage.path / "answers") as book:
+        try:
+            async with started(engine), asyncio.TaskGroup() as group:
+                kept = KeptAnswers(engine, book)
+                tasks = [group.create_task(answer(sample)) for sample in samples]
+        except ExceptionGroup as found:  # the first one tells why
+            raise found.exceptions[0] from None
+    write_failures(stage.path / "failures.jsonl", failures)
+    return [task.result() for task in tasks], tally
+
+
+def _make_engine(cfg: InferConfig, model: str, samples: list[Sample]) -> Engine:
+    if cfg.engine == "endpoint":
+        return ChatClient(model, cfg.endpoint)
+    num_images = max(len(sample.images) for sample in samples)
+    return VllmEngine(Path(model), cfg.vllm, cfg.endpoint, num_images=num_images, settings="distill.infer")
+
+
+# --- the step ---------------------------------------------------------------------------------------------------------
+
+
 def run(
     cfg: InferConfig,
     dataset: Path,
     data: Path,
-    model: Path,
+    model: str | Path,
     out: Path,
     *,
     adapter: Path | None = None,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read a split, the playback tree `data`, the model folder and (if given) its adapter; write `predictions.jsonl`.
+    """Read a split, the playback tree `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
+    Args:
+        model: a folder, or with engine `endpoint` a URL.
     Returns:
         The path of `predictions.jsonl`: one line per sample, in the order of the split.
     Raises:
-        InputError: an input is missing or does not fit.
-        EnvironmentMissing: torch, transformers or peft is missing.
+        InputError: an input is missing or does not fit. ConfigError: the engine takes no adapter.
+        EnvironmentMissing: torch, transformers, peft or vllm is missing. TeacherError: the engine does not answer.
     """
-    require("torch", "transformers", "peft")
-    inputs = {"dataset": dataset, "data": data, **weight_files(model)}
-    facts: dict[str, Any] = {}
+    inputs = {"dataset": dataset, "data": data}
+    if cfg.engine == "transformers":
+        require("torch", "transformers", "peft")
+    elif adapter is not None:
+        raise ConfigError(
+            "an adapter is read by transformers alone",
+            where="distill.infer.engine",
+            got=cfg.engine,
+            fix="merge it into the weights, or --engine transformers",
+        )
+    if cfg.engine != "endpoint":
+        inputs |= weight_files(Path(model))
     if adapter is not None:
-        facts = read_adapter_facts(adapter, model)
+        read_adapter_facts(adapter, Path(model))
         inputs |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)
     path = out / PREDICTIONS
@@ -155,38 +279,13 @@ def run(
     samples = list(read_split(dataset, cfg.split))[: cfg.max_samples or None]
     if not samples:
         raise InputError("the split is empty", where=split_path(dataset, cfg.split), fix="choose another split")
-    # Whole batches are the unit of resumption: rounding may depend on what else is in a batch.
-    batches = [samples[start : start + cfg.batch_size] for start in range(0, len(samples), cfg.batch_size)]
-    items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
-    max_pixels = cfg.max_pixels or int(facts.get("max_pixels", DEFAULT_MAX_PIXELS))
-    finished = run_items(stage, items, _batch_factory, (cfg, data, model, adapter, max_pixels), label=STAGE)
-    tally = Tally(input=len(samples))
-    records = []
-    for record, batch in zip(finished.records, batches, strict=True):
-        if isinstance(record, Failed):
-            tally.fail(record.code, len(batch))
-            records += [failed_prediction(s, cfg.split, record.code).model_dump(mode="json") for s in batch]
-        else:
-            tally.kept += len(batch)
-            records += record.result["predictions"]
+    if cfg.engine == "transformers":
+        predictions, tally = _infer(cfg, stage, samples, data, Path(model), adapter)
+    else:
+        predictions, tally = asyncio.run(_ask(cfg, stage, _make_engine(cfg, str(model), samples), samples, data))
     if not tally.kept:
         raise stage.nothing_kept(tally)
-    write_bytes(path, "".join(dump_json(record) + "\n" for record in records).encode())
-    num_parsed = sum(record["coc"] is not None for record in records)
+    write_bytes(path, "".join(dump_json(p.model_dump(mode="json")) + "\n" for p in predictions).encode())
+    num_parsed = sum(prediction.coc is not None for prediction in predictions)
     stage.finish([path], tally, split=cfg.split, parsed=num_parsed, has_adapter=adapter is not None)
     return path
-
-
-def read_predictions(path: Path) -> list[Prediction]:
-    """Read `predictions.jsonl`.
-
-    Raises:
-        InputError: names the file, the line and the field, or a prediction that stands there twice.
-    """
-    predictions: dict[str, Prediction] = {}
-    lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
-    for number, (_, prediction) in enumerate(lines, 1):
-        if prediction.key in predictions:
-            raise InputError("a sample is answered twice", where=f"{path}:{number}", got=prediction.key)
-        predictions[prediction.key] = prediction
-    return list(predictions.values())

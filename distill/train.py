@@ -31,8 +31,8 @@ from distill.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.dataset import Sample, read_split, split_path
 from distill.encoding import IGNORED, Encoded, count_tokens, encode, image_size, training_batch
+from distill.schema import Sample, read_split, split_path
 from distill.student import Device, Student, load_student, require, weight_files
 
 log = logging.getLogger(__name__)
@@ -89,11 +89,11 @@ class TrainConfig(Config):
         return value
 
 
-# --- plan -------------------------------------------------------------------------------------------------------------
+# --- steps -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Plan:
+class Steps:
     """Which samples each step sees: steps of one epoch follow a permutation of their own."""
 
     num_samples: int
@@ -102,7 +102,7 @@ class Plan:
     seed: int
 
     @classmethod
-    def make(cls, cfg: TrainConfig, num_samples: int, seed: int) -> Plan:
+    def make(cls, cfg: TrainConfig, num_samples: int, seed: int) -> Steps:
         samples_per_step = cfg.batch_size * cfg.accumulate
         num_steps = cfg.epochs * math.ceil(num_samples / samples_per_step)
         return cls(num_samples, samples_per_step, min(num_steps, cfg.max_steps or num_steps), seed)
@@ -293,29 +293,29 @@ def fit(
     """
     import torch
 
-    plan = Plan.make(cfg, len(samples), seed)
+    steps = Steps.make(cfg, len(samples), seed)
     parameters = [p for p in student.model.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=cfg.weight_decay)
     log_path, checkpoints = out / "log.jsonl", out / "checkpoints"
     newest = newest_checkpoint(checkpoints)
     first = load_checkpoint(newest, student, optimizer) if newest else 0
     if first:
-        log.info("%s: continuing after step %d of %d", STAGE, first, plan.num_steps)
+        log.info("%s: continuing after step %d of %d", STAGE, first, steps.num_steps)
     cut_log(log_path, first)
     with (
         storage_errors(log_path),
         open(log_path, "a", encoding="utf-8") as file,
-        progress_bar(STAGE, total=plan.num_steps, done=first) as advance,
+        progress_bar(STAGE, total=steps.num_steps, done=first) as advance,
     ):
-        for step in range(first, plan.num_steps):
-            rate = learning_rate_at(cfg, step, plan.num_steps)
-            chosen = [samples[i] for i in plan.samples_of(step)]
+        for step in range(first, steps.num_steps):
+            rate = learning_rate_at(cfg, step, steps.num_steps)
+            chosen = [samples[i] for i in steps.samples_of(step)]
             with seeded(student, seed, f"step_{step}"):
                 facts = train_step(student, optimizer, chosen, data, cfg, rate)
-            record = {"step": step + 1, "epoch": step // plan.steps_per_epoch, "learning_rate": rate, **facts}
+            record = {"step": step + 1, "epoch": step // steps.steps_per_epoch, "learning_rate": rate, **facts}
             file.write(dump_json(record) + "\n")
             file.flush()
-            if (step + 1) % cfg.save_every_steps == 0 or step + 1 == plan.num_steps:
+            if (step + 1) % cfg.save_every_steps == 0 or step + 1 == steps.num_steps:
                 save_checkpoint(checkpoints / f"step_{step + 1:08d}", student, optimizer, step + 1)
                 drop_old_checkpoints(checkpoints, cfg.keep_checkpoints)
             advance(1)

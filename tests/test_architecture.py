@@ -99,6 +99,13 @@ def test_what_opengl_draws_with_stays_behind_its_renderer(name):
     assert name.startswith(own) or not [module for module in imports(name) if module.startswith(own)]
 
 
+@pytest.mark.parametrize("step", ["dataset", "train", "infer", "evaluate"])
+def test_no_step_of_distill_imports_a_step(step):
+    """They meet in distill/schema.py."""
+    steps = {f"distill.{name}" for name in ("dataset", "train", "infer", "evaluate")}
+    assert not imports(f"distill.{step}") & steps
+
+
 @pytest.mark.parametrize("name", sorted(SOURCES))
 def test_heavy_packages_are_imported_where_they_are_used(name):
     top = {n.split(".")[0] for n in imports(name, top_level_only=True)}

@@ -13,6 +13,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import pytest
+from specimens_distill import make_captions
 from teacher_server import CHINESE, ENGLISH, is_mirror
 
 from caption.run.stage import run
@@ -22,6 +23,9 @@ from cosfly.chat.contract import Reply, Usage
 from cosfly.chat.vllm_engine import VllmEngine, read_output
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 from cosfly.products.captions import read_captions
+from distill import dataset, infer
+from distill.schema import read_predictions, read_split
+from distill.student import MODEL_TYPE
 from specimens import make_playback_tree
 
 
@@ -229,3 +233,18 @@ def test_an_answer_that_the_engine_gave_up_is_none(stand_in, model, tmp_path):
         run(settings(model), tree, tmp_path / "out")
     stand_in.finish_reason = "stop"
     assert len(list(read_captions(run(settings(model), tree, tmp_path / "out")))) == 3
+
+
+def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 3, 8, with_augmented=False)
+    make_captions(tmp_path / "captions.jsonl", tree)
+    training_set = dataset.run(dataset.PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+    student = tmp_path / "student"
+    student.mkdir()
+    (student / "config.json").write_text(json.dumps({"model_type": MODEL_TYPE}))
+    (student / "model.safetensors").touch()
+    cfg = infer.InferConfig(split="train", engine="vllm")
+    predictions = read_predictions(infer.run(cfg, training_set, tree, student, tmp_path / "out"))
+    assert len(predictions) == len(stand_in.asked) == len(list(read_split(training_set, "train")))
+    assert all(prediction.coc is not None for prediction in predictions)
+    assert stand_in.templates == [{"enable_thinking": False}] * len(predictions)

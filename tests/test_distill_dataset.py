@@ -16,17 +16,8 @@ from specimens_distill import make_caption, make_captions
 
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
-from distill.dataset import (
-    SPLITS,
-    PrepareConfig,
-    Sample,
-    assign_splits,
-    check_no_leak,
-    group_of,
-    make_sample,
-    read_split,
-    run,
-)
+from distill.dataset import PrepareConfig, assign_splits, check_no_leak, make_sample, run
+from distill.schema import SPLITS, Sample, group_of, read_split
 from specimens import make_playback_tree
 
 

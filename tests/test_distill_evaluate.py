@@ -14,7 +14,7 @@ from specimens_distill import make_caption
 from cosfly.errors import ConfigError, InputError
 from cosfly.store import dump_json
 from distill.bertscore import others_of, score_texts
-from distill.dataset import PrepareConfig, Sample, make_sample
+from distill.dataset import PrepareConfig, make_sample
 from distill.evaluate import (
     NOT_COMPUTED,
     UNPARSED,
@@ -25,7 +25,8 @@ from distill.evaluate import (
     run,
     wilson_interval,
 )
-from distill.infer import Prediction, make_prediction
+from distill.infer import make_prediction
+from distill.schema import Prediction, Sample
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:

@@ -18,13 +18,13 @@ import httpx
 import numpy as np
 
 from caption.schema import CaptionConfig, ObservedWindow
-from caption.teachers.prompts import answer_schema, make_question, system_prompt
+from caption.teachers.prompts import make_question, system_prompt
 from caption.truth.facts import measure_facts
 from cosfly.chat.client import RETRIED_STATUS, ChatClient
 from cosfly.chat.protocol import response_format
 from cosfly.errors import TeacherError
 from cosfly.frame_views import VIEW_FILES
-from cosfly.products.captions import parse_answer
+from cosfly.products.captions import answer_schema, parse_answer
 from cosfly.store import parse_json
 
 State = Literal["ok", "warning", "unusable"]

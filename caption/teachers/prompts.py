@@ -18,7 +18,7 @@ from caption.teachers.images import EncodedImage, FrameEncoder, available_views
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from cosfly.frame_views import View
-from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, Prompt
+from cosfly.products.captions import ACTIONS, Coc, Language, Prompt
 from cosfly.store import dump_json
 
 PROMPTS = Path(__file__).with_name("prompts")
@@ -170,24 +170,6 @@ def _images_sentence(views: tuple[View, ...], layout: str, language: Language) -
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
-
-
-def answer_schema(decision: str | None = None) -> dict:
-    """Give the JSON schema of an answer; a given decision is the enum's one value."""
-    limits = {"critical_components": (20, 1200), "reasoning_trace": (30, 1600)}  # bounded: a server may pad for ever
-    properties: dict[str, dict] = {
-        name: {"type": "string", "minLength": low, "maxLength": high} for name, (low, high) in limits.items()
-    }
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(ACTIONS)}
-    return {"type": "object", "properties": properties, "required": list(FIELDS), "additionalProperties": False}
-
-
-def mirror_schema(decision: str) -> dict:
-    """Give the schema of the Chinese mirror: shorter texts, the decision fixed."""
-    schema = answer_schema(decision)
-    schema["properties"]["critical_components"]["minLength"] = 7
-    schema["properties"]["reasoning_trace"]["minLength"] = 10
-    return schema
 
 
 def question_messages(question: Question, encoder: FrameEncoder) -> tuple[list[dict], list[str]]:

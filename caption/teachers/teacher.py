@@ -16,7 +16,7 @@ from typing import Protocol
 
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.images import FrameEncoder
-from caption.teachers.prompts import Question, answer_schema, mirror_messages, mirror_schema, question_messages
+from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_answers
 from cosfly.chance import rng_for
 from cosfly.chat.answers import AnswerBook, KeptAnswers
@@ -25,7 +25,7 @@ from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, Reply, Request
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.frame_views import View
-from cosfly.products.captions import Coc, TeacherRecord, TeacherSettings
+from cosfly.products.captions import Coc, TeacherRecord, TeacherSettings, answer_schema
 from cosfly.products.playback import flight_of
 from cosfly.store import dump_json
 
@@ -164,7 +164,7 @@ class AskingTeacher:
 
     async def mirror(self, question: Question, english: Coc, ask: int) -> Reply:
         sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
-        schema = mirror_schema(english.flight_decision)
+        schema = answer_schema(english.flight_decision, "zh")
         request = self.cfg.request(mirror_messages(english), [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 

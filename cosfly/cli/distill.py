@@ -76,8 +76,11 @@ def distill_train(
 @app.command("infer")
 def distill_infer(
     dataset: DatasetOption,
-    model: ModelOption,
+    model: Annotated[str, typer.Option(help="Folder of the student's base model; with --engine endpoint its URL.")],
     out: OutOption,
+    engine: Annotated[
+        str | None, typer.Option(help="transformers, endpoint (a server) or vllm. [default: transformers]")
+    ] = None,
     adapter: Annotated[Path | None, typer.Option(help="Adapter folder; none: the base model as it is.")] = None,
     data: DataOption = None,
     config: ConfigFile = None,
@@ -87,7 +90,8 @@ def distill_infer(
     """Let the student answer a split; continues where it stopped."""
     import distill.infer
 
-    cfg = resolve(config, overrides)
+    extra = [] if engine is None else [f"distill.infer.engine={engine}"]
+    cfg = resolve(config, [*(overrides or []), *extra])
     typer.echo(
         distill.infer.run(
             cfg.distill.infer, dataset, data_folder(data), model, out, adapter=adapter, resume=resume.value

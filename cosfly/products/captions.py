@@ -34,6 +34,7 @@ FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
 # A Chinese character carries about as much as three Latin letters, so the same thought is a third as long.
 MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
+MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bounded: a server may pad for ever
 
 Language = Literal["en", "zh"]
 TeacherKind = Literal["rules", "endpoint", "vllm"]
@@ -47,6 +48,16 @@ def normalize_action(text: str) -> str | None:
         return text
     token = re.sub(r"[\s\-_]+", "_", text.strip().strip("\"'`*.。 ").lower())
     return token if token in _TOKENS else None
+
+
+def answer_schema(decision: str | None = None, language: Language = "en") -> dict:
+    """Give the JSON schema of an answer; a given decision is the enum's one value."""
+    properties: dict[str, dict] = {
+        name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
+        for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
+    }
+    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(ACTIONS)}
+    return {"type": "object", "properties": properties, "required": list(FIELDS), "additionalProperties": False}
 
 
 class Coc(BaseModel):

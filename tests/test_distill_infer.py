@@ -1,0 +1,116 @@
+"""Students asked through an engine: what is sent, what is kept, and what happens when nobody answers. Needs no torch."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from specimens_distill import make_captions
+from teacher_server import TeacherServer, kept_answers
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import ConfigError, TeacherError
+from cosfly.store import inside
+from distill import dataset, infer
+from distill.encoding import load_image
+from distill.schema import read_predictions, read_split
+from specimens import make_playback_tree
+
+ENDPOINT = {"max_tries": 1, "timeout_s": 5.0, "concurrency": 3}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("place")
+    tree = make_playback_tree(root / "tree", 3, 8, with_augmented=False)
+    make_captions(root / "captions.jsonl", tree)
+    cfg = dataset.PrepareConfig(modalities=("rgb", "depth"), val_fraction=0.3, test_fraction=0.3)
+    dataset.run(cfg, root / "captions.jsonl", tree, root / "set")
+    return root
+
+
+def settings(**changes) -> infer.InferConfig:
+    endpoint = ENDPOINT | changes.pop("endpoint", {})
+    return infer.InferConfig.model_validate({"split": "train", "engine": "endpoint", "endpoint": endpoint, **changes})
+
+
+def infer_with(cfg: infer.InferConfig, place: Path, url: str, out: Path, **more) -> Path:
+    return infer.run(cfg, place / "set", place / "tree", url, out, **more)
+
+
+def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
+    samples = list(read_split(place / "set", "train"))
+    with TeacherServer() as server:
+        path = infer_with(settings(max_new_tokens=99, max_pixels=300), place, server.url, tmp_path / "out")
+    predictions = read_predictions(path)
+    assert [p.key for p in predictions] == [sample.key for sample in samples]
+    assert all(p.coc is not None and p.is_finished and p.num_tokens == 100 for p in predictions)
+    bodies = {body["messages"][1]["content"][-1]["text"]: body for body in map(json.loads, server.bodies)}
+    assert len(server.bodies) == len(samples)
+    sample = samples[0]
+    body = bodies[sample.prompt.user]
+    assert (body["temperature"], body["top_p"], body["max_tokens"]) == (0.0, 1.0, 99)
+    assert body["chat_template_kwargs"] == {"enable_thinking": False}
+    assert body["messages"][0] == {"role": "system", "content": sample.prompt.system}
+    assert len(body["response_format"]["json_schema"]["schema"]["properties"]["flight_decision"]["enum"]) == 17
+    urls = [part["image_url"]["url"] for part in body["messages"][1]["content"][:-1]]
+    sent = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) for url in urls]
+    assert len(sent) == len(sample.images)
+    assert all(image.width * image.height <= 300 for image in sent)
+
+
+def test_a_small_picture_is_sent_as_it_is(place):
+    sample = next(read_split(place / "set", "train"))
+    request = infer.make_request(sample, place / "tree", settings())
+    for part, name in zip(request.messages[1]["content"], sample.images, strict=False):
+        data = base64.b64decode(part["image_url"]["url"].partition(",")[2])
+        assert np.array_equal(Image.open(io.BytesIO(data)), load_image(inside(place / "tree", name)))
+
+
+def test_nothing_answered_is_asked_twice(place, tmp_path):
+    out = tmp_path / "out"
+    with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
+        with pytest.raises(TeacherError, match=r"a sample got no answer.*http_500.*same command"):
+            infer_with(settings(), place, server.url, out)
+        num_kept = len(kept_answers(out))
+        assert num_kept >= 5 - ENDPOINT["concurrency"]
+        assert not (out / "predictions.jsonl").exists()
+        server.fault, num_asked = (lambda number, body: None), len(server.bodies)
+        path = infer_with(settings(), place, server.url, out)
+        num_samples = len(read_predictions(path))
+        assert len(server.bodies) == num_asked + num_samples - num_kept
+        (out / "manifest.json").unlink()
+        before = path.read_bytes()
+        assert infer_with(settings(), place, server.url, out).read_bytes() == before
+        assert len(server.bodies) == num_asked + num_samples - num_kept
+
+
+def test_what_a_server_refuses_counts_as_wrong(place, tmp_path):
+    with TeacherServer(lambda number, body: "413" if number == 0 else None) as server:
+        path = infer_with(settings(), place, server.url, tmp_path / "out")
+    predictions = read_predictions(path)
+    assert [p.reason for p in predictions if p.coc is None] == ["failed_refused_413"]
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["counts"]["failed"] == {"refused_413": 1}
+    assert "refused_413" in (tmp_path / "out" / "failures.jsonl").read_text()
+
+
+def test_an_adapter_needs_transformers(place, tmp_path):
+    with pytest.raises(ConfigError, match="read by transformers alone"):
+        infer_with(settings(), place, "http://127.0.0.1:1", tmp_path / "out", adapter=tmp_path)
+
+
+def test_the_command_takes_a_url(place, tmp_path):
+    with TeacherServer() as server:
+        words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--model", server.url]
+        words += ["--engine", "endpoint", "--out", tmp_path / "out", "--set", "distill.infer.endpoint.concurrency=2"]
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert result.exit_code == 0, result.output
+        assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}
+    assert read_predictions(tmp_path / "out" / "predictions.jsonl")
