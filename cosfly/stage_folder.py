@@ -30,7 +30,7 @@ from cosfly.store import (
     dump_json,
     fingerprint,
     inside,
-    parse_json,
+    model_lines,
     read_model,
     remove_partials,
     sha256_file,
@@ -90,6 +90,11 @@ _ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discrim
 def write_failures(path: Path, failures: Iterable[Failed]) -> None:
     """Write `failures.jsonl`."""
     write_bytes(path, "".join(dump_json(f.model_dump(exclude={"status"})) + "\n" for f in failures).encode())
+
+
+def read_failures(path: Path) -> list[Failed]:
+    """Read `failures.jsonl`."""
+    return [failure for _, failure in model_lines(path, Failed, what="record of failures", fix="run the stage first")]
 
 
 class Tally(BaseModel):
@@ -280,11 +285,11 @@ class StageFolder:
     def nothing_kept(self, tally: Tally, *, expected: str | None = None) -> NothingKept:
         """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure."""
         path = self.path / "failures.jsonl"
-        first = path.read_text(encoding="utf-8").partition("\n")[0] if path.exists() else ""
+        failures = read_failures(path) if path.exists() else []
         return NothingKept(
             f"{self.stage} kept nothing, so there is nothing to go on with",
             where=self.path,
-            got=f"{tally}; the first failure: {parse_json(first)['message']}" if first else str(tally),
+            got=f"{tally}; the first failure: {failures[0].message}" if failures else str(tally),
             expected=expected,
             fix="mend what the records in that folder name, or change the settings and choose another --out",
         )

@@ -25,8 +25,7 @@ from cosfly.chat.protocol import shown_url
 from cosfly.errors import CosflyError, InputError, TeacherError
 from cosfly.products.captions import Caption, write_captions
 from cosfly.products.playback import flight_of
-from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import dump_json, parse_json, write_bytes
+from cosfly.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +41,7 @@ class Asked:
     """What came of a run: flights, windows without an answer, flights not begun, and why it stopped early (None: not)."""
 
     flights: Tally
-    unanswered: list[dict] = field(default_factory=list)
+    unanswered: list[Failed] = field(default_factory=list)
     num_flights_left: int = 0
     stopped: str | None = None
     judge_usage: Usage | None = None  # of all runs into the folder
@@ -65,8 +64,8 @@ class Asking:
     def __init__(self, stage: StageFolder, cfg: CaptionConfig, seed: int, *, retry_failed: bool = False) -> None:
         self.stage, self.cfg, self.seed = stage, cfg, seed
         self.open: dict[str, _OpenFlight] = {}
-        self.failures: list[dict] = []  # flights that cannot be read
-        self.unanswered: list[dict] = []
+        self.failures: list[Failed] = []  # flights that cannot be read
+        self.unanswered: list[Failed] = []
         self.quarantine = _read_quarantine(stage.path / QUARANTINE)
         self.only = frozenset(self.quarantine) if retry_failed else None
         in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
@@ -141,7 +140,7 @@ class Asking:
                     flight.has_gap = True
                     break
         except InputError as error:
-            self.failures.append({"id": allotted.name, "code": error.code, "message": str(error)})
+            self.failures.append(Failed(id=allotted.name, code=error.code, message=str(error)))
             tally.fail(error.code)
             log.error("caption: %s: %s", allotted.name, error)
         else:
@@ -160,9 +159,9 @@ class Asking:
             caption = await caption_window(sample, teacher, self.cfg, self.judge)
         except BudgetSpent as error:
             self.stopped = self.stopped or str(error)
-            self._leave_out(flight, {"id": sample_id, "code": "not_asked", "message": str(error)})
+            self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=str(error)))
         except NoAnswer as error:
-            failure = {"id": sample_id, "code": error.cause, "message": str(error)}
+            failure = Failed(id=sample_id, code=error.cause, message=str(error))
             if error.cause == "not_asked":
                 self._leave_out(flight, failure)
             else:
@@ -170,7 +169,7 @@ class Asking:
         except CosflyError as error:
             if error.fatal:
                 raise
-            self._record_gap(flight, {"id": sample_id, "code": error.code, "message": str(error)})
+            self._record_gap(flight, Failed(id=sample_id, code=error.code, message=str(error)))
         else:
             flight.captions.append(caption)
             self.quarantine.pop(sample_id, None)
@@ -179,20 +178,20 @@ class Asking:
         flight.pending -= 1
         self._close_if_done(flight)
 
-    def _leave_out(self, flight: _OpenFlight, failure: dict) -> None:
+    def _leave_out(self, flight: _OpenFlight, failure: Failed) -> None:
         flight.has_gap = True
         self.unanswered.append(failure)
 
-    def _record_gap(self, flight: _OpenFlight, failure: dict) -> None:
+    def _record_gap(self, flight: _OpenFlight, failure: Failed) -> None:
         self._leave_out(flight, failure)
-        self.quarantine[failure["id"]] = failure
+        self.quarantine[failure.id] = failure
         self.display.miss()
         self.failed_in_row += 1
         if self.failed_in_row >= self.cfg.endpoint.stop_after_failures:
             raise TeacherError(
                 f"{self.failed_in_row} windows in a row got no answer",
                 where=shown_url(self.cfg.teacher),
-                got=f"{common_causes(self.unanswered)}; the last: {failure['message']}",
+                got=f"{common_causes(self.unanswered)}; the last: {failure.message}",
                 fix="see to the server, then run the same command again: nothing answered is asked twice",
             )
 
@@ -213,9 +212,9 @@ class Asking:
 
     def _write_failures(self) -> None:
         """Write what failed: flights and windows of this run, and the quarantine of all runs."""
-        windows = [failure for failure in self.unanswered if failure["code"] != "not_asked"]
+        windows = [failure for failure in self.unanswered if failure.code != "not_asked"]
         for name, records in ((FAILURES, self.failures + windows), (QUARANTINE, list(self.quarantine.values()))):
-            write_bytes(self.stage.path / name, "".join(dump_json(record) + "\n" for record in records).encode())
+            write_failures(self.stage.path / name, records)
 
 
 async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:
@@ -225,16 +224,12 @@ async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:
     return pending
 
 
-def common_causes(failures: list[dict], most: int = 3) -> str:
+def common_causes(failures: list[Failed], most: int = 3) -> str:
     """Give the most common causes with their counts."""
-    counts = Counter(failure["code"] for failure in failures)
+    counts = Counter(failure.code for failure in failures)
     ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
     return ", ".join(f"{cause} {count}" for cause, count in ordered[:most])
 
 
-def _read_quarantine(path: Path) -> dict[str, dict]:
-    if not path.exists():
-        return {}
-    with open(path, encoding="utf-8") as file:  # not splitlines(): a message may hold other line separators
-        records = [parse_json(line) for line in file]
-    return {record["id"]: record for record in records}
+def _read_quarantine(path: Path) -> dict[str, Failed]:
+    return {failure.id: failure for failure in read_failures(path)} if path.exists() else {}

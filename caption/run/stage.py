@@ -108,7 +108,7 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
     Raises:
         TeacherError: a budget is used up, or windows got no answer.
     """
-    missed = [failure for failure in asked.unanswered if failure["code"] != "not_asked"]
+    missed = [failure for failure in asked.unanswered if failure.code != "not_asked"]
     if asked.stopped:
         raise TeacherError(
             "stopped before the budget was passed",
