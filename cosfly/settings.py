@@ -9,7 +9,7 @@ from pydantic import Field
 
 from caption.schema import CaptionConfig
 from cosfly.config import Config
-from cosfly.inspection.stage import InspectConfig
+from cosfly.inspection.flight import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.stage import PedestriansConfig
 from cosfly.planners.contract import PlanConfig

@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.errors import InputError
-from cosfly.inspection import stage as qc
+from cosfly.inspection.flight import InspectConfig, check_motion, check_plan
 from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region, png_problem, region_box
+from cosfly.inspection.stage import run
 from cosfly.issues import Issue, Report
 from cosfly.products.frames import frame_name
 from cosfly.products.inspection import read_inspection
@@ -58,11 +59,11 @@ def workplace(specimen, tmp_path) -> Path:
 
 
 # The specimen's drone is jerkier than a planned one, so the plan's rules get their own tests below.
-CFG = qc.InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
+CFG = InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
 
 
-def inspect(workplace: Path, cfg: qc.InspectConfig = CFG, out: str = "out", **more):
-    return read_inspection(qc.run(cfg, workplace / "drone_trace.json", workplace / "tree", workplace / out, **more))
+def inspect(workplace: Path, cfg: InspectConfig = CFG, out: str = "out", **more):
+    return read_inspection(run(cfg, workplace / "drone_trace.json", workplace / "tree", workplace / out, **more))
 
 
 def first_flight(workplace: Path, variant: str = "ORI") -> Path:
@@ -97,7 +98,7 @@ def test_smoothness_numbers_are_those_of_a_circle():
         "p", "muco", np.arange(400) * 0.5, positions, np.zeros((400, 3)), positions, np.full(400, 0.8), np.ones(400)
     )
     metrics: dict = {}
-    qc.check_plan(trace, qc.InspectConfig(), Report(), metrics)
+    check_plan(trace, InspectConfig(), Report(), metrics)
     assert metrics["accel_rms_mps2"] == pytest.approx(0.2, rel=0.01)
     assert metrics["jerk_rms_mps3"] == pytest.approx(0.02, rel=0.01)
     assert metrics["smoothness"] == pytest.approx(np.exp(-0.5 * (0.2 / 5 + 0.02 / 10)), rel=1e-3)
@@ -123,13 +124,13 @@ def test_plan_rules(change, code, severity):
         np.full(n, change.get("clearance", 1.0)), drop_reason=change.get("drop_reason"),
     )  # fmt: skip
     report = Report()
-    qc.check_plan(trace, qc.InspectConfig(), report, {})
+    check_plan(trace, InspectConfig(), report, {})
     assert {issue.code: issue.severity for issue in report.issues}.get(code) == severity
-    off = qc.InspectConfig(
+    off = InspectConfig(
         accel_rms_max_mps2=1e6, jerk_rms_max_mps3=1e6, smoothness_min=0, five_ray_mean_min=0, clearance_min_m=-9
     )
     report = Report()
-    qc.check_plan(trace, off, report, {})
+    check_plan(trace, off, report, {})
     assert {issue.code for issue in report.issues} <= {"prefiltered"}
 
 
@@ -220,7 +221,7 @@ def test_teleport_of_drone_and_person(workplace):
         moved = getattr(flight, name).copy()
         moved[5:, 0] += shift_m
         report = Report()
-        qc.check_motion(replace(flight, **{name: moved}), qc.InspectConfig(), report)
+        check_motion(replace(flight, **{name: moved}), InspectConfig(), report)
         assert [(i.code, "points[5]" in i.where) for i in report.issues] == [("teleport", True)]
 
 

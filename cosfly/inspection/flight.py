@@ -1,0 +1,281 @@
+"""What the inspection finds out about one flight: its thresholds, its checks of plan, poses and motion, its record (sec:step6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.config import Config
+from cosfly.errors import InputError
+from cosfly.flight_metrics import (
+    ACCEL_RMS_MAX_MPS2,
+    FIVE_RAY_MEAN_MIN,
+    JERK_RMS_MAX_MPS3,
+    accel_rms,
+    jerk_rms,
+    length_m,
+    smoothness_score,
+)
+from cosfly.geometry import DT_S, project, world_from_camera, wrap_deg
+from cosfly.inspection.frames import FrameNumbers, check_checksums, check_files, check_pixels, choose_frames, target_box
+from cosfly.inspection.report import draw_flight
+from cosfly.issues import Report
+from cosfly.products.inspection import FlightInspection
+from cosfly.products.inspection import Result as FlightResult
+from cosfly.products.playback import Flight, read_flight
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import TARGET_HEIGHT_M
+
+TIME_TOLERANCE_S = 1e-3
+
+
+class InspectConfig(Config):
+    """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
+
+    accel_rms_max_mps2: float = Field(
+        ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
+    )
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
+    smoothness_min: float = Field(
+        0.5, ge=0, le=1, description="smoothness score S below this goes to review; 0 turns the rule off"
+    )
+    five_ray_mean_min: float = Field(
+        FIVE_RAY_MEAN_MIN,
+        ge=0,
+        le=1,
+        description="mean five-ray visibility of the plan below this rejects; 0 turns the rule off",
+    )
+    clearance_min_m: float = Field(0.0, description="a planned point nearer than this to an obstacle rejects, m")
+    check_pixels: Literal["all", "sample", "none"] = Field(
+        "all",
+        description="decode every frame, an even sample, or none (then only names, headers and poses are checked)",
+    )
+    pixel_sample: int = Field(16, ge=1, description="frames per flight that check_pixels: sample decodes")
+    check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")
+    pose_tolerance_m: float = Field(1e-3, ge=0, description="distance allowed between a flight's pose and its plan, m")
+    rotation_tolerance_deg: float = Field(0.01, ge=0, description="turn allowed between a flight's pose and its plan")
+    reprojection_tolerance_px: float = Field(
+        0.5, gt=0, description="distance allowed between the recorded and the projected target, px"
+    )
+    drone_speed_max_mps: float = Field(25.0, gt=0, description="a faster step between two frames is a teleport, m/s")
+    target_speed_max_mps: float = Field(10.0, gt=0, description="the same for the person, m/s")
+    track_quality_min: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off",
+    )
+    mask_visibility_min: float = Field(
+        0.5, ge=0, le=1, description="a frame at least this visible must show pedestrian pixels at the target's box"
+    )
+    invalid_depth_max: float = Field(
+        0.01, ge=0, le=1, description="share of invalid depth pixels above this in any frame goes to review"
+    )
+    thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
+
+
+# --- one flight -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A flight's record, and what the report draws of it."""
+
+    record: FlightInspection
+    view: dict[str, Any]
+
+
+def inspect_flight(folder: Path, root: Path, traces: dict[str, DroneTrace], cfg: InspectConfig) -> Inspected:
+    """Check one flight folder.
+
+    Raises:
+        InputError: `trajectory.json` cannot be read at all; names the file and the field.
+    """
+    report = Report()
+    flight = _read(folder, report)
+    trace = traces.get(trace_id(flight))
+    metrics: dict[str, float | int | None] = {"num_frames": len(flight)}
+    if trace is None:
+        got = f"no trace {trace_id(flight)!r}"
+        report.add("warning", "no_trace", "trajectory.json: source.scenario_id", got, "the id of a planned flight")
+    else:
+        check_plan(trace, cfg, report, metrics)
+        check_poses(flight, trace, cfg, report)
+    check_motion(flight, cfg, report)
+    check_projection(flight, cfg, report)
+    frames = _check_frames(flight, cfg, report)
+    _rendered_metrics(flight, frames, cfg, report, metrics)
+    issues = report.merged()
+    result: FlightResult = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
+    record = FlightInspection(
+        town=flight.town,
+        trajectory=flight.trajectory,
+        variant=flight.variant,
+        folder=folder.relative_to(root).as_posix(),
+        trace_id=trace.path_id if trace else None,
+        result=result,
+        issues=issues,
+        metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
+    )
+    return Inspected(record, draw_flight(flight, _heights_m(flight), cfg.thumbnail_px))
+
+
+def trace_id(flight: Flight) -> str:
+    """Give the id of the plan that a flight says it was rendered from."""
+    return str(flight.source.get("scenario_id", ""))
+
+
+def _read(folder: Path, report: Report) -> Flight:
+    """Read a flight strictly; if only the layout is broken, read on and report what is."""
+    try:
+        return read_flight(folder)
+    except InputError as error:
+        flight = read_flight(folder, strict=False)  # raises when poses or times are unusable
+        where = str(error.where).replace(f"{folder}/", "")
+        report.error("layout", where, error.got or error.what, error.expected or "the strict layout")
+        return flight
+
+
+def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: dict) -> None:
+    """Judge the planned trajectory: smoothness, five-ray visibility, clearance."""
+    dt_s = float(np.median(np.diff(trace.time_s))) if len(trace.time_s) > 1 else DT_S
+    accel, jerk = accel_rms(trace.positions_m, dt_s), jerk_rms(trace.positions_m, dt_s)
+    score, five_ray = smoothness_score(accel, jerk), float(trace.visibility.mean())
+    clearance = float(trace.clearances_m.min())
+    metrics.update(
+        accel_rms_mps2=accel, jerk_rms_mps3=jerk, smoothness=score, five_ray_mean=five_ray, clearance_min_m=clearance
+    )
+    where = f"plan {trace.path_id}"
+    if trace.drop_reason is not None:
+        report.error("prefiltered", where, trace.drop_reason, "a plan that passed the prefilter")
+    if accel > cfg.accel_rms_max_mps2:
+        report.error("acceleration", where, f"{accel:.2f} m/s^2", f"at most {cfg.accel_rms_max_mps2:g} m/s^2 RMS")
+    if jerk > cfg.jerk_rms_max_mps3:
+        report.error("jerk", where, f"{jerk:.2f} m/s^3", f"at most {cfg.jerk_rms_max_mps3:g} m/s^3 RMS")
+    if score < cfg.smoothness_min:
+        report.add("warning", "smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
+    if five_ray < cfg.five_ray_mean_min:
+        report.error("five_ray_visibility", where, f"{five_ray:.3f}", f"a mean of at least {cfg.five_ray_mean_min:g}")
+    if clearance < cfg.clearance_min_m:
+        report.error("collision", where, f"{clearance:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
+
+
+def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
+    """Check that a flight, its recorded perturbation taken off, is the plan.
+
+    Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared there.
+    """
+    if len(flight) < len(trace.time_s):
+        got, expected = f"{len(flight)} frames", f"{len(trace.time_s)} planned points"
+        report.add("warning", "shorter_than_planned", "trajectory.json: points", got, expected)
+    row = np.searchsorted(trace.time_s, flight.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
+    off_time = np.abs(trace.time_s[row] - flight.time_s) > TIME_TOLERANCE_S
+    for i in np.flatnonzero(off_time):
+        where = f"trajectory.json: points[{i}].timing.trace_timestamp"
+        report.error("pose_differs", where, f"{flight.time_s[i]:.3f} s", "a time of the plan")
+    is_shifted = (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
+    turns = wrap_deg(flight.rotations_deg - flight.rotation_offsets_deg - trace.rotations_deg[row])
+    checks = (
+        ("drone_pose", flight.positions_m - flight.drone_offsets_m - trace.positions_m[row], cfg.pose_tolerance_m, "m"),
+        ("drone_pose", np.where(is_shifted[:, None], 0.0, turns), cfg.rotation_tolerance_deg, "deg"),
+        (
+            "target.world_location",
+            flight.targets_m - flight.target_offsets_m - trace.targets_m[row],
+            cfg.pose_tolerance_m,
+            "m",
+        ),
+    )
+    for name, difference, tolerance, unit in checks:
+        distance = np.abs(np.asarray(difference)).max(axis=1)
+        for i in np.flatnonzero((distance > tolerance) & ~off_time):
+            where, expected = f"trajectory.json: points[{i}].{name}", f"the plan within {tolerance:g} {unit}"
+            report.error("pose_differs", where, f"{distance[i]:.4f} {unit} beside the plan", expected)
+
+
+def check_motion(flight: Flight, cfg: InspectConfig, report: Report) -> None:
+    """Find teleports: steps between frames that nothing flies or walks. Recorded perturbations are taken off."""
+    limits = (
+        ("drone_pose", flight.positions_m - flight.drone_offsets_m, cfg.drone_speed_max_mps),
+        ("target.world_location", flight.targets_m - flight.target_offsets_m, cfg.target_speed_max_mps),
+    )
+    for name, positions_m, limit_mps in limits:
+        speeds = np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(flight.time_s)
+        for i in np.flatnonzero(speeds > limit_mps):
+            where = f"trajectory.json: points[{i + 1}].{name}"
+            report.error("teleport", where, f"{speeds[i]:.1f} m/s", f"at most {limit_mps:g} m/s")
+
+
+def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None:
+    """Check the recorded pixel, box and depth of the target against pose, intrinsics and target position."""
+    for i in range(len(flight)):
+        point = f"trajectory.json: points[{i}].target"
+        if np.isnan(flight.targets_m[i]).any():
+            if flight.target_in_view[i]:
+                report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
+            continue
+        pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
+        uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera.intrinsic)
+        box = target_box(flight, i)
+        recorded = (
+            ("image_uv", flight.target_uv[i], uv[0], cfg.reprojection_tolerance_px, "px"),
+            ("bbox_2d", flight.target_bbox[i], box, 2 * cfg.reprojection_tolerance_px, "px"),
+            ("depth", flight.target_depth_m[i : i + 1], depth_m, 0.01, "m"),
+        )
+        for name, found, expected, tolerance, unit in recorded:
+            if np.isnan(found).any() or np.isnan(expected).any():
+                continue
+            distance = float(np.abs(found - expected).max())
+            if distance > tolerance:
+                limit = f"the projection of the target within {tolerance:g} {unit}"
+                report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} beside it", limit)
+        if flight.target_in_view[i] and np.isnan(flight.target_uv[i]).any():
+            report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
+
+
+def _check_frames(flight: Flight, cfg: InspectConfig, report: Report) -> FrameNumbers:
+    complete = check_files(flight, report)
+    if cfg.check_checksums:
+        check_checksums(flight, report)
+    return check_pixels(
+        flight, choose_frames(complete, cfg.check_pixels, cfg.pixel_sample), cfg.mask_visibility_min, report
+    )
+
+
+def _rendered_metrics(
+    flight: Flight, frames: FrameNumbers, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+) -> None:
+    """Add what the rendered frames say; rendered visibility describes, it never rejects (sec:dataset_stats)."""
+    known = flight.visibility[~np.isnan(flight.visibility)]
+    quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
+    invalid = max(frames.invalid_depth_shares, default=None)
+    metrics.update(
+        num_frames_checked=frames.num_checked,
+        length_m=length_m(flight.positions_m),
+        height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
+        rendered_visibility_mean=float(known.mean()) if len(known) else None,
+        visible_share=float(flight.target_visible.mean()),
+        in_view_share=float(flight.target_in_view.mean()),
+        perturbed_share=float(flight.is_perturbed.mean()),
+        track_quality=quality,
+        invalid_depth_share_max=invalid,
+    )
+    if not flight.target_visible.any():
+        report.add(
+            "warning", "never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target"
+        )
+    if quality is not None and quality < cfg.track_quality_min:
+        report.add(
+            "warning", "track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {cfg.track_quality_min}"
+        )
+    if invalid is not None and invalid > cfg.invalid_depth_max:
+        expected = f"at most {cfg.invalid_depth_max:g} of the pixels of a frame"
+        report.add("warning", "invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
+
+
+def _heights_m(flight: Flight) -> np.ndarray:
+    """Height of the drone over the person's feet, (n,) m."""
+    return flight.positions_m[:, 2] - (flight.targets_m[:, 2] - TARGET_HEIGHT_M)
