@@ -18,7 +18,8 @@ from typing import Any
 import pyarrow.parquet as pq
 import yaml
 
-from release.columns import CAPTION_FIELDS, FILES, MODALITIES, WINDOW, scalar_names, schema
+from release.columns import CAPTION_FIELDS, FILES, MODALITIES, WINDOW, Modality, scalar_names, schema
+from release.record import CaptionNumbers, FileNumbers, History, Numbers, ReleaseRecord, Spread
 
 DIGITS = 4
 MODALITY_TEXT = {
@@ -39,14 +40,14 @@ def read_rows(shards: Iterable[Path]) -> Iterator[dict[str, Any]]:
                 yield from file.read_row_group(k, columns=scalar_names()).to_pylist()
 
 
-def compute_numbers(shards: list[Path], num_frames: int) -> dict[str, Any]:
+def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
     """Compute every number of the card.
 
     Args:
         shards: parquet files in their order.
         num_frames: the release's frames per flight; flights with fewer are counted as short.
     Returns:
-        JSON-able; sums are exact (fsum), so that the same rows give the same digits everywhere.
+        sums are exact (fsum), so that the same rows give the same digits everywhere.
     """
     counts: dict[str, Counter[str]] = {
         name: Counter() for name in ("town", "track", "fov_deg", "image_px", *CAPTION_COUNTS)
@@ -83,41 +84,42 @@ def compute_numbers(shards: list[Path], num_frames: int) -> dict[str, Any]:
             example = example or {"sample_id": row["sample_id"], **{name: row[name] for name in CAPTION_FIELDS}}
             for name in CAPTION_FIELDS:
                 characters[name] += len(row[name] or "")
-    return {
-        "frames": totals["frames"],
-        "flights": len(flights),
-        "trajectories": len({key[:2] for key in flights}),
-        "frames_by": {name: _sorted(counts[name]) for name in ("town", "track", "fov_deg", "image_px")},
-        "trajectories_by_fov_deg": _sorted(Counter(fovs.values())),
-        "flights_by_track": _sorted(Counter("clean" if key[2] == "ORI" else "perturbed" for key in flights)),
-        "frames_per_flight": _spread([float(len(points)) for points in flights.values()]),
-        "flights_shorter_than_num_frames": sum(len(points) < num_frames for points in flights.values()),
-        "flight_duration_s": _spread([points[-1][0] - points[0][0] for points in flights.values()]),
-        "flight_length_m": _spread([_length(points) for points in flights.values()]),
-        "height_over_target_m": _spread(samples["height_m"]),
-        "distance_to_target_m": _spread(samples["distance_m"]),
-        "visibility": _spread(samples["visibility"]),
-        "frames_perturbed": totals["is_perturbed"],
-        "frames_target_in_view": totals["target_in_view"],
-        "frames_target_visible": totals["target_visible"],
-        "captions": {
-            "frames_with": totals["has_caption"],
-            "frames_without": totals["frames"] - totals["has_caption"],
-            "with_label": totals["has_label"],
-            "decision_equals_label": totals["decision_equals_label"],
-            **{name: _sorted(counts[name]) for name in CAPTION_COUNTS},
-            "mean_characters": {
-                name: round(characters[name] / totals["has_caption"], 1) if totals["has_caption"] else None
-                for name in CAPTION_FIELDS
-            },
-            "example": example,
+    captions = {
+        "frames_with": totals["has_caption"],
+        "frames_without": totals["frames"] - totals["has_caption"],
+        "with_label": totals["has_label"],
+        "decision_equals_label": totals["decision_equals_label"],
+        **{name: _sorted(counts[name]) for name in CAPTION_COUNTS},
+        "mean_characters": {
+            name: round(characters[name] / totals["has_caption"], 1) if totals["has_caption"] else None
+            for name in CAPTION_FIELDS
         },
-        "files": {
-            "shards": len(shards),
-            "bytes": sum(shard.stat().st_size for shard in shards),
-            "bytes_by_modality": bytes_by_modality(shards),
-        },
+        "example": example,
     }
+    return Numbers(
+        frames=totals["frames"],
+        flights=len(flights),
+        trajectories=len({key[:2] for key in flights}),
+        frames_by={name: _sorted(counts[name]) for name in ("town", "track", "fov_deg", "image_px")},
+        trajectories_by_fov_deg=_sorted(Counter(fovs.values())),
+        flights_by_track=_sorted(Counter("clean" if key[2] == "ORI" else "perturbed" for key in flights)),
+        frames_per_flight=_spread([float(len(points)) for points in flights.values()]),
+        flights_shorter_than_num_frames=sum(len(points) < num_frames for points in flights.values()),
+        flight_duration_s=_spread([points[-1][0] - points[0][0] for points in flights.values()]),
+        flight_length_m=_spread([_length(points) for points in flights.values()]),
+        height_over_target_m=_spread(samples["height_m"]),
+        distance_to_target_m=_spread(samples["distance_m"]),
+        visibility=_spread(samples["visibility"]),
+        frames_perturbed=totals["is_perturbed"],
+        frames_target_in_view=totals["target_in_view"],
+        frames_target_visible=totals["target_visible"],
+        captions=CaptionNumbers.model_validate(captions),
+        files=FileNumbers(
+            shards=len(shards),
+            bytes=sum(shard.stat().st_size for shard in shards),
+            bytes_by_modality=bytes_by_modality(shards),
+        ),
+    )
 
 
 CAPTION_COUNTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
@@ -140,14 +142,13 @@ def _length(points: list[tuple[float, float, float, float]]) -> float:
     return math.fsum(math.dist(a[1:], b[1:]) for a, b in itertools.pairwise(points))
 
 
-def _spread(values: list[float]) -> dict[str, float | int | None]:
-    """Mean, standard deviation (of the population), least, greatest and number of values."""
+def _spread(values: list[float]) -> Spread:
     if not values:
-        return {"count": 0, "mean": None, "std": None, "min": None, "max": None}
+        return Spread(count=0, mean=None, std=None, min=None, max=None)
     mean = math.fsum(values) / len(values)
     std = math.sqrt(math.fsum((value - mean) ** 2 for value in values) / len(values))
-    numbers = {"mean": mean, "std": std, "min": min(values), "max": max(values)}
-    return {"count": len(values), **{name: round(value, DIGITS) for name, value in numbers.items()}}
+    mean, std, low, high = (round(value, DIGITS) for value in (mean, std, min(values), max(values)))
+    return Spread(count=len(values), mean=mean, std=std, min=low, max=high)
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
@@ -158,7 +159,7 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 # --- the card ---------------------------------------------------------------------------------------------------------
 
 
-def render_card(record: dict[str, Any]) -> str:
+def render_card(record: ReleaseRecord) -> str:
     """Give README.md for a release.json."""
     template = (importlib.resources.files("release") / "card_template.md").read_text(encoding="utf-8")
     values = _values(record)
@@ -179,46 +180,50 @@ def size_category(num_frames: int) -> str:
     return next((name for limit, name in names if num_frames < limit), "n>10M")
 
 
-def _values(record: dict[str, Any]) -> dict[str, str]:
-    numbers, history, settings = record["numbers"], record["history"], record["settings"]
-    captions, frames = numbers["captions"], numbers["frames"]
-    visible = f"{_share(numbers['frames_target_visible'], frames)} of the frames"
+def _values(record: ReleaseRecord) -> dict[str, str]:
+    numbers, history, settings = record.numbers, record.history, record.settings
+    captions, frames = numbers.captions, numbers.frames
+    visible = f"{_share(numbers.frames_target_visible, frames)} of the frames"
     return {
         "front_matter": _front_matter(record),
-        "name": record["name"],
+        "name": record.name,
         "summary": _summary(record),
-        "frames_table": _table(("", "frames"), _groups(numbers["frames_by"])),
-        "fov_trajectories": ", ".join(f"{fov}: {n:,}" for fov, n in numbers["trajectories_by_fov_deg"].items()),
+        "frames_table": _table(("", "frames"), _groups(numbers.frames_by)),
+        "fov_trajectories": ", ".join(f"{fov}: {n:,}" for fov, n in numbers.trajectories_by_fov_deg.items()),
         "flights_table": _spreads(numbers),
         "visible": visible,
-        "perturbed": f"{numbers['frames_perturbed']:,} ({_share(numbers['frames_perturbed'], frames)})",
-        "num_frames": str(settings["num_frames"]),
-        "frame_rule": record["frame_selection"],
-        "short_flights": str(numbers["flights_shorter_than_num_frames"]),
-        "captions_with": f"{captions['frames_with']:,}",
-        "captions_without": f"{captions['frames_without']:,}",
-        "agreement": _share(captions["decision_equals_label"], captions["with_label"]),
-        "with_label": f"{captions['with_label']:,}",
-        "example": _example(captions["example"]),
-        "decisions_table": _table(("decision", "frames", "share"), _histogram(captions["decision"])),
+        "perturbed": f"{numbers.frames_perturbed:,} ({_share(numbers.frames_perturbed, frames)})",
+        "num_frames": str(settings.num_frames),
+        "frame_rule": record.frame_selection,
+        "short_flights": str(numbers.flights_shorter_than_num_frames),
+        "captions_with": f"{captions.frames_with:,}",
+        "captions_without": f"{captions.frames_without:,}",
+        "agreement": _share(captions.decision_equals_label, captions.with_label),
+        "with_label": f"{captions.with_label:,}",
+        "example": _example(captions.example),
+        "decisions_table": _table(("decision", "frames", "share"), _histogram(captions.decision)),
         "provenance_table": _table(
             ("", "", "frames"),
-            [(title, f"`{value}`", f"{n:,}") for title, key in PROVENANCE for value, n in captions[key].items()],
+            [
+                (title, f"`{value}`", f"{n:,}")
+                for title, key in PROVENANCE
+                for value, n in getattr(captions, key).items()
+            ],
         ),
-        "characters_table": _characters(captions["mean_characters"]),
+        "characters_table": _characters(captions.mean_characters),
         "files_table": _table(
             ("", "bytes"),
-            [(name, f"{size:,}") for name, size in numbers["files"]["bytes_by_modality"].items()]
-            + [("all shards", f"{numbers['files']['bytes']:,}")],
+            [(name, f"{size:,}") for name, size in numbers.files.bytes_by_modality.items()]
+            + [("all shards", f"{numbers.files.bytes:,}")],
         ),
         "funnel_table": _funnel(history),
-        "modalities": "\n".join(f"- {MODALITY_TEXT[name]}" for name in settings["modalities"]),
-        "decode": _decode_snippet(settings["modalities"]),
-        "columns_table": _columns(settings["modalities"]),
-        "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record["coordinates"].items()]),
-        "licence": record["licence"],
-        "credits": f"\n\n{record['credits']}" if record["credits"] else "",
-        "made_by": record["made_by"],
+        "modalities": "\n".join(f"- {MODALITY_TEXT[name]}" for name in settings.modalities),
+        "decode": _decode_snippet(settings.modalities),
+        "columns_table": _columns(settings.modalities),
+        "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record.coordinates.items()]),
+        "licence": record.licence,
+        "credits": "".join(f"\n\n{line}" for line in (*_maps(record), record.credits) if line),
+        "made_by": record.made_by,
     }
 
 
@@ -230,12 +235,12 @@ PROVENANCE = (
 )
 
 
-def _front_matter(record: dict[str, Any]) -> str:
+def _front_matter(record: ReleaseRecord) -> str:
     matter = {
-        "license": record["licence"],
+        "license": record.licence,
         "language": ["en", "zh"],
-        "pretty_name": record["name"],
-        "size_categories": [size_category(record["numbers"]["frames"])],
+        "pretty_name": record.name,
+        "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
         "configs": [
@@ -245,14 +250,22 @@ def _front_matter(record: dict[str, Any]) -> str:
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
 
 
-def _summary(record: dict[str, Any]) -> str:
-    numbers = record["numbers"]
-    tracks = ", ".join(f"{count} {name}" for name, count in numbers["flights_by_track"].items())
-    towns = len(numbers["frames_by"]["town"])
+def _maps(record: ReleaseRecord) -> list[str]:
+    """One line a map: its licence, and who must be named."""
+    return [
+        f"Map of {shown.town}: {shown.name}, licence {shown.licence}.{' ' * bool(shown.credits)}{shown.credits}"
+        for shown in record.maps
+    ]
+
+
+def _summary(record: ReleaseRecord) -> str:
+    numbers = record.numbers
+    tracks = ", ".join(f"{count} {name}" for name, count in numbers.flights_by_track.items())
+    towns = len(numbers.frames_by["town"])
     return (
-        f"{numbers['frames']:,} frames of {numbers['flights']:,} flights ({tracks}) "
-        f"over {numbers['trajectories']:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
-        f"{numbers['captions']['frames_with']:,} frames carry a reason in English and in Chinese."
+        f"{numbers.frames:,} frames of {numbers.flights:,} flights ({tracks}) "
+        f"over {numbers.trajectories:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
+        f"{numbers.captions.frames_with:,} frames carry a reason in English and in Chinese."
     )
 
 
@@ -265,7 +278,7 @@ def _groups(frames_by: dict[str, dict[str, int]]) -> list[tuple[str, str]]:
     ]
 
 
-def _spreads(numbers: dict[str, Any]) -> str:
+def _spreads(numbers: Numbers) -> str:
     titles = (
         ("frames per flight", "frames_per_flight"),
         ("duration of a flight, s", "flight_duration_s"),
@@ -276,9 +289,11 @@ def _spreads(numbers: dict[str, Any]) -> str:
     )
     rows = []
     for title, key in titles:
-        spread = numbers[key]
-        cells = ("-" if spread[name] is None else f"{spread[name]:,.3f}" for name in ("mean", "std", "min", "max"))
-        rows.append((title, *cells, f"{spread['count']:,}"))
+        spread: Spread = getattr(numbers, key)
+        cells = (
+            "-" if value is None else f"{value:,.3f}" for value in (spread.mean, spread.std, spread.min, spread.max)
+        )
+        rows.append((title, *cells, f"{spread.count:,}"))
     return _table(("", "mean", "std", "min", "max", "values"), rows)
 
 
@@ -307,26 +322,26 @@ def _example(example: dict[str, str]) -> str:
     return f"`{example['sample_id']}`:\n\n{_table(('', 'English', 'Chinese'), rows)}"
 
 
-def _funnel(history: dict[str, Any]) -> str:
-    planned, flights, captions = history["trajectories"], history["flights"], history["captions"]
-    rows = [("trajectories planned", planned["planned"])]
-    rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned["dropped"].items()]
-    rows += [("trajectories not rendered", planned["not_rendered"]), ("trajectories rendered", planned["rendered"])]
-    rows += [("flights inspected", flights["inspected"])]
-    rows += [(f"flights left out: {reason}", count) for reason, count in flights["left_out"].items()]
-    rows += [("flights released", flights["released"]), ("captions made", captions["read"])]
-    rows += [(f"captions dropped: {reason}", count) for reason, count in captions["dropped"].items()]
+def _funnel(history: History) -> str:
+    planned, flights, captions = history.trajectories, history.flights, history.captions
+    rows = [("trajectories planned", planned.planned)]
+    rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned.dropped.items()]
+    rows += [("trajectories not rendered", planned.not_rendered), ("trajectories rendered", planned.rendered)]
+    rows += [("flights inspected", flights.inspected)]
+    rows += [(f"flights left out: {reason}", count) for reason, count in flights.left_out.items()]
+    rows += [("flights released", flights.released), ("captions made", captions.read)]
+    rows += [(f"captions dropped: {reason}", count) for reason, count in captions.dropped.items()]
     rows += [
-        ("captions accepted, frame not selected", captions["frame_not_selected"]),
-        ("captions accepted, flight left out", captions["flight_left_out"]),
-        ("captions released", captions["released"]),
+        ("captions accepted, frame not selected", captions.frame_not_selected),
+        ("captions accepted, flight left out", captions.flight_left_out),
+        ("captions released", captions.released),
     ]
     return _table(("step", "number"), [(name.replace("_", " "), f"{count:,}") for name, count in rows])
 
 
-def _columns(modalities: list[str]) -> str:
+def _columns(modalities: list[Modality]) -> str:
     rows = []
-    for member in schema(modalities):  # type: ignore[arg-type]
+    for member in schema(modalities):
         kind = "float64" if str(member.type) == "double" else str(member.type)
         if member.name in (FILES["rgb"][0], FILES["instance"][0]):
             kind = "image"
@@ -338,7 +353,7 @@ def _columns(modalities: list[str]) -> str:
     return _table(("column", "type"), rows)
 
 
-def _decode_snippet(modalities: list[str]) -> str:
+def _decode_snippet(modalities: list[Modality]) -> str:
     lines = ["import io", "import numpy as np", "from datasets import load_dataset", ""]
     lines += ['data = load_dataset(FOLDER, split="train")  # this folder, or its name on the hub', "row = data[0]"]
     if "rgb" in modalities:

@@ -19,9 +19,11 @@ from pydantic import Field, field_validator
 
 import cosfly
 from cosfly.config import Config
-from cosfly.errors import InputError, VerifyError
+from cosfly.errors import ConfigError, InputError, VerifyError
+from cosfly.products.boxes import UNKNOWN_LICENCE, LicenceId
 from cosfly.products.inspection import FlightInspection, Inspection, read_inspection
 from cosfly.products.playback import read_flight
+from cosfly.products.town import read_town_map
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import (
@@ -32,13 +34,22 @@ from cosfly.store import (
     sha256_file,
     write_bytes,
     write_checksums,
-    write_json,
 )
 from release import columns
 from release.captions import Captions, load_captions
 from release.card import compute_numbers, render_card
 from release.columns import Modality, ReleasedCaption
-from release.record import RELEASE_SCHEMA, RELEASE_VERSION
+from release.record import (
+    CaptionHistory,
+    FlightHistory,
+    History,
+    ReleasedFlight,
+    ReleasedMap,
+    ReleaseRecord,
+    Settings,
+    Shard,
+    write_record,
+)
 from release.subsample import RULE, select_frames
 
 MB = 1024 * 1024
@@ -50,12 +61,10 @@ class ReleaseConfig(Config):
     """What is published, and how it is cut into files."""
 
     name: str = Field("CosFly flights", min_length=1, description="title of the data-set card")
-    licence: str = Field(
-        "cc-by-4.0", min_length=1, description="licence identifier of the data set, as the hub spells it"
+    licence: LicenceId | None = Field(
+        None, description="licence of the data set, as the hub spells it (cc-by-4.0); null: its maps', if they agree"
     )
-    credits: str = Field(
-        "", description="who must be named: the source of the map and its licence, one sentence or more"
-    )
+    credits: str = Field("", description="who else must be named; the maps' own licences and credits always are")
     num_frames: int = Field(
         400, ge=1, description="frames per flight by stride selection; shorter flights are kept whole, never padded"
     )
@@ -93,6 +102,28 @@ def choose_flights(inspection: Inspection, cfg: ReleaseConfig) -> tuple[list[Fli
         else:
             chosen.append(flight)
     return chosen, dict(sorted(left_out.items()))
+
+
+def maps_of(data: Path, flights: list[FlightInspection]) -> list[ReleasedMap]:
+    """Give the maps below the flights, by town."""
+    towns = {flight.town: inside(data, flight.folder).parent.parent for flight in flights}
+    return [ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in sorted(towns.items())]
+
+
+def choose_licence(cfg: ReleaseConfig, licences: dict[str, str]) -> str:
+    """Give the licence of the data set, given those of its maps: town -> licence.
+
+    Raises:
+        ConfigError: it is not given, and the maps' are unknown or differ.
+    """
+    chosen = cfg.licence or next(iter(licences.values()))
+    if chosen == UNKNOWN_LICENCE or (cfg.licence is None and len(set(licences.values())) > 1):
+        raise ConfigError(
+            "nobody says under which licence this may be released", where="release.licence",
+            got=", ".join(f"{town}: {licence}" for town, licence in licences.items()),
+            expected="a licence identifier as the hub spells it", fix="--set release.licence=... (cc-by-4.0, apache-2.0, ...)",
+        )  # fmt: skip
+    return chosen
 
 
 # --- one flight -------------------------------------------------------------------------------------------------------
@@ -264,6 +295,8 @@ def run(
     if not chosen:
         tally = Tally(input=len(inspection.flights), dropped=left_out)
         raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
+    maps = maps_of(data, chosen)
+    choose_licence(cfg, {shown.town: shown.licence for shown in maps})  # before the work, not after it
     loaded = load_captions(captions)
     items = [
         Item(flight.folder, loaded.by_flight.get((flight.town, flight.trajectory, flight.variant), {}))
@@ -277,10 +310,10 @@ def run(
     history = account(inspection, left_out, loaded, finished)
     with atomic_folder(dataset) as folder:
         shards = assemble_shards([parts / part_name(item_id) for item_id in results], folder, cfg)
-        write_records(folder, shards, results, history, cfg)
+        write_records(folder, make_record(folder, shards, results, history, maps, cfg))
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
-    stage.finish(outputs, finished.tally, history=history)
+    stage.finish(outputs, finished.tally, history=history.model_dump(mode="json"))
     shutil.rmtree(parts, ignore_errors=True)
     return dataset
 
@@ -297,65 +330,71 @@ def _check_parts(parts: Path, results: dict[str, dict]) -> None:
             )
 
 
-def account(inspection: Inspection, left_out: dict[str, int], captions: Captions, finished: Finished) -> dict[str, Any]:
+def account(inspection: Inspection, left_out: dict[str, int], captions: Captions, finished: Finished) -> History:
     """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
-    results = {record.id: record.result for record in finished.kept}
-    gone = dict(left_out)
-    for code, count in finished.tally.failed.items():
-        gone[f"failed: {code}"] = count
-    released = sum(result["captions"] for result in results.values())
-    not_selected = sum(result["captions_not_selected"] for result in results.values())
-    history = {
-        "trajectories": inspection.funnel.trajectories.model_dump(mode="json"),
-        "flights": {"inspected": len(inspection.flights), "released": len(results), "left_out": gone},
-        "captions": {
-            "read": captions.num_read,
-            "dropped": dict(sorted(captions.dropped.items())),
-            "accepted": captions.num_accepted,
-            "released": released,
-            "frame_not_selected": not_selected,
-            "flight_left_out": captions.num_accepted - released - not_selected,
-        },
-    }
-    assert history["flights"]["inspected"] == len(results) + sum(gone.values()), history
-    assert history["captions"]["flight_left_out"] >= 0, history
+    results = [record.result for record in finished.kept]
+    gone = left_out | {f"failed: {code}": count for code, count in finished.tally.failed.items()}
+    released = sum(result["captions"] for result in results)
+    not_selected = sum(result["captions_not_selected"] for result in results)
+    history = History(
+        trajectories=inspection.funnel.trajectories,
+        flights=FlightHistory(inspected=len(inspection.flights), released=len(results), left_out=gone),
+        captions=CaptionHistory(
+            read=captions.num_read,
+            dropped=dict(sorted(captions.dropped.items())),
+            accepted=captions.num_accepted,
+            released=released,
+            frame_not_selected=not_selected,
+            flight_left_out=captions.num_accepted - released - not_selected,
+        ),
+    )
+    assert history.flights.inspected == len(results) + sum(gone.values()), history
+    assert history.captions.flight_left_out >= 0, history
     return history
 
 
-def write_records(
-    folder: Path, shards: list[Path], results: dict[str, dict], history: dict[str, Any], cfg: ReleaseConfig
-) -> None:
-    """Write release.json, the card and the checksums of a folder that holds its shards."""
+def make_record(
+    folder: Path,
+    shards: list[Path],
+    results: dict[str, dict],
+    history: History,
+    maps: list[ReleasedMap],
+    cfg: ReleaseConfig,
+) -> ReleaseRecord:
+    """Give what release.json says of a folder that holds its shards."""
     listed = [
-        {
-            "path": shard.relative_to(folder).as_posix(),
-            "rows": pq.read_metadata(shard).num_rows,
-            "bytes": shard.stat().st_size,
-            "sha256": sha256_file(shard),
-        }
+        Shard(
+            path=shard.relative_to(folder).as_posix(),
+            rows=pq.read_metadata(shard).num_rows,
+            bytes=shard.stat().st_size,
+            sha256=sha256_file(shard),
+        )
         for shard in shards
     ]
-    record = {
-        "schema": RELEASE_SCHEMA,
-        "schema_version": RELEASE_VERSION,
-        "name": cfg.name,
-        "licence": cfg.licence,
-        "credits": cfg.credits,
-        "made_by": f"cosfly {cosfly.__version__}",
-        "settings": {"num_frames": cfg.num_frames, "tracks": list(cfg.tracks), "modalities": list(cfg.modalities)},
-        "frame_selection": RULE,
-        "coordinates": columns.CONTRACT,
-        "numbers": compute_numbers(shards, cfg.num_frames),
-        "history": history,
-        "flights": [
-            {"flight": item_id, "frames": result["frames"], "frames_available": result["frames_available"]}
+    return ReleaseRecord(
+        name=cfg.name,
+        licence=choose_licence(cfg, {shown.town: shown.licence for shown in maps}),
+        credits=cfg.credits,
+        maps=maps,
+        made_by=f"cosfly {cosfly.__version__}",
+        settings=Settings(num_frames=cfg.num_frames, tracks=list(cfg.tracks), modalities=list(cfg.modalities)),
+        frame_selection=RULE,
+        coordinates=columns.CONTRACT,
+        numbers=compute_numbers(shards, cfg.num_frames),
+        history=history,
+        flights=[
+            ReleasedFlight(flight=item_id, frames=result["frames"], frames_available=result["frames_available"])
             for item_id, result in results.items()
         ],
-        "shards": listed,
-    }
-    write_json(folder / "release.json", record)
+        shards=listed,
+    )
+
+
+def write_records(folder: Path, record: ReleaseRecord) -> None:
+    """Write release.json, the card and the checksums beside the shards."""
+    write_record(folder / "release.json", record)
     write_bytes(folder / "README.md", render_card(record).encode())
-    digests = {str(entry["path"]): str(entry["sha256"]) for entry in listed}
+    digests = {shard.path: shard.sha256 for shard in record.shards}
     for name in ("release.json", "README.md"):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)

@@ -5,16 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosfly.store import check_schema, read_json, validation_errors
-from release.columns import Modality
+from cosfly.products.inspection import TrajectoryFunnel
+from cosfly.products.town import TownMap
+from cosfly.store import read_model, write_model
+from release.columns import CAPTION_FIELDS, Modality
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
 
+Counts = dict[str, int]
+
 
 class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Shard(Strict):
@@ -34,6 +38,12 @@ class ReleasedFlight(Strict):
     frames_available: int
 
 
+class ReleasedMap(TownMap):
+    """The map of one town of the tree."""
+
+    town: str
+
+
 class Settings(Strict):
     """The settings that change what is released."""
 
@@ -42,31 +52,122 @@ class Settings(Strict):
     modalities: list[Modality] = Field(min_length=1)
 
 
-class ReleaseRecord(Strict):
-    """The whole file. `numbers` can be computed from the shards; `history` can only add up."""
+class Spread(Strict):
+    """Mean, standard deviation (of the population), least, greatest and number of values."""
 
-    schema_: str = Field(alias="schema")
-    schema_version: str
+    count: int
+    mean: float | None
+    std: float | None
+    min: float | None
+    max: float | None
+
+
+class CaptionNumbers(Strict):
+    """Frames by what their captions say; `example` is the first caption, empty without any."""
+
+    frames_with: int
+    frames_without: int
+    with_label: int
+    decision_equals_label: int
+    decision: Counts
+    label: Counts
+    verdict: Counts
+    repair_strategy: Counts
+    teacher_kind: Counts
+    teacher_model: Counts
+    mean_characters: dict[str, float | None]
+    example: dict[str, str]
+
+    @model_validator(mode="after")
+    def _fields_are_whole(self) -> CaptionNumbers:
+        if set(self.mean_characters) != set(CAPTION_FIELDS):
+            raise ValueError("mean_characters must name every caption column")
+        if self.example and set(self.example) != {"sample_id", *CAPTION_FIELDS}:
+            raise ValueError("example must name sample_id and every caption column")
+        return self
+
+
+class FileNumbers(Strict):
+    shards: int
+    bytes: int
+    bytes_by_modality: Counts
+
+
+class Numbers(Strict):
+    """Every number of the card; all can be computed from the shards."""
+
+    frames: int
+    flights: int
+    trajectories: int
+    frames_by: dict[str, Counts]
+    trajectories_by_fov_deg: Counts
+    flights_by_track: Counts
+    frames_per_flight: Spread
+    flights_shorter_than_num_frames: int
+    flight_duration_s: Spread
+    flight_length_m: Spread
+    height_over_target_m: Spread
+    distance_to_target_m: Spread
+    visibility: Spread
+    frames_perturbed: int
+    frames_target_in_view: int
+    frames_target_visible: int
+    captions: CaptionNumbers
+    files: FileNumbers
+
+
+class FlightHistory(Strict):
+    """inspected = released + left_out, by reason."""
+
+    inspected: int
+    released: int
+    left_out: Counts
+
+
+class CaptionHistory(Strict):
+    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + flight_left_out."""
+
+    read: int
+    dropped: Counts
+    accepted: int
+    released: int
+    frame_not_selected: int
+    flight_left_out: int
+
+
+class History(Strict):
+    """What the shards cannot tell: where all flights and captions went. It can only add up."""
+
+    trajectories: TrajectoryFunnel
+    flights: FlightHistory
+    captions: CaptionHistory
+
+
+class ReleaseRecord(Strict):
+    """The whole file."""
+
     name: str
     licence: str
     credits: str
+    maps: list[ReleasedMap] = []  # older releases name theirs in `credits`
     made_by: str
     settings: Settings
     frame_selection: str
     coordinates: dict[str, Any]
-    numbers: dict[str, Any]
-    history: dict[str, dict[str, Any]]
+    numbers: Numbers
+    history: History
     flights: list[ReleasedFlight]
     shards: list[Shard]
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """Read `release.json` as plain data of a checked shape.
+def write_record(path: Path, record: ReleaseRecord) -> None:
+    write_model(path, record, schema=RELEASE_SCHEMA, version=RELEASE_VERSION)
+
+
+def read_record(path: Path) -> ReleaseRecord:
+    """Read `release.json`.
 
     Raises:
         InputError: names the file and the field.
     """
-    record = check_schema(read_json(path, what="release record"), RELEASE_SCHEMA, RELEASE_VERSION, path)
-    with validation_errors(path):
-        ReleaseRecord.model_validate(record)
-    return record
+    return read_model(path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record")

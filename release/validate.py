@@ -7,7 +7,7 @@ target projected again from pose and intrinsics; every picture decoded.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ from cosfly.store import CHECKSUMS, inside, read_checksums, sha256_file
 from release import columns
 from release.card import compute_numbers, read_rows, render_card
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, FILES, POINT, WINDOW
-from release.record import read_record
+from release.record import ReleaseRecord, read_record
 from release.subsample import select_frames
 
 REPROJECTION_TOLERANCE_PX = 0.5
@@ -53,7 +53,7 @@ def verify(folder: Path, *, pixels: Pixels = "all") -> Report:
     _check_checksums(folder, record, report)
     readable = _readable(folder, shards, record, report)
     _check_sums(record, report)
-    if readable == [entry["path"] for entry in record["shards"]]:
+    if readable == [entry.path for entry in record.shards]:
         paths = [folder / name for name in readable]
         checks = [_check_rows, _check_numbers, *([_check_pictures] if pixels == "all" else [])]
         for check in checks:
@@ -69,7 +69,7 @@ def verify(folder: Path, *, pixels: Pixels = "all") -> Report:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _read_record(folder: Path, report: Report) -> dict[str, Any] | None:
+def _read_record(folder: Path, report: Report) -> ReleaseRecord | None:
     """Read release.json; None, with findings, when nothing else can be checked."""
     if not folder.is_dir():
         report.error("missing", folder, "no such folder", "a release folder")
@@ -82,9 +82,9 @@ def _read_record(folder: Path, report: Report) -> dict[str, Any] | None:
         return None
 
 
-def _check_names_and_sizes(folder: Path, record: dict, report: Report) -> list[str]:
+def _check_names_and_sizes(folder: Path, record: ReleaseRecord, report: Report) -> list[str]:
     """Compare the files that are there with those that should be; give the shards that are there."""
-    listed = {entry["path"]: entry for entry in record["shards"]}
+    listed = {entry.path: entry for entry in record.shards}
     found = {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -96,19 +96,19 @@ def _check_names_and_sizes(folder: Path, record: dict, report: Report) -> list[s
         report.error("unexpected", name, "a file", "nothing: release.json does not know it")
     for name in sorted(listed.keys() & found):
         size = (folder / name).stat().st_size
-        if size != listed[name]["bytes"]:
-            report.error("size", name, f"{size} bytes", f"{listed[name]['bytes']} bytes")
+        if size != listed[name].bytes:
+            report.error("size", name, f"{size} bytes", f"{listed[name].bytes} bytes")
     report.facts.append(f"{len(found)} files, {sum((folder / name).stat().st_size for name in found):,} bytes")
     return [name for name in listed if name in found]
 
 
-def _check_checksums(folder: Path, record: dict, report: Report) -> None:
+def _check_checksums(folder: Path, record: ReleaseRecord, report: Report) -> None:
     try:
         digests = read_checksums(folder)
     except InputError as error:
         report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
         return
-    listed = {entry["path"]: entry["sha256"] for entry in record["shards"]}
+    listed = {entry.path: entry.sha256 for entry in record.shards}
     for name in sorted({*listed, "README.md", "release.json"} ^ set(digests)):
         place = "only in release.json" if name in listed else "only in one of the lists"
         report.error("checksum", f"{CHECKSUMS}: {name}", place, "one line per file")
@@ -123,10 +123,10 @@ def _check_checksums(folder: Path, record: dict, report: Report) -> None:
             report.error("checksum", f"release.json: shards: {name}", listed[name], digest)
 
 
-def _readable(folder: Path, names: list[str], record: dict, report: Report) -> list[str]:
+def _readable(folder: Path, names: list[str], record: ReleaseRecord, report: Report) -> list[str]:
     """Open every shard; give those that have the release's columns and number of rows."""
-    rows = {entry["path"]: entry["rows"] for entry in record["shards"]}
-    expected = columns.schema(record["settings"]["modalities"])
+    rows = {entry.path: entry.rows for entry in record.shards}
+    expected = columns.schema(record.settings.modalities)
     good = []
     for name in names:
         try:
@@ -151,10 +151,10 @@ def _readable(folder: Path, names: list[str], record: dict, report: Report) -> l
 # --- the numbers ------------------------------------------------------------------------------------------------------
 
 
-def _check_numbers(paths: list[Path], record: dict, report: Report) -> None:
+def _check_numbers(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Compute every number again and compare."""
-    computed = _flat(compute_numbers(paths, record["settings"]["num_frames"]))
-    written = _flat(record["numbers"])
+    computed = _flat(compute_numbers(paths, record.settings.num_frames).model_dump())
+    written = _flat(record.numbers.model_dump())
     for name in sorted(computed.keys() | written.keys()):
         if computed.get(name) != written.get(name):
             report.error("number", f"release.json: numbers.{name}", written.get(name), f"{computed.get(name)}")
@@ -170,43 +170,32 @@ def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _check_sums(record: dict, report: Report) -> None:
+def _check_sums(record: ReleaseRecord, report: Report) -> None:
     """What the shards cannot tell must at least add up."""
-    try:
-        planned, flights, captions = (record["history"][key] for key in ("trajectories", "flights", "captions"))
-        numbers = record["numbers"]
-        sums = (
-            ("trajectories.planned", planned["planned"],
-             sum(planned["dropped"].values()) + planned["not_rendered"] + planned["rendered"]),
-            ("trajectories.rendered", planned["rendered"],
-             planned["accepted"] + planned["review"] + planned["rejected"]),
-            ("flights.inspected", flights["inspected"], flights["released"] + sum(flights["left_out"].values())),
-            ("flights.released", flights["released"], numbers["flights"]),
-            ("captions.read", captions["read"], captions["accepted"] + sum(captions["dropped"].values())),
-            ("captions.accepted", captions["accepted"],
-             captions["released"] + captions["frame_not_selected"] + captions["flight_left_out"]),
-            ("captions.released", captions["released"], numbers["captions"]["frames_with"]),
-        )  # fmt: skip
-    except (KeyError, TypeError, AttributeError) as error:
-        report.error("record", "release.json: history", f"{type(error).__name__}: {error}", "the account of the build")
-        return
+    planned, flights, captions = record.history.trajectories, record.history.flights, record.history.captions
+    sums = (
+        ("trajectories.planned", planned.planned,
+         sum(planned.dropped.values()) + planned.not_rendered + planned.rendered),
+        ("trajectories.rendered", planned.rendered, planned.accepted + planned.review + planned.rejected),
+        ("flights.inspected", flights.inspected, flights.released + sum(flights.left_out.values())),
+        ("flights.released", flights.released, record.numbers.flights),
+        ("captions.read", captions.read, captions.accepted + sum(captions.dropped.values())),
+        ("captions.accepted", captions.accepted,
+         captions.released + captions.frame_not_selected + captions.flight_left_out),
+        ("captions.released", captions.released, record.numbers.captions.frames_with),
+    )  # fmt: skip
     for name, whole, parts in sums:
         if whole != parts:
             report.error("sum", f"release.json: history.{name}", whole, f"{parts}, the sum of its parts")
 
 
-def _check_card(folder: Path, record: dict, report: Report) -> None:
+def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
     """The card must be the one that release.json gives, to the letter."""
     path = folder / "README.md"
     if not path.is_file():
         return
-    try:
-        expected = render_card(record)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        report.error("record", "release.json", f"{type(error).__name__}: {error}", "all that the card needs")
-        return
     found = path.read_text(encoding="utf-8", errors="replace").split("\n")
-    wanted = expected.split("\n")
+    wanted = render_card(record).split("\n")
     for number in range(max(len(found), len(wanted))):
         pair = [lines[number] if number < len(lines) else "the end" for lines in (found, wanted)]
         if pair[0] != pair[1]:
@@ -216,9 +205,9 @@ def _check_card(folder: Path, record: dict, report: Report) -> None:
 # --- the rows ---------------------------------------------------------------------------------------------------------
 
 
-def _check_rows(paths: list[Path], record: dict, report: Report) -> None:
+def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Check ids, frame selection, captions and the projection of the target, flight by flight."""
-    flights = {entry["flight"]: entry for entry in record["flights"]}
+    flights = {entry.flight: entry for entry in record.flights}
     frames: dict[str, list[int]] = {}
     seen: set[tuple[str, str]] = set()
     num_projected, worst_px = 0, 0.0
@@ -242,8 +231,8 @@ def _check_rows(paths: list[Path], record: dict, report: Report) -> None:
         entry = flights.get(_listed(flight, flights) or "")
         if entry is None:
             continue
-        expected_indices = select_frames(entry["frames_available"], record["settings"]["num_frames"]).tolist()
-        if indices != expected_indices or len(indices) != entry["frames"]:
+        expected_indices = select_frames(entry.frames_available, record.settings.num_frames).tolist()
+        if indices != expected_indices or len(indices) != entry.frames:
             got = f"{len(indices)} frames, first {indices[:3]}"
             report.error("frames", flight, got, f"{len(expected_indices)} frames by the rule of release.json")
     report.facts.append(
@@ -251,7 +240,7 @@ def _check_rows(paths: list[Path], record: dict, report: Report) -> None:
     )
 
 
-def _listed(flight: str, flights: dict[str, dict]) -> str | None:
+def _listed(flight: str, flights: Iterable[str]) -> str | None:
     """Give the folder name in release.json of a flight: the tree may stand deeper than the town."""
     return next((name for name in flights if name == flight or name.endswith(f"/{flight}")), None)
 
@@ -288,9 +277,9 @@ def projection_error_px(row: dict[str, Any]) -> float | None:
 # --- the pictures -----------------------------------------------------------------------------------------------------
 
 
-def _check_pictures(paths: list[Path], record: dict, report: Report) -> None:
+def _check_pictures(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Decode every picture and compare its size with the row's."""
-    modalities = record["settings"]["modalities"]
+    modalities = record.settings.modalities
     count = 0
     for row in _picture_rows(paths, modalities):
         size = (row["height_px"], row["width_px"])
@@ -304,7 +293,7 @@ def _check_pictures(paths: list[Path], record: dict, report: Report) -> None:
     report.facts.append(f"{count:,} pictures decoded")
 
 
-def _picture_rows(paths: list[Path], modalities: list[str]) -> Iterator[dict[str, Any]]:
+def _picture_rows(paths: list[Path], modalities: list[columns.Modality]) -> Iterator[dict[str, Any]]:
     wanted = ["town", "sample_id", "width_px", "height_px", *(FILES[modality][0] for modality in modalities)]
     for path in paths:
         with pq.ParquetFile(path) as file:

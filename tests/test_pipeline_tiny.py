@@ -11,7 +11,7 @@ import pytest
 
 from cosfly import pipeline
 from cosfly.config import load
-from cosfly.errors import ResumeError
+from cosfly.errors import ConfigError, ResumeError
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
@@ -57,6 +57,19 @@ def begin(base: Path, out: Path, stage: str) -> Path:
 
 def work(cfg: RunConfig, out: Path, stage: str) -> None:
     next(s for s in pipeline.stages(cfg, out) if s.name == stage).work()
+
+
+def test_the_licence_of_the_map_reaches_the_card(base):
+    card = (base / "release/dataset/README.md").read_text(encoding="utf-8")
+    assert "license: apache-2.0\n" in card
+    assert "Map of SynthTown: SynthTown, licence apache-2.0." in card
+
+
+def test_a_run_that_may_not_be_released_is_refused_before_it_begins(tmp_path):
+    cfg = load(RunConfig, None, [*TINY, "maps.source=cityjson", "maps.cityjson.path=/nowhere.json"])
+    with pytest.raises(ConfigError, match=r"release\.licence.*cityjson: unknown"):
+        pipeline.run(cfg, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_every_stage_is_complete_and_adds_up(base):

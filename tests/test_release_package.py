@@ -15,8 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError, NothingKept
+from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.issues import Issue
+from cosfly.products.boxes import MapHeader
 from cosfly.products.captions import Caption, Coc, Prompt, write_captions
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
@@ -28,14 +29,16 @@ from cosfly.products.inspection import (
     write_inspection,
 )
 from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.town import write_town_map
 from cosfly.store import read_json, sha256_file, write_json
 from release.card import render_card, size_category
 from release.package import ReleaseConfig, plan_shards, run
+from release.record import read_record
 from release.validate import picture_problem, verify
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
-CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.")
+CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", licence="cc-by-4.0")
 
 REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 
@@ -225,7 +228,7 @@ def test_the_account_names_every_flight_and_caption(built):
 
 
 def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
-    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",)))
+    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), licence="cc-by-4.0"))
     record = read_json(folder / "release.json")
     assert [flight["frames"] for flight in record["flights"]] == [NUM_POINTS] * 4
     assert record["numbers"]["flights_shorter_than_num_frames"] == 4
@@ -259,6 +262,57 @@ def test_shards_hold_whole_row_groups_in_order(built):
         file = pq.ParquetFile(built / entry["path"])
         assert b"huggingface" in file.schema_arrow.metadata
         assert file.metadata.num_rows == entry["rows"]
+
+
+# --- whose it is ------------------------------------------------------------------------------------------------------
+
+
+def with_maps(inputs: Path, copy: Path, **licences: str) -> Path:
+    shutil.copytree(inputs, copy)
+    for town, licence in licences.items():
+        write_town_map(copy / "tree" / town, MapHeader(name=f"A {town}", licence=licence, credits="Made by M."))
+    return copy
+
+
+def test_a_release_takes_the_licence_of_its_maps(inputs, tmp_path):
+    source = with_maps(inputs, tmp_path / "in", Town01="mit", Town02="mit")
+    folder = build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
+    record = read_json(folder / "release.json")
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    assert record["licence"] == "mit"
+    assert record["maps"][0] == {"name": "A Town01", "licence": "mit", "credits": "Made by M.", "town": "Town01"}
+    assert "license: mit\n" in card
+    assert "Map of Town02: A Town02, licence mit. Made by M." in card
+    assert "Map: a specimen." in card
+    assert verify(folder).is_ok
+
+
+def test_another_licence_for_the_data_set_still_names_the_maps(inputs, tmp_path):
+    source = with_maps(inputs, tmp_path / "in", Town01="mit")
+    card = (build(source, tmp_path / "r") / "README.md").read_text(encoding="utf-8")
+    assert "license: cc-by-4.0\n" in card
+    assert "licence mit. Made by M." in card
+    assert "Map of Town02: Town02, licence unknown." in card
+
+
+@pytest.mark.parametrize(
+    ("licences", "got"),
+    [({}, "Town01: unknown, Town02: unknown"), ({"Town01": "mit"}, "Town02: unknown"),
+     ({"Town01": "mit", "Town02": "cc0-1.0"}, "Town01: mit, Town02: cc0-1.0")],
+)  # fmt: skip
+def test_a_release_without_a_licence_is_refused(inputs, tmp_path, licences, got):
+    source = with_maps(inputs, tmp_path / "in", **licences)
+    with pytest.raises(ConfigError, match=r"release\.licence") as caught:
+        build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
+    assert got in str(caught.value)
+    assert not (tmp_path / "r" / "dataset").exists()
+
+
+def test_releases_from_before_there_were_maps_in_the_record_verify(dataset):
+    edit_record(dataset, lambda r: r.pop("maps"))
+    card = re.sub(r"\n\nMap of [^\n]*", "", (dataset / "README.md").read_text(encoding="utf-8"))
+    (dataset / "README.md").write_text(card, encoding="utf-8")
+    assert codes(dataset) == {"checksum"}
 
 
 @given(st.lists(st.integers(1, 50), max_size=30), st.integers(1, 120))
@@ -360,8 +414,7 @@ def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
     card = dataset / "README.md"
     text = card.read_text(encoding="utf-8")
     places = [match.start() for match in re.finditer(r"\d", text)]
-    record = read_json(dataset / "release.json")
-    expected = render_card(record)
+    expected = render_card(read_record(dataset / "release.json"))
     assert text == expected
     for place in places[:: max(1, len(places) // 12)]:
         digit = str((int(text[place]) + 1) % 10)
@@ -376,7 +429,7 @@ def test_a_changed_number_is_found_even_with_fresh_checksums(dataset):
     record = read_json(dataset / "release.json")
     record["numbers"]["captions"]["frames_with"] += 1
     write_json(dataset / "release.json", record)
-    (dataset / "README.md").write_text(render_card(record), encoding="utf-8")
+    (dataset / "README.md").write_text(render_card(read_record(dataset / "release.json")), encoding="utf-8")
     text = (dataset / "checksums.sha256").read_text()
     for name in ("release.json", "README.md"):
         text = re.sub(rf"^\S+  {name}$", f"{sha256_file(dataset / name)}  {name}", text, flags=re.MULTILINE)

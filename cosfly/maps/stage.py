@@ -41,6 +41,11 @@ class MapsConfig(Config):
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
 
+    @property
+    def licence(self) -> str:
+        """What the chosen source says of its licence, for the map's header."""
+        return getattr(self, self.source).licence
+
     def recorded(self) -> dict[str, Any]:
         """Only the chosen source counts for resumption: the settings of the others change nothing."""
         others = SOURCES.keys() - {self.source}

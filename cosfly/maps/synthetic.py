@@ -68,6 +68,10 @@ class SyntheticConfig(Config):
             )
         return self
 
+    @property
+    def licence(self) -> str:
+        return OUR_LICENCE
+
     def inputs(self) -> dict[str, Path]:
         return {}
 

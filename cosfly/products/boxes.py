@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.columns import rounded
 from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
-from cosfly.store import check_schema, dump_json, read_json, write_bytes
+from cosfly.store import check_schema, dump_json, read_json, validation_errors, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
 COMPUTED = (
@@ -258,12 +258,8 @@ def read_boxes(path: Path) -> BoxMap:
 
 
 def _read_header(value: dict, path: Path) -> MapHeader:
-    try:
+    with validation_errors(path):
         return MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(str(part) for part in detail["loc"])
-        raise InputError(detail["msg"], where=f"{path}: {field}", got=repr(detail["input"])[:80]) from None
 
 
 def _vectors(records: list[dict], name: str, path: Path) -> np.ndarray:

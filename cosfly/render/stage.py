@@ -21,6 +21,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.frames import Camera, Look
+from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID, SHARED_ID, InstanceIds, Renderer, instance_ids
 from cosfly.render.flight import FlightScript, Writing, render_flight
@@ -196,10 +197,11 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, label="render")
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, _ids_record(box_map, instances), indent=None)
+    map_file = write_town_map(out / town, box_map.header)
     results = [record.result for record in finished.kept]
     outputs = [out / result["folder"] / name for result in results for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
-        [*outputs, ids_file],
+        [*outputs, ids_file, map_file],
         finished.tally,
         town=town,
         flights=results,
