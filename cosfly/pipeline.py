@@ -24,6 +24,7 @@ import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package
 from cosfly.gallery import contact_sheet, preview_gif
+from cosfly.planners.ahead import compiled_ahead
 from cosfly.settings import RunConfig, num_workers
 from cosfly.stage_folder import Manifest, Resume, read_manifest
 from cosfly.store import read_json, write_bytes, write_json
@@ -81,11 +82,14 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     todo = stages(cfg, out, resume=resume)
     _save_run(cfg, out)
     results = []
-    for number, stage in enumerate(todo, 1):
-        was_complete = (out / stage.name / "manifest.json").exists()
-        log.info("[%d/%d] %s%s", number, len(todo), stage.name, ": already complete" if was_complete else "")
-        stage.work()
-        results.append(StageResult(stage, read_manifest(out / stage.name), was_complete))
+    with compiled_ahead(cfg.plan.planner) as wait_for_compiled:
+        for number, stage in enumerate(todo, 1):
+            was_complete = (out / stage.name / "manifest.json").exists()
+            log.info("[%d/%d] %s%s", number, len(todo), stage.name, ": already complete" if was_complete else "")
+            if stage.name == "plan" and not was_complete:
+                wait_for_compiled()
+            stage.work()
+            results.append(StageResult(stage, read_manifest(out / stage.name), was_complete))
     tree = out / "render"
     if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
         contact_sheet(tree, out / "contact_sheet.png")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cosfly
 from cosfly import compiled
+from cosfly.planners import ahead
 
 DAY_S = 86400.0
 
@@ -52,3 +53,38 @@ def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     compiled.use_own_cache(tmp_path / "file", "own", 0.0)
     assert compiled.numba.config.CACHE_DIR == "as it was"
+
+
+# --- ahead of use -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_compiled_ahead_is_found_by_the_planner(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the spare process
+    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(ahead, "WAIT_MAX_S", 600.0)
+    with ahead.compiled_ahead("muco") as wait:
+        wait()
+    assert (tmp_path / "muco.compiled").exists()
+    code = "import cosfly.planners.stage as s\ns.warm_up(s.PlanConfig())\nfrom cosfly.planners.muco.step import descend as d\nprint(len(d.stats.cache_hits), len(d.stats.cache_misses))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "0"]
+    monkeypatch.setattr(ahead.subprocess, "Popen", None)
+    with ahead.compiled_ahead("muco") as wait:  # nothing is started where it was done before
+        wait()
+
+
+def test_the_spare_process_ends_with_the_one_that_started_it(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "cosfly.planners.ahead", "muco"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as spare:
+        spare.stdin.close()
+        assert spare.wait(60) == 1
+    assert not (tmp_path / "muco.compiled").exists()
+
+
+def test_a_run_goes_on_without_a_spare_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
+    for broken in ("/nowhere/python", "false"):
+        monkeypatch.setattr(ahead.sys, "executable", broken)
+        with ahead.compiled_ahead("muco") as wait:
+            wait()

@@ -148,20 +148,27 @@ def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: 
         size = 1
         while size > 0:
             size -= 1
-            start, stop = stack[size]
+            start, stop = stack[size, 0], stack[size, 1]
             part = order[start:stop].copy()
-            labels[part] = part.min()
+            lowest = part.min()
+            for row in part:
+                labels[row] = lowest
             if len(part) == 1 or min_fill[part[0]] <= 0.0:
                 continue
             low, high = mins[part[0]].copy(), maxs[part[0]].copy()
-            for row in part:
+            members = np.empty((len(part), rectangles.shape[1]))
+            for place, row in enumerate(part):
                 for k in range(2):
                     low[k] = min(low[k], mins[row, k])
                     high[k] = max(high[k], maxs[row, k])
-            if fill_share(rectangles[part], low, high) >= min_fill[part[0]]:
+                for k in range(rectangles.shape[1]):
+                    members[place, k] = rectangles[row, k]
+            if fill_share(members, low, high) >= min_fill[part[0]]:
                 continue
             axis = 0 if high[0] - low[0] >= high[1] - low[1] else 1
-            order[start:stop] = part[np.argsort(rectangles[part, axis], kind="mergesort")]
+            ranks = np.argsort(members[:, axis], kind="mergesort")
+            for place in range(len(part)):
+                order[start + place] = part[ranks[place]]
             middle = (start + stop) // 2
             stack[size, 0], stack[size, 1] = start, middle
             stack[size + 1, 0], stack[size + 1, 1] = middle, stop

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.compiled import int64, njit
 from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box, window_rays
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 
@@ -103,15 +103,15 @@ def evaluate(points, problem, index, masked, state):
         points: (n, 3) m. masked: (n,) bool, waypoints in a low-visibility run: their visibility and view-angle terms stay in
             the loss but out of gradient and curvature.
     """
-    state.terms[:] = 0.0
-    state.gradient[:] = 0.0
-    state.visibility_gradient[:] = 0.0
-    state.contacts[:] = 0.0
-    state.rough[:] = 0.0
+    state.terms.fill(0.0)
+    state.gradient.fill(0.0)
+    state.visibility_gradient.fill(0.0)
+    state.contacts.fill(0.0)
+    state.rough.fill(0.0)
     chain_curvature(problem, state)
-    point_terms(points, 0, len(points), problem, index, masked, state)
+    point_terms(points, int64(0), len(points), problem, index, masked, state)
     visibility_terms(points, problem, index, masked, state)
-    chain_terms(points, 0, len(points), problem, state)
+    chain_terms(points, int64(0), len(points), problem, state)
     return state.terms.sum()
 
 
@@ -234,7 +234,7 @@ def visibility_terms(points, problem, index, masked, state):
 def chain_curvature(problem, state):
     """Set the curvature to that of smoothness, jerk and altitude oscillation: the same wherever the waypoints are."""
     band, num_points, weights = state.band, len(problem.targets), problem.weights
-    band[:] = 0.0
+    band.fill(0.0)
     for coefficients, weight in (
         (SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK]),
     ):  # fmt: skip
@@ -323,7 +323,7 @@ def difference_gradient(points, problem, index, masked, state, gradient):
     Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that flies at it.
     Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is overwritten.
     """
-    state.contacts[:] = 0.0
+    state.contacts.fill(0.0)
     for i in range(len(points)):
         for axis in range(3):
             losses, places = np.zeros(2), np.zeros(2)
@@ -333,7 +333,7 @@ def difference_gradient(points, problem, index, masked, state, gradient):
                 if axis == 2:
                     places[side] = min(max(places[side], problem.altitudes[0]), problem.altitudes[2])
                 points[i, axis] = places[side]
-                state.terms[:] = 0.0
+                state.terms.fill(0.0)
                 point_terms(points, i, i + 1, problem, index, masked, state)
                 chain_terms(points, i - 3, i + 1, problem, state)
                 losses[side] = state.terms.sum() - (state.terms[VIEW_ANGLE] if masked[i] else 0.0)

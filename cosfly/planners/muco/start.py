@@ -107,7 +107,8 @@ def _search(places, targets, times, extra, index, clearance_m, speed_max_mps):
                     - free_rays(index, blockers, count, p[0], p[1], p[2], x)
                 )
         if key == 0:
-            cost[0] = own
+            for c in range(num_places):
+                cost[0, c] = own[c]
             continue
         seconds = times[key] - times[key - 1]
         for c in range(num_places):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.compiled import boolean, int64, njit
 from cosfly.kernels import collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
 from cosfly.planners.muco.nearby import known, nearest_among, nearest_of, nothing_nearby
@@ -70,7 +70,7 @@ def solve_band(band, damping, gradient):
     """
     size, rows = 3 * len(gradient) - 6, BAND_ROWS
     factor, step = np.empty((size + rows, rows)), np.empty(size)  # factor[j, k]: row j + k, column j
-    factor[size:] = 0.0
+    factor[size:].fill(0.0)
     for j in range(size):
         for k in range(rows):
             factor[j, k] = band[k, j + 3] if j + k < size else 0.0
@@ -120,7 +120,7 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
         for axis in range(3):
             trial[i + 1, axis] = points[i + 1, axis] + share * steps[i, axis]
     loss = np.inf
-    if project(trial, problem, index, 1, len(trial) - 1, state.nearby):
+    if project(trial, problem, index, int64(1), len(trial) - 1, state.nearby):
         loss = evaluate(trial, problem, index, masked, state)
     return loss, longest > cap_m
 
@@ -153,21 +153,23 @@ def descend(points, problem, index, rules, states, history):
             difference_gradient(points, problem, index, masked, spare, smooth)
         if rules.is_paper:
             steps = _scaled_sum(smooth, now.visibility_gradient, -rules.learning_rate)[1:-1]
-            found, _ = try_step(points, steps, 1.0, rules.step_cap_m, False, problem, index, masked, spare, trial)
+            found, _ = try_step(
+                points, steps, 1.0, rules.step_cap_m, boolean(False), problem, index, masked, spare, trial
+            )
             num_tried += 1
         else:
             found = np.inf
             if rest == 0 and now.visibility_gradient.any():
                 slope = _scaled_sum(smooth, now.visibility_gradient, 1.0)
                 found, tried = newton_step(
-                    points, loss, slope, damping, TRIES_WITH_VISIBILITY, rules, problem, index, masked, now, spare, trial
+                    points, loss, slope, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now, spare, trial
                 )  # fmt: skip
                 num_tried += tried
                 rest, next_rest = (next_rest, min(2 * next_rest, REST_MAX)) if found == np.inf else (0, 1)
             rest = max(rest - 1, 0)
             if found == np.inf:
                 found, tried = newton_step(
-                    points, loss, smooth, damping, TRIES, rules, problem, index, masked, now, spare, trial
+                    points, loss, smooth, damping, int64(TRIES), rules, problem, index, masked, now, spare, trial
                 )
                 num_tried += tried
         if found == np.inf:
@@ -235,7 +237,7 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
         band[0, column] += DAMPING_LEAST
     hold_bounds(points, problem, now.contacts, band, gradient)
     raised = damping.copy()
-    steps, scale, as_a_whole = solve_band(band, raised, gradient), 1.0, False
+    steps, scale, as_a_whole = solve_band(band, raised, gradient), 1.0, boolean(False)
     for tried in range(1, num_tries + 1):
         found, is_capped = try_step(
             points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
