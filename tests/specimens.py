@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
@@ -20,7 +19,10 @@ from cosfly.products.frames import (
     PerturbationMeta,
     TargetMeta,
     camera_meta,
+    depth_bytes,
     frame_name,
+    instance_bytes,
+    rgb_bytes,
     tree_angles,
     tree_pose,
     tree_position,
@@ -268,11 +270,9 @@ def paint(scene: Scene, flight: Flight, i: int) -> tuple[np.ndarray, np.ndarray,
 def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
     rgb, depth, semantic, instance = paint(scene, flight, i)
     folder.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(folder / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    np.save(folder / "depth.npy", depth)
-    # OpenCV writes B, G, R: id high byte, id low byte, semantic tag.
-    coded = np.stack([(instance >> 8).astype(np.uint8), (instance & 255).astype(np.uint8), semantic], axis=-1)
-    cv2.imwrite(str(folder / "instance.png"), coded)
+    (folder / "rgb.png").write_bytes(rgb_bytes(rgb, 1))
+    (folder / "depth.npy").write_bytes(depth_bytes(depth))
+    (folder / "instance.png").write_bytes(instance_bytes(semantic, instance, 1))
     (folder / "meta.json").write_bytes(_meta(flight, i, int((instance == PERSON_ID).sum())).to_bytes())
 
 

@@ -106,6 +106,13 @@ def test_no_step_of_distill_imports_a_step(step):
     assert not imports(f"distill.{step}") & steps
 
 
+def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
+    importers = {
+        name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_(pos|rot)", path.read_text(), re.M)
+    }
+    assert importers == {"cosfly.products.frames", "cosfly.products.playback"}
+
+
 @pytest.mark.parametrize("name", sorted(SOURCES))
 def test_heavy_packages_are_imported_where_they_are_used(name):
     top = {n.split(".")[0] for n in imports(name, top_level_only=True)}

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from cosfly.errors import RenderError
 from cosfly.geometry import world_from_camera
-from cosfly.products.frames import (  # fmt: skip
-    Camera,
-    FrameMeta,
-    Look,
-    PerturbationMeta,
-    TargetMeta,
-    camera_meta,
-    frame_name,
-    tree_angles,
-    tree_pose,
-    tree_position,
-)
+from cosfly.products import frames
+from cosfly.products.frames import Camera, FrameMeta, Look, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
@@ -32,7 +19,7 @@ from cosfly.render.camera import TargetView, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Gait
 from cosfly.render.perturbation import Perturbed
-from cosfly.store import dump_json, sha256_bytes, sha256_file, storage_errors, write_checksums
+from cosfly.store import sha256_bytes, sha256_file, storage_errors, write_checksums, write_json
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight
@@ -105,7 +92,7 @@ def render_flight(
             digests.update(future.result())
     flight = _flight(script, seen)
     write_flight(folder, flight)
-    _write_text(folder / "perturbation_report.json", dump_json(_report(script.perturbed), indent=1) + "\n")
+    write_json(folder / "perturbation_report.json", _report(script.perturbed))
     for name in ("trajectory.json", "perturbation_report.json"):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)
@@ -125,9 +112,9 @@ def _look(frame: Frame, target_m: np.ndarray, pose: np.ndarray, camera: Camera, 
 def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
     """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
     makers: dict[str, tuple[str, Callable[[], bytes]]] = {
-        "rgb": ("rgb.png", lambda: png_bytes(frame.rgb[..., ::-1], writing.png_compression)),
-        "depth": ("depth.npy", lambda: npy_bytes(frame.depth)),
-        "instance": ("instance.png", lambda: png_bytes(instance_bgr(frame), writing.png_compression)),
+        "rgb": ("rgb.png", lambda: frames.rgb_bytes(frame.rgb, writing.png_compression)),
+        "depth": ("depth.npy", lambda: frames.depth_bytes(frame.depth)),
+        "instance": ("instance.png", lambda: frames.instance_bytes(frame.kinds, frame.ids, writing.png_compression)),
     }
     contents = {makers[m][0]: makers[m][1]() for m in writing.modalities}
     contents["meta.json"] = meta.to_bytes()
@@ -138,31 +125,6 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
             # No fsync here: the flight's folder gets its final name only when all of it is written.
             (target / file_name).write_bytes(data)
     return {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
-
-
-def png_bytes(bgr: np.ndarray, compression: int) -> bytes:
-    """Encode a picture, (h, w, 3) uint8 in OpenCV's order. Run-length strategy: half the time of the default, same size."""
-    settings = [cv2.IMWRITE_PNG_COMPRESSION, compression, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(bgr), settings)
-    if not ok:
-        raise RenderError("cannot encode a PNG", got=str(bgr.shape))
-    return data.tobytes()
-
-
-def npy_bytes(depth: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(depth), version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def instance_bgr(frame: Frame) -> np.ndarray:
-    """CARLA's encoding: R the kind, G the low and B the high byte of the id; in OpenCV's order B, G, R."""
-    return np.dstack([(frame.ids >> 8).astype(np.uint8), (frame.ids & 0xFF).astype(np.uint8), frame.kinds])
-
-
-def _write_text(path: Path, text: str) -> None:
-    with storage_errors(path):
-        path.write_text(text, encoding="utf-8")
 
 
 # --- annotations ------------------------------------------------------------------------------------------------------
@@ -176,10 +138,10 @@ def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=camera_meta(script.camera, NEAR_M, FAR_M),
-        drone_pose=tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
-        target=TargetMeta(
-            world_location=tree_position(perturbed.poses.targets_m[i]),
+        camera=frames.camera_meta(script.camera, NEAR_M, FAR_M),
+        drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
+        target=frames.TargetMeta(
+            world_location=frames.tree_position(perturbed.poses.targets_m[i]),
             half_extents_m=PERSON_HALF_EXTENTS_M,
             instance_id=PERSON_ID,
             semantic_id=KINDS["Pedestrians"],
@@ -191,11 +153,11 @@ def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
             visibility=round(seen.visibility, 6),
             num_pixels=seen.num_person_px,
         ),
-        perturbation=PerturbationMeta(
+        perturbation=frames.PerturbationMeta(
             **perturbed.states[i],
-            drone_position=tree_position(perturbed.drone_offsets_m[i]),
-            target_position=tree_position(perturbed.target_offsets_m[i]),
-            drone_rotation=tree_angles(perturbed.rotation_offsets_deg[i]),
+            drone_position=frames.tree_position(perturbed.drone_offsets_m[i]),
+            target_position=frames.tree_position(perturbed.target_offsets_m[i]),
+            drone_rotation=frames.tree_angles(perturbed.rotation_offsets_deg[i]),
         ),
         look=script.look,
     )

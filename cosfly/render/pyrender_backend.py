@@ -20,22 +20,8 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.render.contract import (  # fmt: skip
-    DEBIAN_PACKAGES,
-    FAR_M,
-    LAYER_STEP,
-    NEAR_M,
-    NO_INSTANCE,
-    PERSON_ID,
-    STANDING_LAYER,
-    Frame,
-    PosedPerson,
-    check_pose,
-    ground_plane,
-    instance_ids,
-    layers_of,
-    scene_origin,
-)
+from cosfly.render import contract
+from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedPerson
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
@@ -69,7 +55,7 @@ def _open_screen(width_px: int, height_px: int) -> Any:
         screen = pyrender.OffscreenRenderer(width_px, height_px)
     except Exception as error:  # PyOpenGL raises its own, pyrender's platforms bare assertions
         raise EnvironmentMissing(
-            "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {DEBIAN_PACKAGES}"
+            "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {contract.DEBIAN_PACKAGES}"
         ) from None
     screen._renderer._program_cache = ShaderProgramCache(str(Path(__file__).parent / "pyrender_shaders"))
     _keep_display(screen._platform)
@@ -92,7 +78,7 @@ class PyrenderRenderer:
         from OpenGL.GL import GL_RENDERER, glGetString
 
         self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
-        self._origin = scene_origin(box_map)
+        self._origin = contract.scene_origin(box_map)
         self._scene = pyrender.Scene()
         self._scene.add(self._mesh(*_all_boxes(box_map, self._origin)))
 
@@ -101,7 +87,7 @@ class PyrenderRenderer:
 
     def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
         """Draw one frame, as the contract says."""
-        check_pose(camera_pose, intrinsic)
+        contract.check_pose(camera_pose, intrinsic)
         import pyrender
 
         flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera looks along -z, y up
@@ -156,7 +142,7 @@ def _as_byte(linear: np.ndarray) -> np.ndarray:
 def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
     """What the vertex shader is given of kind, id and layer, (n, 4) float."""
     ids = ids.astype(np.int64)
-    return np.column_stack([kinds, ids & 255, ids >> 8, LAYER_STEP * layers]).astype(np.float32)
+    return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
 def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,7 +150,7 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndar
     import trimesh
 
     box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
-    center, half = ground_plane(box_map)
+    center, half = contract.ground_plane(box_map)
     centers = np.vstack([box_map.centers, center]) - origin
     halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
@@ -172,7 +158,9 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndar
     corners = np.einsum("nij,nvj->nvi", turns, halves[:, None] * box.vertices) + centers[:, None]
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
-    tags = _tags(kinds, np.append(instance_ids(box_map).ids, NO_INSTANCE), np.append(layers_of(box_map), 0))
+    tags = _tags(
+        kinds, np.append(contract.instance_ids(box_map).ids, NO_INSTANCE), np.append(contract.layers_of(box_map), 0)
+    )
     num_faces = len(box.faces)
     triangles = corners[:, box.faces].reshape(-1, 3, 3)
     return triangles, np.repeat(table[kinds], num_faces, axis=0), np.repeat(tags, num_faces, axis=0)
@@ -197,7 +185,7 @@ def _figure(person: PosedPerson, origin: np.ndarray) -> tuple[np.ndarray, np.nda
     feet = person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M] - origin
     triangles = np.concatenate([solid.triangles for solid in solids]) @ turn.T + feet
     painted = np.concatenate([np.tile(color, (len(s.faces), 1)) for s, color in zip(solids, colors, strict=True)])
-    tag = _tags(np.array([KINDS["Pedestrians"]]), np.array([PERSON_ID]), np.array([STANDING_LAYER]))
+    tag = _tags(np.array([KINDS["Pedestrians"]]), np.array([contract.PERSON_ID]), np.array([contract.STANDING_LAYER]))
     return triangles, painted, np.repeat(tag, len(triangles), axis=0)
 
 
