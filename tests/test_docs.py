@@ -1,7 +1,8 @@
-"""The README is true: every command has help and stands in it, and what it names exists."""
+"""The documents are true: every command has help and stands in the README, and what they name exists."""
 
 import re
 import shlex
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -69,3 +70,68 @@ def test_links_and_pictures_exist():
 def test_ci_runs_a_command_of_the_readme():
     (command,) = [line for line in (ROOT / ".ci/run").read_text().splitlines() if line.startswith("make")]
     assert f"`{command}`" in README
+
+
+# --- the documents and the disk ---------------------------------------------------------------------------------------
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FOLDERS = ("cosfly", "caption", "distill", "release", "configs", "tests")
+CODE = "\n".join(p.read_text(encoding="utf-8") for f in FOLDERS[:4] for p in sorted((ROOT / f).rglob("*.py")))
+
+
+def tree_of(text: str) -> list[str]:
+    """Files of a drawn tree, as paths; the depth is the indentation, and a folder ends with a slash."""
+    found, above = [], []
+    for indent, name in re.findall(r"^    ( *)(\S+)  +\S.*$", text, re.M):
+        above = [*above[: len(indent) // 2], name]
+        if not name.endswith("/"):
+            found.append("".join(above))
+    return found
+
+
+def test_a_drawn_tree_is_read_by_its_indentation():
+    text = "    a/      one\n      b/    two\n        c.py  three\n      d.py  four\n    e.py    five\n"
+    assert tree_of(text) == ["a/b/c.py", "a/d.py", "e.py"]
+
+
+def test_the_tree_of_the_architecture_is_the_disk():
+    drawn = tree_of(
+        (ROOT / "docs/architecture.md").read_text(encoding="utf-8").partition("## The tree")[2].partition("\n## ")[0]
+    )
+    disk = {
+        str(p.relative_to(ROOT))
+        for folder in FOLDERS
+        for p in (ROOT / folder).rglob("*")
+        if p.is_file() and p.name != "__init__.py" and p.suffix != ".pyc"
+    }
+    shown = {name: {p for p in disk if fnmatch(p, name) and p.count("/") == name.count("/")} for name in drawn}
+    assert [name for name, files in shown.items() if not files] == []
+    assert sorted(disk - set().union(*shown.values())) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_paths_exist(page):
+    text = page.read_text(encoding="utf-8")
+    words = set(
+        re.findall(
+            rf"(?<![\w./-])(?:{'|'.join((*FOLDERS, 'docs'))})/[\w./-]*(?:\.(?:py|glsl|txt|md|yaml)\b|/(?![\w<*]))", text
+        )
+    )
+    assert sorted(word for word in words if not (ROOT / word).exists() and not is_made_by_a_run(word)) == []
+
+
+def is_made_by_a_run(word: str) -> bool:
+    """`release/dataset/` is a folder of a run, not of the repository."""
+    return word in ("release/dataset/", "caption/answers/")
+
+
+def test_every_file_of_the_files_page_is_written_by_code():
+    words = re.findall(
+        r"`([\w./-]+\.(?:json|jsonl|html|png|gif|npy|md|sha256|yaml|pt))`", (ROOT / "docs/files.md").read_text()
+    )
+    names = {word.rpartition("/")[2] for word in words}
+    elsewhere = {f"{split}.jsonl" for split in ("train", "val", "test")} | {
+        "roi_polygon.json"
+    }  # named by a loop; a user's own
+    assert len(names) > 40
+    assert sorted(name for name in names - elsewhere if f'{name}"' not in CODE and f"{name}'" not in CODE) == []
