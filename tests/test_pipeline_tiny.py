@@ -96,6 +96,13 @@ def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):
     assert [c.sample_id for c in captions] == sorted(c.sample_id for c in captions)
 
 
+def test_every_file_of_a_run_stands_in_the_files_page(base):
+    page = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
+    names = {path.name for path in base.rglob("*") if path.is_file()}
+    assert len(names) > 30
+    assert sorted(name for name in names if name not in page and not name.endswith(".parquet")) == []
+
+
 def test_running_again_changes_nothing(base):
     before = {
         p: p.stat().st_mtime_ns for p in base.rglob("*") if p.is_file() and p.name not in ("run.yaml", "summary.json")
