@@ -49,6 +49,9 @@ class Report:
     def error(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("error", code, where, got, expected)
 
+    def warn(self, code: str, where: object, got: object, expected: str) -> None:
+        self.add("warning", code, where, got, expected)
+
     def extend(self, issues: Iterable[Issue]) -> None:
         self.issues.extend(issues)
 

@@ -49,10 +49,12 @@ STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0
 # --- what became of the items -----------------------------------------------------------------------------------------
 
 
-class Kept(BaseModel):
-    """A line of `items.jsonl`: the item is done; `result` is the stage's own."""
-
+class _Record(BaseModel):
     model_config = ConfigDict(frozen=True)
+
+
+class Kept(_Record):
+    """A line of `items.jsonl`: the item is done; `result` is the stage's own."""
 
     id: str
     status: Literal["kept"] = "kept"
@@ -60,10 +62,8 @@ class Kept(BaseModel):
     seconds: float = 0.0
 
 
-class Dropped(BaseModel):
+class Dropped(_Record):
     """A line of `items.jsonl`: the item is done, and a rule of the stage leaves it out."""
-
-    model_config = ConfigDict(frozen=True)
 
     id: str
     status: Literal["dropped"] = "dropped"
@@ -72,10 +72,8 @@ class Dropped(BaseModel):
     seconds: float = 0.0
 
 
-class Failed(BaseModel):
+class Failed(_Record):
     """A line of `items.jsonl`, and without its status of `failures.jsonl`: the item will be tried again."""
-
-    model_config = ConfigDict(frozen=True)
 
     id: str
     status: Literal["failed"] = "failed"
@@ -132,14 +130,14 @@ class Tally(BaseModel):
 # --- what stands in the folder ----------------------------------------------------------------------------------------
 
 
-class StageInput(BaseModel):
+class StageInput(_Record):
     """A file or folder that a stage reads."""
 
     path: str
     sha256: str
 
 
-class StageRecord(BaseModel):
+class StageRecord(_Record):
     """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on."""
 
     stage: str
@@ -154,7 +152,7 @@ class StageRecord(BaseModel):
         return {name: value for name, value in dump(self).items() if value or name != "resumed_with_other"}
 
 
-class Output(BaseModel):
+class Output(_Record):
     """A file of a finished stage, its path relative to the stage folder."""
 
     path: str

@@ -189,14 +189,8 @@ def run(
     Raises:
         NothingKept: no caption can be used. InputError: there are too few trajectories to split.
     """
-    stage = StageFolder.open(
-        out,
-        "distill.prepare",
-        config=cfg,
-        inputs={"captions": captions, "data": data},
-        seed=seed,
-        resume=resume,
-    )
+    inputs = {"captions": captions, "data": data}
+    stage = StageFolder.open(out, "distill.prepare", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
     excluded = Counter[str]()

@@ -335,14 +335,8 @@ def run(
     """
     require("torch", "transformers", "peft")
     weights = weight_files(model)
-    stage = StageFolder.open(
-        out,
-        STAGE,
-        config=cfg,
-        inputs={"dataset": dataset, "data": data, **weights},
-        seed=seed,
-        resume=resume,
-    )
+    inputs = {"dataset": dataset, "data": data, **weights}
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     adapter = out / "adapter"
     if stage.is_complete:
         return adapter

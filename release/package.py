@@ -278,14 +278,8 @@ def run(
     resume: Resume = "if-same",
 ) -> Path:
     """Read the playback tree, the captions and the inspection; write `dataset/` and give its path."""
-    stage = StageFolder.open(
-        out,
-        "release",
-        config=cfg,
-        inputs={"data": data, "captions": captions, "inspect": inspect},
-        seed=0,
-        resume=resume,
-    )
+    inputs = {"data": data, "captions": captions, "inspect": inspect}
+    stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0, resume=resume)
     dataset, parts = out / DATASET, out / PARTS
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)

@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cosfly.cli.options import (
-    Overrides,
-    ResumeMode,
-    ResumeOption,
-    Seed,
-    Workers,
-    check_failures,
-    resolve,
-)
+from cosfly.cli.options import Overrides, ResumeMode, ResumeOption, Seed, Workers, check_failures, resolve
 
 if TYPE_CHECKING:
     from cosfly.pipeline import StageResult

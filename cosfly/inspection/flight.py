@@ -101,7 +101,7 @@ def inspect_flight(folder: Path, root: Path, traces: dict[str, DroneTrace], cfg:
     metrics: dict[str, float | int | None] = {"num_frames": len(flight)}
     if trace is None:
         got = f"no trace {trace_id(flight)!r}"
-        report.add("warning", "no_trace", "trajectory.json: source.scenario_id", got, "the id of a planned flight")
+        report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a planned flight")
     else:
         check_plan(trace, cfg, report, metrics)
         check_poses(flight, trace, cfg, report)
@@ -157,7 +157,7 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: d
     if jerk > cfg.jerk_rms_max_mps3:
         report.error("jerk", where, f"{jerk:.2f} m/s^3", f"at most {cfg.jerk_rms_max_mps3:g} m/s^3 RMS")
     if score < cfg.smoothness_min:
-        report.add("warning", "smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
+        report.warn("smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
     if five_ray < cfg.five_ray_mean_min:
         report.error("five_ray_visibility", where, f"{five_ray:.3f}", f"a mean of at least {cfg.five_ray_mean_min:g}")
     if clearance < cfg.clearance_min_m:
@@ -171,7 +171,7 @@ def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: R
     """
     if len(flight) < len(trace.time_s):
         got, expected = f"{len(flight)} frames", f"{len(trace.time_s)} planned points"
-        report.add("warning", "shorter_than_planned", "trajectory.json: points", got, expected)
+        report.warn("shorter_than_planned", "trajectory.json: points", got, expected)
     row = np.searchsorted(trace.time_s, flight.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
     off_time = np.abs(trace.time_s[row] - flight.time_s) > TIME_TOLERANCE_S
     for i in np.flatnonzero(off_time):
@@ -264,16 +264,12 @@ def _rendered_metrics(
         invalid_depth_share_max=invalid,
     )
     if not flight.target_visible.any():
-        report.add(
-            "warning", "never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target"
-        )
+        report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < cfg.track_quality_min:
-        report.add(
-            "warning", "track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {cfg.track_quality_min}"
-        )
+        report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {cfg.track_quality_min}")
     if invalid is not None and invalid > cfg.invalid_depth_max:
         expected = f"at most {cfg.invalid_depth_max:g} of the pixels of a frame"
-        report.add("warning", "invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
+        report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
 
 
 def _heights_m(flight: Flight) -> np.ndarray:

@@ -114,7 +114,7 @@ def check_files(flight: Flight, report: Report) -> list[int]:
     known = {Path(frame_name(i)).name for i in range(len(flight))}
     frames = flight.folder / FRAMES_DIR
     for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
-        report.add("warning", "stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
+        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
     return complete
 
 

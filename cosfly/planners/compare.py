@@ -182,9 +182,8 @@ def run(
     """
     from cosfly.planners.compare_plots import draw_overlay, draw_radar, draw_series
 
-    stage = StageFolder.open(
-        out, "plan_compare", config=cfg, inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
-    )  # fmt: skip
+    inputs = {"map": simplified_map, "paths": paths}
+    stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "compare.json"
     if stage.is_complete:
         return product

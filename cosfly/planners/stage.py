@@ -171,9 +171,8 @@ def run(
     """
     from cosfly.planners.overview import draw_flights
 
-    stage = StageFolder.open(
-        out, "plan", config=cfg, inputs={"map": simplified_map, "paths": paths}, seed=seed, resume=resume
-    )  # fmt: skip
+    inputs = {"map": simplified_map, "paths": paths}
+    stage = StageFolder.open(out, "plan", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product, picture = out / "drone_trace.json", out / "plan.png"
     if stage.is_complete:
         return product
