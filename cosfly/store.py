@@ -147,7 +147,8 @@ def validation_errors(where: str | Path) -> Iterator[None]:
         yield
     except ValidationError as error:
         detail = error.errors()[0]
-        field = ".".join(map(str, detail["loc"])) or "top level"
+        places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
+        field = "".join(places).removeprefix(".") or "top level"
         what = "not an object" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
         raise InputError(what, where=f"{where}: {field}", got=repr(detail["input"])[:80]) from None
 

@@ -75,7 +75,7 @@ def test_a_foreign_header_survives(tmp_path):
         (lambda v: v.update(boxes={}), r"boxes.*dict"),
         (lambda v: v.update(schema_version="2.0"), r"schema_version.*2\.0"),
         (lambda v: v.update(schema="other"), r"schema.*other"),
-        (lambda v: v["boxes"].append(3), r"boxes\[3\].*int"),
+        (lambda v: v["boxes"].append(3), r"boxes\[3\]: not an object"),
     ],
 )
 def test_bad_maps_are_named(tmp_path, change, words):
@@ -116,7 +116,7 @@ def test_roi_forms(tmp_path):
         ({"closed": False, "points_world": [[0, 0], [1, 0], [1, 1]]}, "not closed"),
         ({"closed": True, "points_world": []}, "no polygon"),
         ({"closed": True, "points_world": [[0, 0], [1, 0]]}, "not a ring"),
-        ({"closed": True, "points_world": [[0, 0], [1, 0], ["a", 1]]}, "points_world.2.0"),
+        ({"closed": True, "points_world": [[0, 0], [1, 0], ["a", 1]]}, r"points_world\[2\]\[0\]"),
         ([], "top level: not an object"),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
@@ -26,6 +26,7 @@ COMPUTED = (
 )  # written from the boxes, never carried
 
 UNKNOWN_LICENCE, OUR_LICENCE = "unknown", "apache-2.0"  # the latter: of maps that cosfly invents
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 LicenceId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9.+-]*$")]  # as the hub spells it: apache-2.0, cc-by-4.0
 
 
@@ -174,6 +175,29 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         raise InputError("a box id occurs more than once", where=where, got=str(ids[counts > 1][0]))
 
 
+class _Box(BaseModel):
+    """What is read of a box; its other fields follow from these."""
+
+    model_config = ConfigDict(strict=True)  # no numbers in quotes
+
+    type: str
+    id: int = Field(ge=0, lt=2**64)
+    center: Vector
+    extent: Vector
+    rotation: Vector
+
+    @field_validator("type")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name not in KINDS:
+            raise ValueError(f"unknown type{nearest(name, KINDS)}, expected a CityObjectLabel name")
+        return name
+
+
+class _Boxes(BaseModel):
+    boxes: list[_Box]
+
+
 def write_boxes(path: Path, box_map: BoxMap) -> None:
     """Write boxes in the paper's fields (tab:boxes_schema), one box a line."""
     check_boxes(box_map, path)
@@ -231,28 +255,12 @@ def read_boxes(path: Path) -> BoxMap:
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:
         raise InputError("the map holds no boxes", where=path, fix="check the source, or the stage that made it")
-    kinds, ids = [], []
-    for i, record in enumerate(records):
-        if not isinstance(record, dict):
-            raise InputError("not a box", where=f"{path}: boxes[{i}]", got=type(record).__name__, expected="an object")
-        kind = record.get("type")
-        if kind not in KINDS:
-            hint = nearest(str(kind), KINDS)
-            raise InputError(
-                f"unknown type{hint}",
-                where=f"{path}: boxes[{i}].type",
-                got=repr(kind),
-                expected="a CityObjectLabel name",
-            )
-        kinds.append(KINDS[kind])
-        box_id = record.get("id")
-        if not isinstance(box_id, int) or isinstance(box_id, bool) or not 0 <= box_id < 2**64:
-            raise InputError(
-                "not an id", where=f"{path}: boxes[{i}].id", got=repr(box_id), expected="a non-negative integer"
-            )
-        ids.append(box_id)
-    centers, extents, rotations = (_vectors(records, name, path) for name in ("center", "extent", "rotation"))
-    box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
+    with validation_errors(path):
+        boxes = _Boxes.model_validate({"boxes": records}).boxes
+    centers, extents, rotations = ([getattr(box, name) for box in boxes] for name in ("center", "extent", "rotation"))
+    box_map = make_box_map(
+        centers, extents, rotations, [KINDS[box.type] for box in boxes], [box.id for box in boxes], header
+    )
     check_boxes(box_map, path)
     return box_map
 
@@ -260,21 +268,3 @@ def read_boxes(path: Path) -> BoxMap:
 def _read_header(value: dict, path: Path) -> MapHeader:
     with validation_errors(path):
         return MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
-
-
-def _vectors(records: list[dict], name: str, path: Path) -> np.ndarray:
-    """Read one three-vector field of all records, (n, 3)."""
-    try:
-        values = np.array([record[name] for record in records])
-        if values.shape == (len(records), 3) and values.dtype.kind in "fiu":  # not numbers in quotes, not null
-            return values.astype(np.float64)
-    except (KeyError, TypeError, ValueError):
-        pass
-    for i, record in enumerate(records):  # slow, only to name the culprit
-        value = record.get(name)
-        ok = isinstance(value, list) and len(value) == 3 and all(type(v) in (int, float) for v in value)
-        if not ok:
-            raise InputError(
-                "not a vector", where=f"{path}: boxes[{i}].{name}", got=repr(value), expected="three numbers"
-            )
-    raise InputError("not vectors", where=f"{path}: boxes[].{name}", expected="three numbers each")
