@@ -1,8 +1,8 @@
 """Items to work, on this machine: a process pool with resume, progress, a tally that adds up and a record per failure.
 
-`run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and a *worker factory*: a
-module-level function that is called once in each worker process with `factory_args` and returns the function that does one
-item. Load maps and open GL contexts in the factory. The same signature fits an actor pool on other machines.
+`run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and `make_worker`, a
+module-level function that is called once in each worker process with `worker_args` and returns the function that does one
+item. Load maps and open GL contexts in it. The same signature fits an actor pool on other machines.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Finished:
 def run_items(
     stage: StageFolder,
     items: Sequence[Item],
-    factory: Callable[..., Work],
-    factory_args: tuple = (),
+    make_worker: Callable[..., Work],
+    worker_args: tuple = (),
     *,
     workers: int = 1,
     label: str | None = None,
@@ -75,7 +75,7 @@ def run_items(
     On a later run kept and dropped items are taken from the journal and failed ones are tried again.
 
     Args:
-        factory: module-level function; `factory(*factory_args)` returns the work function, once in each process.
+        make_worker: module-level function; `make_worker(*worker_args)` returns the work function, once in each process.
         workers: processes; 1 works in this process.
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
@@ -90,7 +90,7 @@ def run_items(
         if records:
             log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
         with progress_bar(label or stage.stage, total=len(items), done=len(records)) as advance:
-            for record in _outcomes(todo, factory, factory_args, workers):
+            for record in _outcomes(todo, make_worker, worker_args, workers):
                 records[record.id] = record
                 journal.append(record.model_dump())
                 if isinstance(record, Failed):
@@ -124,24 +124,24 @@ def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:
     return tally
 
 
-def _outcomes(items: list[Item], factory: Callable, factory_args: tuple, workers: int) -> Iterator[ItemRecord]:
+def _outcomes(items: list[Item], make_worker: Callable, worker_args: tuple, workers: int) -> Iterator[ItemRecord]:
     if workers <= 1 or len(items) <= 1:
-        work = factory(*factory_args) if items else None
+        work = make_worker(*worker_args) if items else None
         for item in items:
             yield _attempt(work, item)
         return
     suspects: list[Item] = []  # in flight when a worker died: each gets one more try, alone
-    yield from _pooled(items, factory, factory_args, workers, suspects)
+    yield from _pooled(items, make_worker, worker_args, workers, suspects)
     for item in suspects:
         again: list[Item] = []
-        yield from _pooled([item], factory, factory_args, 1, again)
+        yield from _pooled([item], make_worker, worker_args, 1, again)
         if again:
             message = f"{item.item_id}: its worker process died twice; it may need more memory than there is"
             yield Failed(id=item.item_id, code="worker_died", message=message)
 
 
 def _pooled(
-    items: list[Item], factory: Callable, factory_args: tuple, workers: int, suspects: list[Item]
+    items: list[Item], make_worker: Callable, worker_args: tuple, workers: int, suspects: list[Item]
 ) -> Iterator[ItemRecord]:
     """Run items on a pool; those in flight when a worker died are put into `suspects`, the others run on a new pool."""
     context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
@@ -155,7 +155,7 @@ def _pooled(
                 min(workers, len(waiting)),
                 context,
                 _start_worker,
-                (factory, factory_args, logs, logging.getLogger().level),
+                (make_worker, worker_args, logs, logging.getLogger().level),
             )
             running: dict[Future, Item] = {}
             try:
@@ -196,7 +196,7 @@ _work: Work | None = None  # this worker process's function
 _start_error: CosflyError | None = None
 
 
-def _start_worker(factory: Callable, factory_args: tuple, logs: Any, level: int) -> None:
+def _start_worker(make_worker: Callable, worker_args: tuple, logs: Any, level: int) -> None:
     global _work, _start_error
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker at once; only the main process speaks of it
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -204,7 +204,7 @@ def _start_worker(factory: Callable, factory_args: tuple, logs: Any, level: int)
     root.handlers = [logging.handlers.QueueHandler(logs)]
     root.setLevel(level)
     try:
-        _work = factory(*factory_args)
+        _work = make_worker(*worker_args)
     except CosflyError as error:
         _start_error = error  # raised by the first item: an error in an initializer would only break the pool
 
