@@ -18,15 +18,12 @@ from pydantic import Field, model_validator
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import Caption, Language, parse_answer, read_captions
-from cosfly.products.frames import frame_name
+from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_file, dump_json
 from distill.schema import SPLITS, Sample, Split, read_split, split_path
 
 log = logging.getLogger(__name__)
-
-Modality = Literal["rgb", "depth", "instance"]
-MODALITY_FILES: dict[Modality, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
 
 
 class PrepareConfig(Config):
@@ -35,7 +32,7 @@ class PrepareConfig(Config):
     languages: tuple[Language, ...] = Field(
         ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
     )
-    modalities: tuple[Modality, ...] = Field(
+    modalities: tuple[FrameFile, ...] = Field(
         ("rgb",), min_length=1, description="images of each window frame, in this order: rgb, depth, instance"
     )
     split_by: Literal["trajectory", "town"] = Field(
@@ -156,7 +153,7 @@ def make_sample(caption: Caption, language: Language, cfg: PrepareConfig) -> Sam
         town=caption.town,
         trajectory=caption.trajectory,
         variant=caption.variant,
-        images=[f"{folder}/{frame_name(i)}/{MODALITY_FILES[m]}" for i in caption.window for m in cfg.modalities],
+        images=[f"{folder}/{frame_name(i)}/{FILE_NAMES[m]}" for i in caption.window for m in cfg.modalities],
         prompt=caption.prompt[language],
         answer=answer,
         decision=parsed.coc.flight_decision,

@@ -18,11 +18,12 @@ from typing import Any
 import pyarrow.parquet as pq
 import yaml
 
-from release.columns import CAPTION_FIELDS, FILES, MODALITIES, WINDOW, Modality, scalar_names, schema
+from cosfly.products.frames import FrameFile
+from release.columns import CAPTION_FIELDS, PICTURES, SCALAR_NAMES, WINDOW, schema
 from release.record import CaptionNumbers, FileNumbers, History, Numbers, ReleaseRecord, Spread
 
 DIGITS = 4
-MODALITY_TEXT = {
+FILE_TEXT: dict[FrameFile, str] = {
     "rgb": "`image`: colour, PNG",
     "depth": "`depth`: z-depth in metres, float32 `.npy` bytes, lossless",
     "instance": "`instance`: semantic number and instance id, PNG",
@@ -37,7 +38,7 @@ def read_rows(shards: Iterable[Path]) -> Iterator[dict[str, Any]]:
     for shard in shards:
         with pq.ParquetFile(shard) as file:
             for k in range(file.num_row_groups):
-                yield from file.read_row_group(k, columns=scalar_names()).to_pylist()
+                yield from file.read_row_group(k, columns=SCALAR_NAMES).to_pylist()
 
 
 def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
@@ -117,7 +118,7 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         files=FileNumbers(
             shards=len(shards),
             bytes=sum(shard.stat().st_size for shard in shards),
-            bytes_by_modality=bytes_by_modality(shards),
+            bytes_by_modality=stored_bytes(shards),
         ),
     )
 
@@ -125,9 +126,9 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
 CAPTION_COUNTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
 
 
-def bytes_by_modality(shards: Iterable[Path]) -> dict[str, int]:
-    """Give stored bytes of each modality, from the parquet footers; all small columns together as `annotations`."""
-    owner = {FILES[modality][0]: modality for modality in MODALITIES}
+def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
+    """Give the bytes of each picture column, from the parquet footers; all small columns together as `annotations`."""
+    owner = {column.name: file for file, column in PICTURES.items()}
     sizes: Counter[str] = Counter()
     for shard in shards:
         metadata = pq.read_metadata(shard)
@@ -217,7 +218,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
             + [("all shards", f"{numbers.files.bytes:,}")],
         ),
         "funnel_table": _funnel(history),
-        "modalities": "\n".join(f"- {MODALITY_TEXT[name]}" for name in settings.modalities),
+        "modalities": "\n".join(f"- {FILE_TEXT[name]}" for name in settings.modalities),
         "decode": _decode_snippet(settings.modalities),
         "columns_table": _columns(settings.modalities),
         "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record.coordinates.items()]),
@@ -339,11 +340,11 @@ def _funnel(history: History) -> str:
     return _table(("step", "number"), [(name.replace("_", " "), f"{count:,}") for name, count in rows])
 
 
-def _columns(modalities: list[Modality]) -> str:
+def _columns(files: list[FrameFile]) -> str:
     rows = []
-    for member in schema(modalities):
+    for member in schema(files):
         kind = "float64" if str(member.type) == "double" else str(member.type)
-        if member.name in (FILES["rgb"][0], FILES["instance"][0]):
+        if member.name in (PICTURES["rgb"].name, PICTURES["instance"].name):
             kind = "image"
         elif kind.startswith("struct"):
             kind = "numbers " + ", ".join(f"`{child.name}`" for child in member.type)
@@ -353,14 +354,14 @@ def _columns(modalities: list[Modality]) -> str:
     return _table(("column", "type"), rows)
 
 
-def _decode_snippet(modalities: list[Modality]) -> str:
+def _decode_snippet(files: list[FrameFile]) -> str:
     lines = ["import io", "import numpy as np", "from datasets import load_dataset", ""]
     lines += ['data = load_dataset(FOLDER, split="train")  # this folder, or its name on the hub', "row = data[0]"]
-    if "rgb" in modalities:
+    if "rgb" in files:
         lines.append('rgb = np.asarray(row["image"].convert("RGB"))')
-    if "depth" in modalities:
+    if "depth" in files:
         lines.append('depth_m = np.load(io.BytesIO(row["depth"]))  # float32 (height, width)')
-    if "instance" in modalities:
+    if "instance" in files:
         lines += [
             'coded = np.asarray(row["instance"].convert("RGB")).astype(np.uint16)',
             "semantic, instance_id = coded[..., 0], coded[..., 1] | (coded[..., 2] << 8)",

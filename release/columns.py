@@ -7,23 +7,17 @@ list and no nested list stands in a row except the caption's window, so that eve
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.playback import Flight, sample_id
-
-Modality = Literal["rgb", "depth", "instance"]
-MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "instance")
-
-# modality -> (column, file in the frame folder)
-FILES = {"rgb": ("image", "rgb.png"), "depth": ("depth", "depth.npy"), "instance": ("instance", "instance.png")}
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
@@ -34,34 +28,6 @@ CAPTION_FIELDS = tuple(
 )
 CAPTION_FACTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
 
-# name -> type: a name of a scalar, or the members of a struct (all float64)
-SCALARS: dict[str, str | tuple[str, ...]] = {
-    "sample_id": "string",
-    "town": "string",
-    "trajectory": "string",
-    "variant": "string",
-    "track": "string",
-    "frame_index": "int32",
-    "time_s": "float64",
-    "width_px": "int32",
-    "height_px": "int32",
-    "fov_deg": "float64",
-    "intrinsics": ("fx", "fy", "cx", "cy"),
-    "pose": POSE,
-    "target": POINT,
-    "target_uv": ("u_px", "v_px"),
-    "target_bbox": ("xmin_px", "ymin_px", "xmax_px", "ymax_px"),
-    "target_depth_m": "float64",
-    "target_in_view": "bool",
-    "target_visible": "bool",
-    "visibility": "float64",
-    "is_perturbed": "bool",
-    "drone_offset": POSE,
-    "target_offset": POINT,
-    "has_caption": "bool",
-    **dict.fromkeys(CAPTION_FACTS, "string"),
-    **dict.fromkeys(CAPTION_FIELDS, "string"),
-}
 WINDOW = "caption_window"
 PNG_END = b"IEND\xaeB`\x82"  # the last chunk and its checksum
 
@@ -92,107 +58,135 @@ class ReleasedCaption:
     facts: dict[str, str | None]  # CAPTION_FACTS
 
 
-def schema(modalities: tuple[Modality, ...] | list[Modality]) -> pa.Schema:
+# --- the table --------------------------------------------------------------------------------------------------------
+
+# type -> what it is in parquet, and for `datasets`; a tuple names the members of a struct of float64
+TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
+    **{
+        name: (kind, {"dtype": name, "_type": "Value"})
+        for name, kind in (
+            ("string", pa.string()), ("int32", pa.int32()), ("float64", pa.float64()), ("bool", pa.bool_()), ("binary", pa.binary()),
+        )
+    },
+    "image": (pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}),
+    # `element` is parquet's own name. `Sequence` is what `datasets` before version 4 calls a list; later versions still read it.
+    "indices": (
+        pa.list_(pa.field("element", pa.int32())),
+        {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"},
+    ),
+}  # fmt: skip
+
+Value = Callable[[Flight, int, ReleasedCaption | None], Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its type (of TYPES, or the members of a struct) and its value at frame i of a flight; NaN becomes null."""
+
+    name: str
+    type: str | tuple[str, ...]
+    value: Value
+
+    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None) -> Any:
+        value = self.value(flight, i, caption)
+        if isinstance(self.type, tuple):  # adding 0.0 turns -0.0 into 0.0
+            return None if np.isnan(value).any() else dict(zip(self.type, (value + 0.0).tolist(), strict=True))
+        if self.type == "float64":
+            return None if np.isnan(value) else float(value)
+        return bool(value) if self.type == "bool" else value
+
+
+def _fact(name: str) -> Column:
+    return Column(name, "string", lambda _, __, caption: caption.facts[name] if caption else None)
+
+
+def _text(name: str) -> Column:
+    return Column(name, "string", lambda _, __, caption: caption.texts[name] if caption else None)
+
+
+def _picture(file: FrameFile) -> Value:
+    def value(flight: Flight, i: int, _: ReleasedCaption | None) -> dict[str, Any]:
+        return {"bytes": _read(flight, i, file), "path": f"{sample_id(flight.flight_id, i)}_{FILE_NAMES[file]}"}
+
+    return value
+
+
+PICTURES: dict[FrameFile, Column] = {
+    "rgb": Column("image", "image", _picture("rgb")),
+    "depth": Column("depth", "binary", lambda f, i, _: _read(f, i, "depth")),
+    "instance": Column("instance", "image", _picture("instance")),
+}
+SCALARS = (  # everything but pictures and depth
+    Column("sample_id", "string", lambda f, i, _: sample_id(f.flight_id, i)),
+    Column("town", "string", lambda f, i, _: f.town),
+    Column("trajectory", "string", lambda f, i, _: f.trajectory),
+    Column("variant", "string", lambda f, i, _: f.variant),
+    Column("track", "string", lambda f, i, _: "clean" if f.is_original else "perturbed"),
+    Column("frame_index", "int32", lambda f, i, _: i),
+    Column("time_s", "float64", lambda f, i, _: f.time_s[i]),
+    Column("width_px", "int32", lambda f, i, _: f.camera.width_px),
+    Column("height_px", "int32", lambda f, i, _: f.camera.height_px),
+    Column("fov_deg", "float64", lambda f, i, _: round(f.camera.fov_deg, 6)),
+    Column("intrinsics", ("fx", "fy", "cx", "cy"), lambda f, i, _: f.camera.intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
+    Column("pose", POSE, lambda f, i, _: np.concatenate([f.positions_m[i], f.rotations_deg[i]])),
+    Column("target", POINT, lambda f, i, _: f.targets_m[i]),
+    Column("target_uv", ("u_px", "v_px"), lambda f, i, _: f.target_uv[i]),
+    Column("target_bbox", ("xmin_px", "ymin_px", "xmax_px", "ymax_px"), lambda f, i, _: f.target_bbox[i]),
+    Column("target_depth_m", "float64", lambda f, i, _: f.target_depth_m[i]),
+    Column("target_in_view", "bool", lambda f, i, _: f.target_in_view[i]),
+    Column("target_visible", "bool", lambda f, i, _: f.target_visible[i]),
+    Column("visibility", "float64", lambda f, i, _: f.visibility[i]),
+    Column("is_perturbed", "bool", lambda f, i, _: f.is_perturbed[i]),
+    Column("drone_offset", POSE, lambda f, i, _: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]])),
+    Column("target_offset", POINT, lambda f, i, _: f.target_offsets_m[i]),
+    Column("has_caption", "bool", lambda f, i, caption: caption is not None),
+    *map(_fact, CAPTION_FACTS),
+    *map(_text, CAPTION_FIELDS),
+    Column(WINDOW, "indices", lambda f, i, caption: list(caption.window) if caption else None),
+)
+SCALAR_NAMES = [column.name for column in SCALARS]
+
+
+def columns_of(files: Collection[FrameFile]) -> list[Column]:
+    """Give the columns in their order; of the pictures those of the wanted files."""
+    return [*(column for file, column in PICTURES.items() if file in files), *SCALARS]
+
+
+def schema(files: Collection[FrameFile]) -> pa.Schema:
     """Give the parquet schema, features for HuggingFace `datasets` in its metadata."""
     fields: list[pa.Field] = []
     features: dict[str, Any] = {}
-    types = {"string": pa.string(), "int32": pa.int32(), "float64": pa.float64(), "bool": pa.bool_()}
-    for modality in MODALITIES:
-        if modality not in modalities:
-            continue
-        column = FILES[modality][0]
-        if modality == "depth":
-            fields.append(pa.field(column, pa.binary()))
-            features[column] = {"dtype": "binary", "_type": "Value"}
+    for column in columns_of(files):
+        if isinstance(column.type, tuple):
+            kind = pa.struct([(member, pa.float64()) for member in column.type])
+            features[column.name] = {member: {"dtype": "float64", "_type": "Value"} for member in column.type}
         else:
-            fields.append(pa.field(column, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
-            features[column] = {"_type": "Image"}
-    for name, kind in SCALARS.items():
-        if isinstance(kind, tuple):
-            fields.append(pa.field(name, pa.struct([(member, pa.float64()) for member in kind])))
-            features[name] = {member: {"dtype": "float64", "_type": "Value"} for member in kind}
-        else:
-            fields.append(pa.field(name, types[kind]))
-            features[name] = {"dtype": kind, "_type": "Value"}
-    fields.append(pa.field(WINDOW, pa.list_(pa.field("element", pa.int32()))))  # parquet's own name of it
-    # `Sequence` is what `datasets` before version 4 calls a list; later versions still read it.
-    features[WINDOW] = {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"}
+            kind, features[column.name] = TYPES[column.type]
+        fields.append(pa.field(column.name, kind))
     return pa.schema(fields, {b"huggingface": json.dumps({"info": {"features": features}}).encode()})
 
 
-def scalar_names() -> list[str]:
-    """Names of the columns that are small: everything but pictures and depth."""
-    return [*SCALARS, WINDOW]
-
-
-def row(
-    flight: Flight, i: int, modalities: tuple[Modality, ...] | list[Modality], caption: ReleasedCaption | None
-) -> dict[str, Any]:
+def row(flight: Flight, i: int, files: Collection[FrameFile], caption: ReleasedCaption | None) -> dict[str, Any]:
     """Give the row of one frame, right-handed axes.
 
     Raises:
         InputError: a file of the frame cannot be read.
     """
-    intrinsic = flight.camera.intrinsic
-    values: dict[str, Any] = {
-        "sample_id": sample_id(flight.flight_id, i),
-        "town": flight.town,
-        "trajectory": flight.trajectory,
-        "variant": flight.variant,
-        "track": "clean" if flight.is_original else "perturbed",
-        "frame_index": i,
-        "time_s": float(flight.time_s[i]),
-        "width_px": flight.camera.width_px,
-        "height_px": flight.camera.height_px,
-        "fov_deg": round(flight.camera.fov_deg, 6),
-        "intrinsics": _struct("intrinsics", intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
-        "pose": _struct("pose", np.concatenate([flight.positions_m[i], flight.rotations_deg[i]])),
-        "target": _struct("target", flight.targets_m[i]),
-        "target_uv": _struct("target_uv", flight.target_uv[i]),
-        "target_bbox": _struct("target_bbox", flight.target_bbox[i]),
-        "target_depth_m": _number(flight.target_depth_m[i]),
-        "target_in_view": bool(flight.target_in_view[i]),
-        "target_visible": bool(flight.target_visible[i]),
-        "visibility": _number(flight.visibility[i]),
-        "is_perturbed": bool(flight.is_perturbed[i]),
-        "drone_offset": _struct(
-            "drone_offset", np.concatenate([flight.drone_offsets_m[i], flight.rotation_offsets_deg[i]])
-        ),
-        "target_offset": _struct("target_offset", flight.target_offsets_m[i]),
-        "has_caption": caption is not None,
-        WINDOW: list(caption.window) if caption else None,
-    }
-    values.update(caption.texts if caption else dict.fromkeys(CAPTION_FIELDS))
-    values.update(caption.facts if caption else dict.fromkeys(CAPTION_FACTS))
-    for modality in modalities:
-        column, name = FILES[modality]
-        data = _read(flight.frame_folder(i) / name, modality, flight.camera.width_px * flight.camera.height_px)
-        values[column] = data if modality == "depth" else {"bytes": data, "path": f"{values['sample_id']}_{name}"}
-    return values
+    return {column.name: column.cell(flight, i, caption) for column in columns_of(files)}
 
 
-def _struct(name: str, numbers: np.ndarray) -> dict[str, float] | None:
-    """Name the numbers of a struct column; None where they are unknown. Adding 0.0 turns -0.0 into 0.0."""
-    if np.isnan(numbers).any():
-        return None
-    members = SCALARS[name]
-    assert isinstance(members, tuple)
-    return dict(zip(members, (np.asarray(numbers, dtype=np.float64) + 0.0).tolist(), strict=True))
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
-
-
-def _read(path: Path, modality: Modality, num_pixels: int) -> bytes:
+def _read(flight: Flight, i: int, file: FrameFile) -> bytes:
     """Read a frame's file and see that its end is there; `release verify` decodes all of it."""
+    path = flight.frame_folder(i) / FILE_NAMES[file]
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(
             "cannot read a frame's file", where=path, got=error.strerror, fix="run cosfly inspect again"
         ) from None
-    is_whole = len(data) > 4 * num_pixels if modality == "depth" else PNG_END in data[-256:]
+    is_whole = (
+        len(data) > 4 * flight.camera.width_px * flight.camera.height_px if file == "depth" else PNG_END in data[-256:]
+    )
     if not is_whole:
         raise InputError("a frame's file is cut short", where=path, got=f"{len(data)} bytes", fix="render it again")
     return data

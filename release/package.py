@@ -21,6 +21,7 @@ import cosfly
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError, VerifyError
 from cosfly.products.boxes import UNKNOWN_LICENCE, LicenceId
+from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.inspection import FlightInspection, Inspection, read_inspection
 from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
@@ -38,7 +39,7 @@ from cosfly.store import (
 from release import columns
 from release.captions import Captions, load_captions
 from release.card import compute_numbers, render_card
-from release.columns import Modality, ReleasedCaption
+from release.columns import ReleasedCaption
 from release.record import (
     CaptionHistory,
     FlightHistory,
@@ -70,8 +71,8 @@ class ReleaseConfig(Config):
     )
     tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
     include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
-    modalities: tuple[Modality, ...] = Field(
-        columns.MODALITIES, min_length=1, description="pictures to include: rgb, depth (lossless float32), instance"
+    modalities: tuple[FrameFile, ...] = Field(
+        tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth (lossless float32), instance"
     )
     shard_mb: int = Field(500, ge=1, description="size that a parquet file should not pass by more than one flight, MB")
     row_group_mb: int = Field(
@@ -166,9 +167,9 @@ def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[lis
     num_bytes = 0
     for row in rows:
         batch.append(row)
-        for modality in cfg.modalities:
-            value = row[columns.FILES[modality][0]]
-            num_bytes += len(value if modality == "depth" else value["bytes"])
+        for file in cfg.modalities:
+            value = row[columns.PICTURES[file].name]
+            num_bytes += len(value if file == "depth" else value["bytes"])
         if num_bytes >= cfg.row_group_mb * MB:
             yield batch
             batch, num_bytes = [], 0

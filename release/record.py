@@ -7,10 +7,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.store import read_model, write_model
-from release.columns import CAPTION_FIELDS, Modality
+from release.columns import CAPTION_FIELDS
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
 
@@ -49,7 +50,7 @@ class Settings(Strict):
 
     num_frames: int = Field(ge=1)
     tracks: list[str]
-    modalities: list[Modality] = Field(min_length=1)
+    modalities: list[FrameFile] = Field(min_length=1)
 
 
 class Spread(Strict):

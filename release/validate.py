@@ -20,10 +20,11 @@ from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.issues import Report
 from cosfly.products.captions import ACTIONS
+from cosfly.products.frames import FrameFile
 from cosfly.store import CHECKSUMS, inside, read_checksums, sha256_file
 from release import columns
 from release.card import compute_numbers, read_rows, render_card
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, FILES, POINT, WINDOW
+from release.columns import CAPTION_FACTS, CAPTION_FIELDS, PICTURES, POINT, WINDOW
 from release.record import ReleaseRecord, read_record
 from release.subsample import select_frames
 
@@ -279,31 +280,31 @@ def projection_error_px(row: dict[str, Any]) -> float | None:
 
 def _check_pictures(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Decode every picture and compare its size with the row's."""
-    modalities = record.settings.modalities
+    files = record.settings.modalities
     count = 0
-    for row in _picture_rows(paths, modalities):
+    for row in _picture_rows(paths, files):
         size = (row["height_px"], row["width_px"])
-        for modality in modalities:
-            column = FILES[modality][0]
-            problem = picture_problem(modality, row[column], size)
+        for file in files:
+            column = PICTURES[file].name
+            problem = picture_problem(file, row[column], size)
             count += 1
             if problem:
-                expected = f"a {modality} picture of {size[1]} x {size[0]} px"
+                expected = f"a {file} picture of {size[1]} x {size[0]} px"
                 report.error("picture", f"{row['town']}/{row['sample_id']}: {column}", problem, expected)
     report.facts.append(f"{count:,} pictures decoded")
 
 
-def _picture_rows(paths: list[Path], modalities: list[columns.Modality]) -> Iterator[dict[str, Any]]:
-    wanted = ["town", "sample_id", "width_px", "height_px", *(FILES[modality][0] for modality in modalities)]
+def _picture_rows(paths: list[Path], files: list[FrameFile]) -> Iterator[dict[str, Any]]:
+    wanted = ["town", "sample_id", "width_px", "height_px", *(PICTURES[file].name for file in files)]
     for path in paths:
         with pq.ParquetFile(path) as file:
             for k in range(file.num_row_groups):
                 yield from file.read_row_group(k, columns=wanted).to_pylist()
 
 
-def picture_problem(modality: str, value: Any, size: tuple[int, int]) -> str | None:
+def picture_problem(file: FrameFile, value: Any, size: tuple[int, int]) -> str | None:
     """Say why a picture is not one of (height, width), None if it is."""
-    if modality == "depth":
+    if file == "depth":
         try:
             depth = np.load(io.BytesIO(value or b""), allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -19,7 +20,9 @@ from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.store import dump_json, read_model
 
 FRAMES_DIR = "frames_playback"
-FRAME_FILES = ("rgb.png", "depth.npy", "instance.png", "meta.json")
+FrameFile = Literal["rgb", "depth", "instance"]
+FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
+FRAME_FILES = (*FILE_NAMES.values(), "meta.json")
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
 META_SCHEMA, META_VERSION = "cosfly.frame", "1.0"
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")

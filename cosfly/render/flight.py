@@ -11,7 +11,7 @@ import numpy as np
 
 from cosfly.geometry import world_from_camera
 from cosfly.products import frames
-from cosfly.products.frames import Camera, FrameMeta, Look, frame_name
+from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
@@ -47,7 +47,7 @@ class FlightScript:
 class Writing:
     """How frames are written."""
 
-    modalities: tuple[str, ...]
+    files: tuple[FrameFile, ...]
     png_compression: int
     visible_threshold: float
 
@@ -116,7 +116,7 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
         "depth": ("depth.npy", lambda: frames.depth_bytes(frame.depth)),
         "instance": ("instance.png", lambda: frames.instance_bytes(frame.kinds, frame.ids, writing.png_compression)),
     }
-    contents = {makers[m][0]: makers[m][1]() for m in writing.modalities}
+    contents = {makers[m][0]: makers[m][1]() for m in writing.files}
     contents["meta.json"] = meta.to_bytes()
     target = folder / name
     with storage_errors(target):

@@ -20,7 +20,7 @@ from cosfly.config import Config, MayDiffer
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.frames import Camera, Look
+from cosfly.products.frames import Camera, FrameFile, Look
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID, SHARED_ID, InstanceIds, Renderer, instance_ids
@@ -64,7 +64,7 @@ class RenderConfig(Config):
     )
     perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
     look: Look = Field(Look(), description="sun and air")
-    modalities: tuple[Literal["rgb", "depth", "instance"], ...] = Field(
+    modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
     )
     png_compression: int = Field(1, ge=0, le=9, description="zlib level of the PNG files; 0 for none, 9 is slow")
