@@ -331,7 +331,7 @@ def _holds_work(out: Path) -> bool:
 
 def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
     """Say which settings, inputs or seed differ, one phrase each."""
-    before, after = _flat(found.config), _flat(wanted.config)
+    before, after = flattened(found.config), flattened(wanted.config)
     changed = [
         f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())
@@ -346,12 +346,13 @@ def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
     return changed
 
 
-def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
+def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Name every value of nested objects by its dotted path."""
     if not isinstance(config, dict) or not config:
         return {prefix: config}
     flat: dict[str, Any] = {}
     for key, value in config.items():
-        flat.update(_flat(value, f"{prefix}.{key}" if prefix else str(key)))
+        flat.update(flattened(value, f"{prefix}.{key}" if prefix else str(key)))
     return flat
 
 

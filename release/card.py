@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from cosfly.products.frames import FrameFile
-from release.columns import CAPTION_FIELDS, PICTURES, SCALAR_NAMES, WINDOW, schema
+from release.columns import CAPTION_FACTS, CAPTION_FIELDS, PICTURES, SCALAR_NAMES, WINDOW, schema
 from release.record import CaptionNumbers, FileNumbers, History, Numbers, ReleaseRecord, Spread
 
 DIGITS = 4
@@ -51,7 +51,7 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         sums are exact (fsum), so that the same rows give the same digits everywhere.
     """
     counts: dict[str, Counter[str]] = {
-        name: Counter() for name in ("town", "track", "fov_deg", "image_px", *CAPTION_COUNTS)
+        name: Counter() for name in ("town", "track", "fov_deg", "image_px", *CAPTION_FACTS)
     }
     totals: Counter[str] = Counter()
     flights: dict[tuple[str, str, str], list[tuple[float, float, float, float]]] = {}
@@ -78,7 +78,7 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         if row["visibility"] is not None:
             samples["visibility"].append(row["visibility"])
         if row["has_caption"]:
-            for name in CAPTION_COUNTS:
+            for name in CAPTION_FACTS:
                 counts[name]["none" if row[name] is None else row[name]] += 1
             totals["has_label"] += row["label"] is not None
             totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
@@ -90,7 +90,7 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         "frames_without": totals["frames"] - totals["has_caption"],
         "with_label": totals["has_label"],
         "decision_equals_label": totals["decision_equals_label"],
-        **{name: _sorted(counts[name]) for name in CAPTION_COUNTS},
+        **{name: _sorted(counts[name]) for name in CAPTION_FACTS},
         "mean_characters": {
             name: round(characters[name] / totals["has_caption"], 1) if totals["has_caption"] else None
             for name in CAPTION_FIELDS
@@ -121,9 +121,6 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
             bytes_by_modality=stored_bytes(shards),
         ),
     )
-
-
-CAPTION_COUNTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
 
 
 def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:

@@ -21,6 +21,7 @@ from cosfly.geometry import project, world_from_camera
 from cosfly.issues import Report
 from cosfly.products.captions import ACTIONS
 from cosfly.products.frames import FrameFile
+from cosfly.stage_folder import flattened
 from cosfly.store import CHECKSUMS, inside, read_checksums, sha256_file
 from release import columns
 from release.card import compute_numbers, read_rows, render_card
@@ -154,21 +155,12 @@ def _readable(folder: Path, names: list[str], record: ReleaseRecord, report: Rep
 
 def _check_numbers(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Compute every number again and compare."""
-    computed = _flat(compute_numbers(paths, record.settings.num_frames).model_dump())
-    written = _flat(record.numbers.model_dump())
+    computed = flattened(compute_numbers(paths, record.settings.num_frames).model_dump())
+    written = flattened(record.numbers.model_dump())
     for name in sorted(computed.keys() | written.keys()):
         if computed.get(name) != written.get(name):
             report.error("number", f"release.json: numbers.{name}", written.get(name), f"{computed.get(name)}")
     report.facts.append(f"{len(computed)} numbers computed again from {len(paths)} shards")
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix: value}
-    flat: dict[str, Any] = {}
-    for key, item in value.items():
-        flat.update(_flat(item, f"{prefix}.{key}" if prefix else key))
-    return flat
 
 
 def _check_sums(record: ReleaseRecord, report: Report) -> None:
