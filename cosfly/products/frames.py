@@ -102,9 +102,8 @@ class TreePose(TreePosition):
 
 
 def tree_position(position_m: np.ndarray) -> TreePosition:
-    return TreePosition(
-        **dict(zip(XYZ, (mirror_positions(position_m) + 0.0).tolist(), strict=True))
-    )  # + 0.0: no minus zero
+    x, y, z = (mirror_positions(position_m) + 0.0).tolist()  # + 0.0: no minus zero
+    return TreePosition(x=x, y=y, z=z)
 
 
 def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:

@@ -41,19 +41,14 @@ class Body:
 class _Figure:
     """Collects parts in the person's own axes: x forward, y left, z up, feet at 0."""
 
-    records: list[tuple] = field(default_factory=list)
-    mesh: list[int] = field(default_factory=list)
-    centers: list[np.ndarray] = field(default_factory=list)
-    turns: list[np.ndarray] = field(default_factory=list)
+    parts: list[tuple] = field(default_factory=list)  # (mesh, center, turn, half, color)
     bones: list[tuple[np.ndarray, np.ndarray, float]] = field(default_factory=list)
 
     def solid(
         self, mesh: int, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0
     ) -> None:
-        self.mesh.append(mesh)
-        self.centers.append(np.array(center))
-        self.turns.append(Rotation.from_euler("y", pitch_rad).as_matrix())
-        self.records.append((tuple(half), tuple(color)))
+        turn = Rotation.from_euler("y", pitch_rad).as_matrix()
+        self.parts.append((mesh, np.array(center), turn, tuple(half), color))
 
     def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
         """A limb between two points, thicker at `high`."""
@@ -62,10 +57,8 @@ class _Figure:
         z = along / length
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
-        self.mesh.append(meshes.LIMB)
-        self.centers.append((low + high) / 2.0)
-        self.turns.append(np.stack([x, np.cross(z, x), z], axis=1))
-        self.records.append(((radius, radius, length / 2.0 + 0.6 * radius), tuple(color)))
+        turn, half = np.stack([x, np.cross(z, x), z], axis=1), (radius, radius, length / 2.0 + 0.6 * radius)
+        self.parts.append((meshes.LIMB, (low + high) / 2.0, turn, half, color))
 
     def bone(self, low: np.ndarray, high: np.ndarray, radius: float) -> None:
         self.bones.append((low, high, radius))
@@ -131,13 +124,12 @@ def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
 
 def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.ndarray) -> Body:
     turn = Rotation.from_euler("z", heading_rad).as_matrix()
-    records = np.zeros(len(figure.records), PART)
-    for row, (half, color) in enumerate(figure.records):
-        records["half"][row], records["color"][row, :3] = half, color
-    records["quaternion"] = Rotation.from_matrix(turn @ np.array(figure.turns)).as_quat()
+    mesh, centers, turns, halves, colors = zip(*figure.parts, strict=True)
+    records = np.zeros(len(mesh), PART)
+    records["half"], records["color"][:, :3] = halves, colors
+    records["quaternion"] = Rotation.from_matrix(turn @ np.array(turns)).as_quat()
     records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), PERSON_ID))
     records["bias"] = LAYER_STEP * STANDING_LAYER
-    centers = np.array(figure.centers) @ turn.T + feet_m
     ends = np.array([[low, high] for low, high, _ in figure.bones]) @ turn.T + feet_m
     radii = np.array([radius for _, _, radius in figure.bones])
-    return Body(records, np.array(figure.mesh), centers, ends, radii, hip_m)
+    return Body(records, np.array(mesh), np.array(centers) @ turn.T + feet_m, ends, radii, hip_m)

@@ -12,33 +12,8 @@ from scipy.spatial import cKDTree
 
 from cosfly.products.kinds import KINDS
 from cosfly.render.contract import LAWN_HALF_M, LAYERS
-from cosfly.render.gl import meshes
-from cosfly.render.gl.parts import (  # fmt: skip
-    BARK,
-    BRICK,
-    BUS,
-    CABIN,
-    CAR_PAINT,
-    CLOTH,
-    CONCRETE,
-    FACADE,
-    FAR_PX,
-    FENCE,
-    GRASS,
-    GRAVEL,
-    LAMP,
-    LEAVES,
-    METAL,
-    PLAIN,
-    ROAD,
-    ROAD_LINE,
-    RUBBER,
-    SIDEWALK,
-    SIGNAL,
-    WATER,
-    Boxes,
-    PartBuilder,
-)
+from cosfly.render.gl import meshes, parts
+from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder
 
 EDGE_GAP_M, MOST_EDGED = 0.05, 4000
 
@@ -56,12 +31,12 @@ LEAF_COLORS = np.array(
 )
 
 
-def _slab(material: int, color: tuple[float, float, float], kind: str):
-    """A ground surface: the box itself, lengthwise, in its layer."""
+def _box(material: int, color: tuple[float, float, float], layer: int | None = None):
+    """The box itself, lengthwise: a ground surface in its layer, or something that stands."""
 
     def build(builder: PartBuilder, boxes: Boxes) -> None:
         boxes = boxes.lengthwise()
-        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color), layer=LAYERS[kind])
+        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color), layer=layer)
 
     return build
 
@@ -70,7 +45,7 @@ def _sidewalks(builder: PartBuilder, boxes: Boxes) -> None:
     """Pavement; the shader draws a kerb along the open edges, which stand in the seed."""
     boxes = boxes.lengthwise()
     boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
-    builder.add(boxes, meshes.BOX, boxes.half, SIDEWALK, np.array([0.36, 0.345, 0.32]), layer=LAYERS["Sidewalks"])
+    builder.add(boxes, meshes.BOX, boxes.half, parts.SIDEWALK, np.array([0.36, 0.345, 0.32]), layer=LAYERS["Sidewalks"])
 
 
 def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
@@ -100,28 +75,18 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
     return bits
 
 
-def _solid(material: int, color: tuple[float, float, float]):
-    """A standing thing drawn as its box."""
-
-    def build(builder: PartBuilder, boxes: Boxes) -> None:
-        boxes = boxes.lengthwise()
-        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color))
-
-    return build
-
-
 def plain(builder: PartBuilder, boxes: Boxes) -> None:
     shades = np.array(
         [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
     )
-    builder.add(boxes, meshes.BOX, boxes.half, PLAIN, boxes.pick(shades))
+    builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(shades))
 
 
 def _buildings(builder: PartBuilder, boxes: Boxes) -> None:
     """Houses; the shader makes storeys, windows and a roof whose rim follows the open edges (the seed's whole part)."""
     colors = boxes.pick(BUILDING_COLORS)
     edged = replace(boxes, seeds=boxes.seeds * 0.999 + _open_edges(boxes, height_share=0.98, slack_m=0.0))
-    builder.add(edged, meshes.BOX, boxes.half, FACADE, colors)
+    builder.add(edged, meshes.BOX, boxes.half, parts.FACADE, colors)
 
 
 def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
@@ -134,11 +99,13 @@ def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
     is_trunk = ~(is_lawn | is_bush) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
     is_tree = ~(is_lawn | is_hedge | is_bush | is_trunk)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
-    builder.add(boxes.select(is_lawn), meshes.BOX, boxes.half[is_lawn], GRASS, leaf[is_lawn], layer=LAYERS["RoadLines"])
-    builder.add(boxes.select(is_hedge), meshes.BOX, boxes.half[is_hedge], LEAVES, leaf[is_hedge])
+    builder.add(
+        boxes.select(is_lawn), meshes.BOX, boxes.half[is_lawn], parts.GRASS, leaf[is_lawn], layer=LAYERS["RoadLines"]
+    )
+    builder.add(boxes.select(is_hedge), meshes.BOX, boxes.half[is_hedge], parts.LEAVES, leaf[is_hedge])
     _bushes(builder, boxes.select(is_bush), leaf[is_bush])
     trunks = boxes.select(is_trunk)
-    builder.add(trunks, meshes.CYLINDER, trunks.half, BARK, BARK_COLOR)
+    builder.add(trunks, meshes.CYLINDER, trunks.half, parts.BARK, BARK_COLOR)
     is_crown = is_tree & _over_a_trunk(boxes, trunks)
     _crowns(builder, boxes.select(is_crown), leaf[is_crown], np.full(int(is_crown.sum()), -1.0))
     is_tree &= ~is_crown
@@ -149,12 +116,18 @@ def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
 
 def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
     h = boxes.half
-    builder.add(boxes, meshes.BLOB_COARSE, h, LEAVES, leaf, max_px=FAR_PX)
-    builder.add(boxes, meshes.BLOB, h * [0.72, 0.72, 0.98], LEAVES, leaf, min_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB_COARSE, h, parts.LEAVES, leaf, max_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX)
     for side in (-1.0, 1.0):
         offset = h * [0.42 * side, 0.25 * side, -0.25]
         builder.add(
-            boxes, meshes.BLOB, h * [0.56, 0.6, 0.72], LEAVES, leaf * (1.0 + 0.12 * side), offset=offset, min_px=FAR_PX
+            boxes,
+            meshes.BLOB,
+            h * [0.56, 0.6, 0.72],
+            parts.LEAVES,
+            leaf * (1.0 + 0.12 * side),
+            offset=offset,
+            min_px=FAR_PX,
         )
 
 
@@ -180,8 +153,8 @@ def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.
     h = boxes.half
     crown_half = h * np.stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0], axis=1)
     crown_center = h * np.stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0], axis=1)
-    builder.add(boxes, meshes.BLOB_COARSE, crown_half, LEAVES, leaf, offset=crown_center, max_px=FAR_PX)
-    builder.add(boxes, meshes.BLOB_FINE, crown_half * 0.74, LEAVES, leaf, offset=crown_center, min_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB_COARSE, crown_half, parts.LEAVES, leaf, offset=crown_center, max_px=FAR_PX)
+    builder.add(boxes, meshes.BLOB_FINE, crown_half * 0.74, parts.LEAVES, leaf, offset=crown_center, min_px=FAR_PX)
     for number in range(7):
         radius = 0.40 + 0.13 * boxes.chance(10 + number)
         angle = 2.0 * np.pi * (number / 6.0 + boxes.chance(30)) + 0.5 * boxes.chance(20 + number)
@@ -190,17 +163,17 @@ def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.
         direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), lift], axis=1)
         offset = crown_center + crown_half * direction * (1.0 - radius)[:, None]
         shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
-        builder.add(boxes, meshes.BLOB, crown_half * radius[:, None], LEAVES, shade, offset=offset, min_px=FAR_PX)
+        builder.add(boxes, meshes.BLOB, crown_half * radius[:, None], parts.LEAVES, shade, offset=offset, min_px=FAR_PX)
 
 
 def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
     h = boxes.half
     dark = leaf * [0.6, 0.75, 0.85]
-    builder.add(boxes, meshes.CONE, h * [1, 1, 0.92], LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
+    builder.add(boxes, meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
     _trunk(builder, boxes, np.full(len(h), -0.5))
     for low, top, radius in ((-0.78, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
         size = h * [radius, radius, (top - low) / 2.0]
-        builder.add(boxes, meshes.CONE, size, LEAVES, dark, offset=h * [0, 0, (low + top) / 2.0], min_px=FAR_PX)
+        builder.add(boxes, meshes.CONE, size, parts.LEAVES, dark, offset=h * [0, 0, (low + top) / 2.0], min_px=FAR_PX)
 
 
 def _trunk(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
@@ -210,7 +183,7 @@ def _trunk(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
     radius = np.minimum(radius, np.minimum(h[:, 0], h[:, 1]))
     size = np.stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0], axis=1)
     offset = np.stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0], axis=1)
-    builder.add(boxes, meshes.CYLINDER, size, BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
+    builder.add(boxes, meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
 
 
 _WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the cylinder's axis along the car's y
@@ -223,31 +196,31 @@ def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float
     for front in (-along, along):
         for side in (-1.0, 1.0):
             offset = np.stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]], axis=1)
-            builder.add(boxes, meshes.CYLINDER, size, RUBBER, np.array([0.02, 0.02, 0.022]), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
+            builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, np.array([0.02, 0.02, 0.022]), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
 
 
 def _cars(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     h, paint = boxes.half, boxes.pick(CAR_COLORS)
-    builder.add(boxes, meshes.ROUNDED, h * [1, 0.97, 0.36], CAR_PAINT, paint, offset=h * [0, 0, -0.36])
-    builder.add(boxes, meshes.CABIN, h * [0.56, 0.84, 0.37], CABIN, paint, offset=h * [-0.08, 0, 0.3])
-    builder.add(boxes, meshes.CABIN, h * [0.36, 0.69, 0.19], CAR_PAINT, paint, offset=h * [-0.08, 0, 0.81])
+    builder.add(boxes, meshes.ROUNDED, h * [1, 0.97, 0.36], parts.CAR_PAINT, paint, offset=h * [0, 0, -0.36])
+    builder.add(boxes, meshes.CABIN, h * [0.56, 0.84, 0.37], parts.CABIN, paint, offset=h * [-0.08, 0, 0.3])
+    builder.add(boxes, meshes.CABIN, h * [0.36, 0.69, 0.19], parts.CAR_PAINT, paint, offset=h * [-0.08, 0, 0.81])
     _wheels(builder, boxes, np.minimum(0.43 * h[:, 2], 0.2 * h[:, 0]), 0.6)
 
 
 def _trucks(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     h, paint = boxes.half, boxes.pick(CAR_COLORS)
-    builder.add(boxes, meshes.BOX, h * [0.7, 1, 0.83], PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17])
-    builder.add(boxes, meshes.ROUNDED, h * [0.27, 0.94, 0.46], CAR_PAINT, paint, offset=h * [0.72, 0, -0.3])
-    builder.add(boxes, meshes.CABIN, h * [0.26, 0.92, 0.3], CABIN, paint, offset=h * [0.68, 0, 0.3])
+    builder.add(boxes, meshes.BOX, h * [0.7, 1, 0.83], parts.PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17])
+    builder.add(boxes, meshes.ROUNDED, h * [0.27, 0.94, 0.46], parts.CAR_PAINT, paint, offset=h * [0.72, 0, -0.3])
+    builder.add(boxes, meshes.CABIN, h * [0.26, 0.92, 0.3], parts.CABIN, paint, offset=h * [0.68, 0, 0.3])
     _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.68)
 
 
 def _buses(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     h = boxes.half
-    builder.add(boxes, meshes.BOX, h * [1, 1, 0.9], BUS, boxes.pick(CAR_COLORS[3:6]), offset=h * [0, 0, 0.1])
+    builder.add(boxes, meshes.BOX, h * [1, 1, 0.9], parts.BUS, boxes.pick(CAR_COLORS[3:6]), offset=h * [0, 0, 0.1])
     _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.62)
 
 
@@ -258,16 +231,22 @@ def _two_wheelers(builder: PartBuilder, boxes: Boxes) -> None:
     size = np.stack([radius, radius, np.minimum(0.05, h[:, 1])], axis=1)
     for front in (-1.0, 1.0):
         offset = np.stack([front * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]], axis=1)
-        builder.add(boxes, meshes.CYLINDER, size, RUBBER, np.array([0.03, 0.03, 0.03]), offset=offset, turn=_WHEEL_TURN)
-    builder.add(boxes, meshes.ROUNDED, h * [0.5, 0.25, 0.22], CAR_PAINT, boxes.pick(CAR_COLORS), offset=h * [0, 0, 0.1])
-    builder.add(boxes, meshes.BOX, h * [0.06, 0.95, 0.06], METAL, np.array([0.1, 0.1, 0.1]), offset=h * [0.45, 0, 0.9])
+        builder.add(
+            boxes, meshes.CYLINDER, size, parts.RUBBER, np.array([0.03, 0.03, 0.03]), offset=offset, turn=_WHEEL_TURN
+        )
+    builder.add(
+        boxes, meshes.ROUNDED, h * [0.5, 0.25, 0.22], parts.CAR_PAINT, boxes.pick(CAR_COLORS), offset=h * [0, 0, 0.1]
+    )
+    builder.add(
+        boxes, meshes.BOX, h * [0.06, 0.95, 0.06], parts.METAL, np.array([0.1, 0.1, 0.1]), offset=h * [0.45, 0, 0.9]
+    )
 
 
 def _pole(builder: PartBuilder, boxes: Boxes, most_m: float = 0.1) -> None:
     h = boxes.half
     radius = np.minimum(np.minimum(h[:, 0], h[:, 1]), most_m)
     size = np.stack([radius, radius, 0.985 * h[:, 2]], axis=1)
-    builder.add(boxes, meshes.CYLINDER, size, METAL, np.array([0.17, 0.18, 0.18]), offset=h * [0, 0, -0.015])
+    builder.add(boxes, meshes.CYLINDER, size, parts.METAL, np.array([0.17, 0.18, 0.18]), offset=h * [0, 0, -0.015])
 
 
 def _poles(builder: PartBuilder, boxes: Boxes) -> None:
@@ -275,20 +254,20 @@ def _poles(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     is_head = boxes.half[:, 2] < boxes.half[:, 0]  # maps that keep arm and head apart from the pole
     heads = boxes.select(is_head)
-    builder.add(heads, meshes.ROUNDED, heads.half, LAMP, np.array([0.17, 0.17, 0.17]))
+    builder.add(heads, meshes.ROUNDED, heads.half, parts.LAMP, np.array([0.17, 0.17, 0.17]))
     boxes = boxes.select(~is_head)
     _pole(builder, boxes)
     lamps = boxes.select(boxes.half[:, 2] > 1.2)
     h = lamps.half
     grey = np.array([0.2, 0.2, 0.2])
     size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)], axis=1)
-    builder.add(lamps, meshes.BOX, size, METAL, grey, offset=h * [0, 0, 0.96], min_px=FAR_PX)
+    builder.add(lamps, meshes.BOX, size, parts.METAL, grey, offset=h * [0, 0, 0.96], min_px=FAR_PX)
     head = np.stack(
         [np.minimum(0.9 * h[:, 0], 0.35), np.minimum(h[:, 1], 0.16), np.minimum(0.04 * h[:, 2], 0.1)], axis=1
     )
     for side in (-1.0, 1.0):
         offset = np.stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]], axis=1)
-        builder.add(lamps, meshes.ROUNDED, head, LAMP, np.array([0.75, 0.74, 0.68]), offset=offset)
+        builder.add(lamps, meshes.ROUNDED, head, parts.LAMP, np.array([0.75, 0.74, 0.68]), offset=offset)
 
 
 def _traffic_lights(builder: PartBuilder, boxes: Boxes) -> None:
@@ -298,8 +277,8 @@ def _traffic_lights(builder: PartBuilder, boxes: Boxes) -> None:
     head = np.stack([np.minimum(h[:, 0], 0.22), np.minimum(h[:, 1], 0.2), np.minimum(0.35 * h[:, 2], 0.55)], axis=1)
     offset = np.stack([h[:, 0] - head[:, 0], 0 * h[:, 1], h[:, 2] - head[:, 2]], axis=1)
     arm = np.stack([h[:, 0], np.minimum(h[:, 1], 0.05), np.minimum(0.05 * h[:, 2], 0.05)], axis=1)
-    builder.add(boxes, meshes.BOX, arm, METAL, np.array([0.14, 0.14, 0.14]), offset=h * [0, 0, 0.9])
-    builder.add(boxes, meshes.BOX, head, SIGNAL, np.array([0.03, 0.035, 0.03]), offset=offset)
+    builder.add(boxes, meshes.BOX, arm, parts.METAL, np.array([0.14, 0.14, 0.14]), offset=h * [0, 0, 0.9])
+    builder.add(boxes, meshes.BOX, head, parts.SIGNAL, np.array([0.03, 0.035, 0.03]), offset=offset)
 
 
 def _signs(builder: PartBuilder, boxes: Boxes) -> None:
@@ -309,35 +288,37 @@ def _signs(builder: PartBuilder, boxes: Boxes) -> None:
     colors = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
     size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.03), np.minimum(h[:, 0], 0.5 * h[:, 2])], axis=1)
     offset = np.stack([0 * h[:, 0], 0 * h[:, 1], h[:, 2] - size[:, 2]], axis=1)
-    builder.add(boxes, meshes.BOX, size, METAL, boxes.pick(colors), offset=offset)
+    builder.add(boxes, meshes.BOX, size, parts.METAL, boxes.pick(colors), offset=offset)
 
 
 def _bystanders(builder: PartBuilder, boxes: Boxes) -> None:
     """People of the map stand still: trousers, coat, head."""
     h = boxes.half
     coats = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
-    builder.add(boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], CLOTH, np.array([0.05, 0.06, 0.09]), offset=h * [0, 0, -0.54])
-    builder.add(boxes, meshes.ROUNDED, h * [0.55, 0.85, 0.36], CLOTH, boxes.pick(coats), offset=h * [0, 0, 0.28])
     builder.add(
-        boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], CLOTH, np.array([0.5, 0.32, 0.22]), offset=h * [0, 0, 0.82]
+        boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, np.array([0.05, 0.06, 0.09]), offset=h * [0, 0, -0.54]
+    )
+    builder.add(boxes, meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, boxes.pick(coats), offset=h * [0, 0, 0.28])
+    builder.add(
+        boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, np.array([0.5, 0.32, 0.22]), offset=h * [0, 0, 0.82]
     )
 
 
 BUILDERS = {
     KINDS[name]: build
     for name, build in {
-        "Roads": _slab(ROAD, (0.095, 0.095, 0.1), "Roads"),
+        "Roads": _box(parts.ROAD, (0.095, 0.095, 0.1), LAYERS["Roads"]),
         "Sidewalks": _sidewalks,
-        "Terrain": _slab(GRASS, (0.105, 0.14, 0.045), "Terrain"),
-        "Ground": _slab(GRAVEL, (0.30, 0.275, 0.235), "Ground"),
-        "RoadLines": _slab(ROAD_LINE, (0.62, 0.62, 0.6), "RoadLines"),
-        "RailTrack": _slab(GRAVEL, (0.20, 0.18, 0.165), "RailTrack"),
-        "Water": _slab(WATER, (0.03, 0.07, 0.09), "Water"),
+        "Terrain": _box(parts.GRASS, (0.105, 0.14, 0.045), LAYERS["Terrain"]),
+        "Ground": _box(parts.GRAVEL, (0.30, 0.275, 0.235), LAYERS["Ground"]),
+        "RoadLines": _box(parts.ROAD_LINE, (0.62, 0.62, 0.6), LAYERS["RoadLines"]),
+        "RailTrack": _box(parts.GRAVEL, (0.20, 0.18, 0.165), LAYERS["RailTrack"]),
+        "Water": _box(parts.WATER, (0.03, 0.07, 0.09), LAYERS["Water"]),
         "Buildings": _buildings,
-        "Walls": _solid(BRICK, (0.42, 0.24, 0.18)),
-        "Fences": _solid(FENCE, (0.30, 0.23, 0.16)),
-        "GuardRail": _solid(METAL, (0.42, 0.43, 0.44)),
-        "Bridge": _solid(CONCRETE, (0.42, 0.41, 0.39)),
+        "Walls": _box(parts.BRICK, (0.42, 0.24, 0.18)),
+        "Fences": _box(parts.FENCE, (0.30, 0.23, 0.16)),
+        "GuardRail": _box(parts.METAL, (0.42, 0.43, 0.44)),
+        "Bridge": _box(parts.CONCRETE, (0.42, 0.41, 0.39)),
         "Poles": _poles,
         "TrafficLight": _traffic_lights,
         "TrafficSigns": _signs,
