@@ -218,7 +218,7 @@ class StageFolder:
             inputs={name: StageInput(path=str(p), sha256=fingerprint(p)) for name, p in sorted(inputs.items())},
             code_version=cosfly.__version__,
         )
-        stage_file, manifest_file = out / "stage.json", out / "manifest.json"
+        stage_file = out / "stage.json"
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
         if stage_file.exists() and not _holds_work(out):
@@ -231,15 +231,11 @@ class StageFolder:
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )
-        is_complete = manifest_file.exists()
+        is_complete = (out / "manifest.json").exists() and not read_manifest(out).counts.failed
         if is_complete:
-            manifest = read_manifest(out)
-            if manifest.counts.failed:
-                manifest_file.unlink()  # failed items are tried again; the others stand in the journal
-                is_complete = False
-            else:
-                _check_outputs_exist(out, manifest)
-        if not is_complete:
+            _check_outputs_exist(out, read_manifest(out))
+        else:  # failed items are tried again; the others stand in the journal
+            (out / "manifest.json").unlink(missing_ok=True)
             write_model(stage_file, record, schema=STAGE_SCHEMA, version=VERSION)
             remove_partials(out)
         return cls(out, stage, is_complete)
@@ -250,9 +246,8 @@ class StageFolder:
 
     def items(self) -> Iterator[ItemRecord]:
         """Yield the outcomes in the journal; an item that failed and was tried again has several."""
-        journal = self.journal
-        with validation_errors(journal.path):
-            for record in journal.read():
+        with validation_errors(self.journal.path):
+            for record in self.journal.read():
                 yield _ITEM.validate_python(record)
 
     def finish(self, outputs: Iterable[Path], tally: Tally, **facts: Any) -> None:
@@ -291,10 +286,6 @@ class StageFolder:
             expected=expected,
             fix="mend what the records in that folder name, or change the settings and choose another --out",
         )
-
-    def manifest(self) -> Manifest:
-        """Read the manifest of this complete stage."""
-        return read_manifest(self.path)
 
 
 def _continue(out: Path, record: StageRecord, resume: Resume) -> StageRecord:

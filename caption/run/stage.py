@@ -23,7 +23,7 @@ from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest
 from cosfly.store import write_json
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
     """Tell whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
-    limit = stage.manifest().facts.get("limit")
+    limit = read_manifest(stage.path).facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
     (stage.path / "manifest.json").unlink()

@@ -16,10 +16,12 @@ Result = Literal["accepted", "review", "rejected"]
 RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
-class FlightInspection(BaseModel):
-    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown."""
-
+class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+
+class FlightInspection(_Strict):
+    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown."""
 
     town: str
     trajectory: str
@@ -36,10 +38,8 @@ class FlightInspection(BaseModel):
         return self.issues[0].code if self.result != "accepted" and self.issues else None
 
 
-class TrajectoryFunnel(BaseModel):
+class TrajectoryFunnel(_Strict):
     """planned = sum(dropped) + not_rendered + rendered; rendered = accepted + review + rejected."""
-
-    model_config = ConfigDict(extra="forbid")
 
     planned: int
     dropped: dict[str, int]
@@ -55,10 +55,8 @@ class TrajectoryFunnel(BaseModel):
         assert self.rendered == self.accepted + self.review + self.rejected, self
 
 
-class FlightFunnel(BaseModel):
+class FlightFunnel(_Strict):
     """inspected = accepted + review + rejected; `reasons` counts the worst finding of those in review or rejected."""
-
-    model_config = ConfigDict(extra="forbid")
 
     inspected: int
     accepted: int
@@ -68,19 +66,15 @@ class FlightFunnel(BaseModel):
     reasons: dict[str, int]
 
 
-class Funnel(BaseModel):
+class Funnel(_Strict):
     """The way from planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
-
-    model_config = ConfigDict(extra="forbid")
 
     trajectories: TrajectoryFunnel
     flights: FlightFunnel
 
 
-class Inspection(BaseModel):
+class Inspection(_Strict):
     """The whole file."""
-
-    model_config = ConfigDict(extra="forbid")
 
     settings: dict[str, Any]
     funnel: Funnel
