@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.products.captions import FIELDS, Caption, read_captions
-from release.columns import CAPTION_FIELDS, ReleasedCaption
+from release.columns import ReleasedCaption
 
 
 @dataclass
@@ -47,18 +47,17 @@ def _released(caption: Caption, path: Path) -> ReleasedCaption:
     if caption.en.flight_decision != caption.zh.flight_decision:
         got = f"{caption.en.flight_decision} and {caption.zh.flight_decision}"
         raise InputError("the two languages decide differently", where=f"{path}: {caption.sample_id}", got=got)
-    answers = {"en": caption.en, "zh": caption.zh}
-    texts = {f"caption_{lang}_{name}": getattr(answer, name) for lang, answer in answers.items() for name in FIELDS}
-    assert set(texts) == set(CAPTION_FIELDS)
-    return ReleasedCaption(
-        tuple(caption.window),
-        texts,
-        {
-            "decision": caption.en.flight_decision,
-            "label": caption.label,
-            "verdict": caption.verdict,
-            "repair_strategy": caption.repair.strategy if caption.repair else None,
-            "teacher_kind": caption.teacher.kind,
-            "teacher_model": caption.teacher.model,
-        },
-    )
+    texts = {
+        f"caption_{language}_{name}": getattr(answer, name)
+        for language, answer in (("en", caption.en), ("zh", caption.zh))
+        for name in FIELDS
+    }
+    facts = {
+        "decision": caption.en.flight_decision,
+        "label": caption.label,
+        "verdict": caption.verdict,
+        "repair_strategy": caption.repair.strategy if caption.repair else None,
+        "teacher_kind": caption.teacher.kind,
+        "teacher_model": caption.teacher.model,
+    }
+    return ReleasedCaption(tuple(caption.window), facts | texts)

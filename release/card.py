@@ -20,7 +20,7 @@ import yaml
 
 from cosfly.products.frames import FrameFile
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, PICTURES, SCALAR_NAMES, WINDOW, schema
-from release.record import CaptionNumbers, FileNumbers, History, Numbers, ReleaseRecord, Spread
+from release.record import CaptionNumbers, FileNumbers, FramesBy, History, Numbers, ReleaseRecord, Spread
 
 DIGITS = 4
 FILE_TEXT: dict[FrameFile, str] = {
@@ -101,7 +101,7 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         frames=totals["frames"],
         flights=len(flights),
         trajectories=len({key[:2] for key in flights}),
-        frames_by={name: _sorted(counts[name]) for name in ("town", "track", "fov_deg", "image_px")},
+        frames_by=FramesBy(**{name: _sorted(counts[name]) for name in FramesBy.model_fields}),
         trajectories_by_fov_deg=_sorted(Counter(fovs.values())),
         flights_by_track=_sorted(Counter("clean" if key[2] == "ORI" else "perturbed" for key in flights)),
         frames_per_flight=_spread([float(len(points)) for points in flights.values()]),
@@ -259,7 +259,7 @@ def _maps(record: ReleaseRecord) -> list[str]:
 def _summary(record: ReleaseRecord) -> str:
     numbers = record.numbers
     tracks = ", ".join(f"{count} {name}" for name, count in numbers.flights_by_track.items())
-    towns = len(numbers.frames_by["town"])
+    towns = len(numbers.frames_by.town)
     return (
         f"{numbers.frames:,} frames of {numbers.flights:,} flights ({tracks}) "
         f"over {numbers.trajectories:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
@@ -267,13 +267,9 @@ def _summary(record: ReleaseRecord) -> str:
     )
 
 
-def _groups(frames_by: dict[str, dict[str, int]]) -> list[tuple[str, str]]:
+def _groups(frames_by: FramesBy) -> list[tuple[str, str]]:
     titles = {"town": "town", "track": "track", "fov_deg": "field of view (degrees)", "image_px": "image (px)"}
-    return [
-        (f"{titles[name]} {value}", f"{count:,}")
-        for name, counts in frames_by.items()
-        for value, count in counts.items()
-    ]
+    return [(f"{titles[name]} {value}", f"{count:,}") for name, counts in frames_by for value, count in counts.items()]
 
 
 def _spreads(numbers: Numbers) -> str:
@@ -304,7 +300,8 @@ def _characters(mean: dict[str, float | None]) -> str:
     rows = []
     for english in CAPTION_FIELDS[: len(CAPTION_FIELDS) // 2]:
         chinese = english.replace("_en_", "_zh_")
-        cells = ("-" if mean[name] is None else f"{mean[name]:.1f}" for name in (english, chinese))
+        values = (mean.get(name) for name in (english, chinese))
+        cells = ("-" if value is None else f"{value:.1f}" for value in values)
         rows.append((english.removeprefix("caption_en_"), *cells))
     return _table(("mean characters", "English", "Chinese"), rows)
 
@@ -314,10 +311,10 @@ def _example(example: dict[str, str]) -> str:
         return "No frame has a caption."
     half = len(CAPTION_FIELDS) // 2
     rows = [
-        (english.removeprefix("caption_en_"), example[english], example[chinese])
+        (english.removeprefix("caption_en_"), example.get(english, "-"), example.get(chinese, "-"))
         for english, chinese in zip(CAPTION_FIELDS[:half], CAPTION_FIELDS[half:], strict=True)
     ]
-    return f"`{example['sample_id']}`:\n\n{_table(('', 'English', 'Chinese'), rows)}"
+    return f"`{example.get('sample_id')}`:\n\n{_table(('', 'English', 'Chinese'), rows)}"
 
 
 def _funnel(history: History) -> str:

@@ -54,8 +54,7 @@ class ReleasedCaption:
     """What a row holds of an accepted caption."""
 
     window: tuple[int, ...]
-    texts: dict[str, str]  # CAPTION_FIELDS
-    facts: dict[str, str | None]  # CAPTION_FACTS
+    values: dict[str, str | None]  # CAPTION_FACTS and CAPTION_FIELDS
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -96,12 +95,8 @@ class Column:
         return bool(value) if self.type == "bool" else value
 
 
-def _fact(name: str) -> Column:
-    return Column(name, "string", lambda _, __, caption: caption.facts[name] if caption else None)
-
-
-def _text(name: str) -> Column:
-    return Column(name, "string", lambda _, __, caption: caption.texts[name] if caption else None)
+def _said(name: str) -> Column:
+    return Column(name, "string", lambda _, __, caption: caption.values[name] if caption else None)
 
 
 def _picture(file: FrameFile) -> Value:
@@ -140,8 +135,7 @@ SCALARS = (  # everything but pictures and depth
     Column("drone_offset", POSE, lambda f, i, _: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]])),
     Column("target_offset", POINT, lambda f, i, _: f.target_offsets_m[i]),
     Column("has_caption", "bool", lambda f, i, caption: caption is not None),
-    *map(_fact, CAPTION_FACTS),
-    *map(_text, CAPTION_FIELDS),
+    *map(_said, (*CAPTION_FACTS, *CAPTION_FIELDS)),
     Column(WINDOW, "indices", lambda f, i, caption: list(caption.window) if caption else None),
 )
 SCALAR_NAMES = [column.name for column in SCALARS]

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.store import read_model, write_model
-from release.columns import CAPTION_FIELDS
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
 
@@ -64,7 +63,7 @@ class Spread(Strict):
 
 
 class CaptionNumbers(Strict):
-    """Frames by what their captions say; `example` is the first caption, empty without any."""
+    """Frames by what their captions say; `example` is the first one's sample_id and texts, empty without any."""
 
     frames_with: int
     frames_without: int
@@ -79,19 +78,18 @@ class CaptionNumbers(Strict):
     mean_characters: dict[str, float | None]
     example: dict[str, str]
 
-    @model_validator(mode="after")
-    def _fields_are_whole(self) -> CaptionNumbers:
-        if set(self.mean_characters) != set(CAPTION_FIELDS):
-            raise ValueError("mean_characters must name every caption column")
-        if self.example and set(self.example) != {"sample_id", *CAPTION_FIELDS}:
-            raise ValueError("example must name sample_id and every caption column")
-        return self
-
 
 class FileNumbers(Strict):
     shards: int
     bytes: int
     bytes_by_modality: Counts
+
+
+class FramesBy(Strict):
+    town: Counts
+    track: Counts
+    fov_deg: Counts
+    image_px: Counts
 
 
 class Numbers(Strict):
@@ -100,7 +98,7 @@ class Numbers(Strict):
     frames: int
     flights: int
     trajectories: int
-    frames_by: dict[str, Counts]
+    frames_by: FramesBy
     trajectories_by_fov_deg: Counts
     flights_by_track: Counts
     frames_per_flight: Spread
