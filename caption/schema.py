@@ -76,8 +76,8 @@ class FutureMotion:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One window and its future. Whoever asks a teacher passes on `observed` only."""
+class Window:
+    """What was observed and what came after. Whoever asks a teacher passes on `observed` only."""
 
     observed: ObservedWindow
     future: FutureMotion

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from caption.schema import CaptionConfig, Sample, Strategy
+from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.prompts import Question, make_question, prompt_hash
 from caption.teachers.teacher import Teacher
 from caption.truth.actions import Motion, label_of, measure, verdict_of
@@ -31,7 +31,7 @@ from cosfly.products.captions import (
 )
 
 
-async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:
+async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:
     """Caption one window.
 
     Args:
@@ -40,13 +40,13 @@ async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, j
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
     """
-    window = sample.observed
-    motion = measure(sample.future)
-    facts = measure_facts(window)
-    question = make_question(window, facts, cfg.image)
+    observed = window.observed
+    motion = measure(window.future)
+    facts = measure_facts(observed)
+    question = make_question(observed, facts, cfg.image)
     loop = _Loop(teacher, cfg, motion, label_of(motion, cfg.label), judge)
-    loop.checks.keyframe = sample.keyframe
-    reason = sample.problem
+    loop.checks.keyframe = window.keyframe
+    reason = window.problem
     if reason is None:
         try:
             reason = await loop.run(question)
@@ -58,13 +58,13 @@ async def caption_window(sample: Sample, teacher: Teacher, cfg: CaptionConfig, j
             reason = "unreadable_frame"
             loop.checks.frame = error.what
     return Caption(
-        sample_id=window.sample_id,
-        town=window.town,
-        trajectory=window.trajectory,
-        variant=window.variant,
-        frame_index=window.indices[-1],
-        window=list(window.indices),
-        future=list(sample.future.indices),
+        sample_id=observed.sample_id,
+        town=observed.town,
+        trajectory=observed.trajectory,
+        variant=observed.variant,
+        frame_index=observed.indices[-1],
+        window=list(observed.indices),
+        future=list(window.future.indices),
         prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
         prompt_hash=prompt_hash(question.prompts),
         teacher=teacher.record.model_copy(update={"structured": loop.structured}),
@@ -94,17 +94,17 @@ class Trial:
     tokens: int
 
 
-async def try_strategy(sample: Sample, teacher: Teacher, cfg: CaptionConfig, strategy: Strategy) -> Trial | None:
+async def try_strategy(window: Window, teacher: Teacher, cfg: CaptionConfig, strategy: Strategy) -> Trial | None:
     """Repair a window's first answer by a strategy; None where that answer is none or is not rejected.
 
     Raises:
         NoAnswer: the teacher gave none.
     """
-    facts = measure_facts(sample.observed)
-    motion = measure(sample.future)
+    facts = measure_facts(window.observed)
+    motion = measure(window.future)
     repair = cfg.repair.model_copy(update={"strategy": strategy})
     loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), motion, label_of(motion, cfg.label))
-    question = make_question(sample.observed, facts, cfg.image)
+    question = make_question(window.observed, facts, cfg.image)
     if await loop.ask_freely(question) is not None or loop.verdict not in repair.verdicts or loop.label is None:
         return None
     assert loop.english is not None

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Sample, WindowConfig
+from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Window, WindowConfig
 from caption.truth.actions import label_of, measure
 from cosfly.products.captions import KeyframeRecord
 from cosfly.products.playback import Flight, sample_id
@@ -25,8 +25,8 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
     return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
 
 
-def iterate_samples(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFAULT_LABEL) -> Iterator[Sample]:
-    """Yield a flight's samples in order of time. A flight shorter than a window gives none.
+def cut_windows(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFAULT_LABEL) -> Iterator[Window]:
+    """Yield a flight's windows in order of time. A flight shorter than a window gives none.
 
     Args:
         label: thresholds by which keyframes are chosen; the choice takes windows, it shows a teacher nothing.
@@ -48,7 +48,7 @@ def iterate_samples(flight: Flight, cfg: WindowConfig, label: LabelConfig = DEFA
         observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders, files)
         problem = "missing_frame" if missing.intersection(observed.indices) else None
         future = cut_future(flight, clean_positions, clean_yaw_deg, current, cfg.future_frames)
-        yield Sample(observed, future, problem, keyframe)
+        yield Window(observed, future, problem, keyframe)
 
 
 def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, KeyframeRecord]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.truth.actions import label_of, measure
-from caption.windows import choose_keyframes, iterate_samples, missed_changes
+from caption.windows import choose_keyframes, cut_windows, missed_changes
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
 from specimens import make_playback_tree
@@ -63,7 +63,7 @@ def test_a_run_reports_what_it_saved(tmp_path):
     ids = {caption.sample_id for caption in taken}
     cfg = CaptionConfig.model_validate({"window": window})
     for folder in find_flights(tree):
-        samples = list(iterate_samples(read_flight(folder), cfg.window))
+        samples = list(cut_windows(read_flight(folder), cfg.window))
         labels = [label_of(measure(sample.future), cfg.label) for sample in samples]
         for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
             assert before == after or sample.observed.sample_id in ids

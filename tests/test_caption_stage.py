@@ -12,7 +12,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.truth.actions import label_of, measure
 from caption.truth.glossary import GLOSSARY_FILE, load_glossary
-from caption.windows import iterate_samples
+from caption.windows import cut_windows
 from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
@@ -33,7 +33,7 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     captions = list(read_captions(done / "captions.jsonl"))
     expected = {}
     for folder in find_flights(tree):
-        for sample in iterate_samples(read_flight(folder), CaptionConfig().window):
+        for sample in cut_windows(read_flight(folder), CaptionConfig().window):
             expected[sample.observed.sample_id] = label_of(measure(sample.future), CaptionConfig().label)
     assert [caption.sample_id for caption in captions] == sorted(expected)
     assert {caption.sample_id: caption.label for caption in captions} == expected

@@ -14,7 +14,7 @@ from caption.teachers.rules import write_answers
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.truth.verify import check_evidence, check_mirror, flight_numbers
-from caption.windows import iterate_samples
+from caption.windows import cut_windows
 from cosfly.products.captions import ACTIONS, Coc
 from specimens import make_flight
 
@@ -171,7 +171,7 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
         for variant in ("ORI", "aug_001"):
             flight, _ = make_flight(30, seed=seed, variant=variant, width_px=640, height_px=360)
             flight = dataclasses.replace(flight, folder=Path("nowhere"))
-            for sample in iterate_samples(flight, WindowConfig(require_images=False, stride=2)):
+            for sample in cut_windows(flight, WindowConfig(require_images=False, stride=2)):
                 facts = measure_facts(sample.observed)
                 captions.append((facts, *write_answers(facts, np.random.default_rng([seed, len(captions)]))))
     return captions

@@ -16,10 +16,10 @@ from teacher_server import TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig
 from caption.teachers.images import FrameEncoder
-from caption.teachers.prompts import answer_schema, make_question, mirror_schema, question_messages, system_prompt
+from caption.teachers.prompts import make_question, question_messages, system_prompt
 from caption.truth.facts import measure_facts
-from caption.windows import current_frames, iterate_samples
-from cosfly.products.captions import ACTIONS
+from caption.windows import current_frames, cut_windows
+from cosfly.products.captions import ACTIONS, answer_schema
 from cosfly.products.playback import find_flights, read_flight, write_flight
 from specimens import make_flight, make_playback_tree
 
@@ -44,7 +44,7 @@ def test_current_frames_have_a_whole_past_and_future(num_points, stride, expecte
 
 
 def test_samples_carry_their_frames_and_ids(tree):
-    samples = list(iterate_samples(flight_in(tree), WindowConfig(stride=2)))
+    samples = list(cut_windows(flight_in(tree), WindowConfig(stride=2)))
     assert [sample.observed.indices[-1] for sample in samples] == [4, 6, 8, 10]
     assert samples[0].observed.sample_id == "trajectory_1776047127_ORI_frame_00004"
     assert samples[1].observed.indices == (2, 3, 4, 5, 6)
@@ -54,7 +54,7 @@ def test_samples_carry_their_frames_and_ids(tree):
 
 def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
     flight = flight_in(tree)
-    sample = next(iterate_samples(flight, WindowConfig()))
+    sample = next(cut_windows(flight, WindowConfig()))
     assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
     for field in dataclasses.fields(ObservedWindow):
         value = getattr(sample.observed, field.name)
@@ -120,7 +120,7 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     cfg = ImageConfig(layout=layout)
     found = []
     for root in (tree, spoiled):
-        sample = next(s for s in iterate_samples(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
+        sample = next(s for s in cut_windows(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
         question = make_question(sample.observed, measure_facts(sample.observed), cfg)
         messages, digests = question_messages(question, FrameEncoder(cfg))
         found.append((question.prompts, json.dumps(messages), digests))
@@ -129,14 +129,14 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     changed = [
         make_question(s.observed, measure_facts(s.observed), cfg).prompts
         for root in (tree, spoiled)
-        for s in iterate_samples(flight_in(root), NO_IMAGES)
+        for s in cut_windows(flight_in(root), NO_IMAGES)
         if s.observed.indices[-1] == current + 1
     ]
     assert changed[0] != changed[1]
 
 
 def test_facts_of_a_hand_made_window(tree):
-    window = next(iterate_samples(flight_in(tree), WindowConfig())).observed
+    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
     x = np.arange(5.0)
     window = dataclasses.replace(
         window,
@@ -175,7 +175,7 @@ def test_prompts_name_the_closed_set_and_the_shape():
         assert all(token in text for token in ACTIONS)
         assert all(name in text for name in ("critical_components", "reasoning_trace", "flight_decision"))
     assert answer_schema()["properties"]["flight_decision"]["enum"] == list(ACTIONS)
-    assert mirror_schema("hover")["properties"]["flight_decision"]["enum"] == ["hover"]
+    assert answer_schema("hover", "zh")["properties"]["flight_decision"]["enum"] == ["hover"]
 
 
 def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
@@ -193,7 +193,7 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
         (frame / "depth.npy").unlink()
         rgb = cv2.imread(str(frame / "rgb.png"))
         cv2.imwrite(str(frame / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_BGR2BGRA))
-    sample = next(iterate_samples(flight_in(root), WindowConfig()))
+    sample = next(cut_windows(flight_in(root), WindowConfig()))
     facts = measure_facts(sample.observed)
     assert facts.box_width_px == (None,) * 5
     assert facts.offset_x_px[-1] is not None  # from image_uv
@@ -209,7 +209,7 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
 def test_pictures_are_bounded_and_encoded_once_per_frame(tree, layout, num_images, width_px):
     cfg = ImageConfig(layout=layout, max_side_px=32, encoding="png")
     encoder = FrameEncoder(cfg)
-    for sample in list(iterate_samples(flight_in(tree), WindowConfig()))[:4]:
+    for sample in list(cut_windows(flight_in(tree), WindowConfig()))[:4]:
         question = make_question(sample.observed, measure_facts(sample.observed), cfg)
         messages, digests = question_messages(question, encoder)
         assert len(digests) == num_images
@@ -226,6 +226,6 @@ def test_perturbation_is_taken_off_the_future_only():
     noisy = dataclasses.replace(noisy, folder=clean.folder)
     frames = {}
     for name, flight in (("clean", clean), ("noisy", noisy)):
-        frames[name] = next(iterate_samples(dataclasses.replace(flight, folder=Path("x")), NO_IMAGES))
+        frames[name] = next(cut_windows(dataclasses.replace(flight, folder=Path("x")), NO_IMAGES))
     np.testing.assert_allclose(frames["clean"].future.positions_m, frames["noisy"].future.positions_m, atol=1e-9)
     assert not np.allclose(frames["clean"].observed.positions_m, frames["noisy"].observed.positions_m)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from caption.run.flights import Allotted
 from caption.run.progress import Display
-from caption.schema import CaptionConfig, Sample
+from caption.schema import CaptionConfig, Window
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.judge import open_judge
 from caption.window_loop import caption_window
@@ -130,10 +130,10 @@ class Asking:
         flight = self.open[allotted.name] = _OpenFlight(allotted)
         num_windows = 0
         try:
-            for sample in allotted.samples(self.cfg):
+            for window in allotted.windows(self.cfg):
                 num_windows += 1
                 flight.pending += 1
-                running.add(asyncio.create_task(self._one(flight, sample, teacher)))
+                running.add(asyncio.create_task(self._one(flight, window, teacher)))
                 if len(running) >= self.most_open:
                     running = await _some_done(running)
                 if self.stopped:
@@ -153,10 +153,10 @@ class Asking:
         self._close_if_done(flight)
         return running
 
-    async def _one(self, flight: _OpenFlight, sample: Sample, teacher: Teacher) -> None:
-        sample_id = sample.observed.sample_id
+    async def _one(self, flight: _OpenFlight, window: Window, teacher: Teacher) -> None:
+        sample_id = window.observed.sample_id
         try:
-            caption = await caption_window(sample, teacher, self.cfg, self.judge)
+            caption = await caption_window(window, teacher, self.cfg, self.judge)
         except BudgetSpent as error:
             self.stopped = self.stopped or str(error)
             self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=str(error)))
@@ -213,8 +213,8 @@ class Asking:
     def _write_failures(self) -> None:
         """Write what failed: flights and windows of this run, and the quarantine of all runs."""
         windows = [failure for failure in self.unanswered if failure.code != "not_asked"]
-        for name, records in ((FAILURES, self.failures + windows), (QUARANTINE, list(self.quarantine.values()))):
-            write_failures(self.stage.path / name, records)
+        write_failures(self.stage.path / FAILURES, self.failures + windows)
+        write_failures(self.stage.path / QUARANTINE, self.quarantine.values())
 
 
 async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
-from caption.schema import CaptionConfig, Sample, Strategy
+from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.window_loop import Trial, try_strategy
 from cosfly.chat.answers import AnswerBook
@@ -101,10 +101,10 @@ async def _try_all(
     num_windows = 0
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked once for all strategies
         async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            samples = iter(_samples(cfg, data))
-            while batch := list(itertools.islice(samples, cfg.most_in_flight)):
+            windows = iter(_windows(cfg, data))
+            while batch := list(itertools.islice(windows, cfg.most_in_flight)):
                 num_windows += len(batch)
-                for tried in await asyncio.gather(*(_try_each(sample, teacher, cfg) for sample in batch)):
+                for tried in await asyncio.gather(*(_try_each(window, teacher, cfg) for window in batch)):
                     if tried is not None and len(trials[STRATEGIES[0]]) < most:
                         for strategy in STRATEGIES:
                             trials[strategy].append(tried[strategy])
@@ -113,12 +113,12 @@ async def _try_all(
     return num_windows, trials
 
 
-async def _try_each(sample: Sample, teacher: Teacher, cfg: CaptionConfig) -> dict[Strategy, Trial] | None:
+async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig) -> dict[Strategy, Trial] | None:
     """Give a trial per strategy; None where the first answer is no conflict or an answer is missing."""
     found: dict[Strategy, Trial] = {}
     for strategy in STRATEGIES:
         try:
-            trial = await try_strategy(sample, teacher, cfg, strategy)
+            trial = await try_strategy(window, teacher, cfg, strategy)
         except NoAnswer:
             return None
         if trial is None:
@@ -127,9 +127,9 @@ async def _try_each(sample: Sample, teacher: Teacher, cfg: CaptionConfig) -> dic
     return found
 
 
-def _samples(cfg: CaptionConfig, data: Path) -> Iterable[Sample]:
+def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
     for flight in allot(named_flights(data), cfg)[0]:
-        yield from (sample for sample in flight.samples(cfg) if sample.problem is None)
+        yield from (window for window in flight.windows(cfg) if window.problem is None)
 
 
 def comparison_table(comparisons: list[Comparison]) -> Table:

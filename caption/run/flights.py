@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from caption.schema import CaptionConfig, Sample, WindowConfig
-from caption.windows import current_frames, iterate_samples
+from caption.schema import CaptionConfig, Window, WindowConfig
+from caption.windows import current_frames, cut_windows
 from cosfly.errors import InputError
 from cosfly.products.playback import find_flights, read_flight
 
@@ -38,17 +38,17 @@ class Allotted:
     def item_id(self) -> str:
         return self.name if self.most is None else f"{self.name}[:{self.most}]"
 
-    def samples(self, cfg: CaptionConfig) -> Iterator[Sample]:
+    def windows(self, cfg: CaptionConfig) -> Iterator[Window]:
         """Yield its windows in order of time.
 
         Raises:
             InputError: it cannot be read.
         """
         flight = read_flight(self.folder, strict=False)
-        for number, sample in enumerate(iterate_samples(flight, cfg.window, cfg.label)):
+        for number, window in enumerate(cut_windows(flight, cfg.window, cfg.label)):
             if number == self.most:
                 return
-            yield sample
+            yield window
 
     def guess_num_windows(self, cfg: WindowConfig) -> int:
         """Guess the number of windows from the frame folders, without reading the flight: for display and estimates."""
@@ -84,7 +84,7 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[All
     for name, folder in flights:
         try:
             flight = read_flight(folder, strict=False)
-            count = sum(1 for _ in iterate_samples(flight, cfg.window, cfg.label))
+            count = sum(1 for _ in cut_windows(flight, cfg.window, cfg.label))
         except InputError:
             count = 0  # the work itself records the failure
         if left == 0 and count > 0:

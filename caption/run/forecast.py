@@ -18,7 +18,7 @@ from caption.run.asking import ANSWERS
 from caption.run.flights import Allotted, allot, named_flights
 from caption.run.progress import duration
 from caption.run.stage import open_stage
-from caption.schema import CaptionConfig, Sample
+from caption.schema import CaptionConfig, Window
 from caption.teachers.prompts import make_question
 from caption.teachers.teacher import AskingTeacher, first_budget
 from caption.truth.facts import measure_facts
@@ -96,10 +96,10 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]
     guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
     num_windows = sum(guesses[flight.name] for flight in left)
-    samples = _trial_samples([flight for flight in left if guesses[flight.name]], guesses, cfg)
-    if not samples:
+    windows = _trial_windows([flight for flight in left if guesses[flight.name]], guesses, cfg)
+    if not windows:
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
-    rehearsal = asyncio.run(_rehearse(cfg, out, seed, samples))
+    rehearsal = asyncio.run(_rehearse(cfg, out, seed, windows))
     return forecast_from(rehearsal, num_windows, sum(guesses.values()) - num_windows, cfg)
 
 
@@ -159,27 +159,27 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(max(0.0, mean - half), mean, mean + half)
 
 
-def _trial_samples(flights: list[Allotted], guesses: dict[str, int], cfg: CaptionConfig) -> list[Sample]:
+def _trial_windows(flights: list[Allotted], guesses: dict[str, int], cfg: CaptionConfig) -> list[Window]:
     """Take windows from flights spread over all, each from another part of its flight."""
     count = min(TRIAL_WINDOWS, sum(guesses[flight.name] for flight in flights))
-    samples: dict[str, Sample] = {}
+    windows: dict[str, Window] = {}
     for number in range(count):
         flight = flights[number * len(flights) // count]
         position = min(guesses[flight.name] - 1, (2 * number + 1) * guesses[flight.name] // (2 * count))
         try:
-            found = next(itertools.islice(flight.samples(cfg), position, None), None)
+            found = next(itertools.islice(flight.windows(cfg), position, None), None)
         except InputError:
             continue  # the run itself records it
         if found is not None:
-            samples[found.observed.sample_id] = found
-    return list(samples.values())
+            windows[found.observed.sample_id] = found
+    return list(windows.values())
 
 
-async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, samples: list[Sample]) -> Rehearsal:
+async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, windows: list[Window]) -> Rehearsal:
     with AnswerBook(out / ANSWERS) as book:
         async with AskingTeacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            image_tokens = await _image_tokens(samples[0], teacher, cfg)
-            results = await asyncio.gather(*(_answered(sample, teacher, cfg) for sample in samples))
+            image_tokens = await _image_tokens(windows[0], teacher, cfg)
+            results = await asyncio.gather(*(_answered(window, teacher, cfg) for window in windows))
         captions = [result for result in results if isinstance(result, Caption)]
         seconds = [book.latency_s(flight_of(caption.sample_id), caption.sample_id) for caption in captions]
     if not captions:
@@ -187,16 +187,16 @@ async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, samples: list[Samp
     return Rehearsal(captions, seconds, image_tokens)
 
 
-async def _answered(sample: Sample, teacher: AskingTeacher, cfg: CaptionConfig) -> Caption | str:
+async def _answered(window: Window, teacher: AskingTeacher, cfg: CaptionConfig) -> Caption | str:
     try:
-        return await caption_window(sample, teacher, cfg)
+        return await caption_window(window, teacher, cfg)
     except (NoAnswer, BudgetSpent) as error:
         return str(error)
 
 
-async def _image_tokens(sample: Sample, teacher: AskingTeacher, cfg: CaptionConfig) -> int | None:
+async def _image_tokens(window: Window, teacher: AskingTeacher, cfg: CaptionConfig) -> int | None:
     """Ask one prompt with and without its pictures, for one token each: the difference is theirs."""
-    request = await teacher.request(make_question(sample.observed, measure_facts(sample.observed), cfg.image))
+    request = await teacher.request(make_question(window.observed, measure_facts(window.observed), cfg.image))
     counts: list[int] = []
     for messages in (request.messages, [_without_images(message) for message in request.messages]):
         try:

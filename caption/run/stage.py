@@ -150,7 +150,7 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 
 
 async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path) -> int:
-    captions = [await caption_window(sample, teacher, cfg) for sample in flight.samples(cfg)]
+    captions = [await caption_window(window, teacher, cfg) for window in flight.windows(cfg)]
     if captions:
         write_captions(flight.part(stage_path), captions)
     return len(captions)

@@ -24,7 +24,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
 from caption.window_loop import caption_window
-from caption.windows import iterate_samples
+from caption.windows import cut_windows
 from cosfly.products.captions import Caption, write_captions
 from specimens import FIRST_SECOND, make_flight, make_playback_tree
 
@@ -61,7 +61,7 @@ def measure_loop(num_windows: int) -> dict[str, float]:
 
 
 async def _caption(flight, teacher: RuleTeacher) -> list[Caption]:
-    return [await caption_window(sample, teacher, CFG) for sample in iterate_samples(flight, CFG.window)]
+    return [await caption_window(sample, teacher, CFG) for sample in cut_windows(flight, CFG.window)]
 
 
 def measure_stage(num_windows: int) -> dict[str, float]:
