@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
 from cosfly.chat.protocol import base_url, shown_url
 from cosfly.chat.throttle import Throttle
-from cosfly.errors import ResumeError, TeacherError
+from cosfly.errors import NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -81,7 +82,8 @@ DROPPING_FAULTS = [
 @pytest.mark.parametrize(("fault", "reason"), DROPPING_FAULTS)
 def test_a_lasting_fault_drops_windows_with_its_reason(tree, tmp_path, fault, reason):
     cfg = {"limit": 2, "repair": {"verdicts": ()}}
-    with TeacherServer(lambda number, body: fault, decision=lambda body: "ascend") as server:
+    server = TeacherServer(lambda number, body: fault, decision=lambda body: "ascend")
+    with server, pytest.raises(NothingKept, match=f"2 dropped .{reason} 2"):
         run(settings(server.url, **cfg), tree, tmp_path / "out")
     windows = report_of(tmp_path / "out")["windows"]
     assert windows == {"input": 2, "kept": 0, "dropped": {reason: 2}, "failed": {}}
@@ -177,9 +179,10 @@ def test_anchored_repair_enforces_the_label(tree, tmp_path):
 )
 def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
     """A teacher that insists on hovering: only an enforced decision can mend it."""
-    with TeacherServer(decision=lambda body: "hover") as server:
-        path = run(settings(server.url, repair={"strategy": strategy}), tree, tmp_path / "out")
-    repaired = [caption for caption in read_captions(path) if caption.repair]
+    server = TeacherServer(decision=lambda body: "hover")
+    with server, nullcontext() if "anchored" in rungs else pytest.raises(NothingKept):
+        run(settings(server.url, repair={"strategy": strategy}), tree, tmp_path / "out")
+    repaired = [caption for caption in read_captions(tmp_path / "out" / "captions.jsonl") if caption.repair]
     assert repaired
     for caption in repaired:
         assert caption.repair.strategy == strategy
@@ -211,9 +214,10 @@ def test_a_hint_can_mend_a_conflict(tree, tmp_path):
 
 
 def test_a_server_that_ignores_the_schema_exhausts_the_asks(tree, tmp_path):
-    with TeacherServer(lambda number, body: "schema_ignored", decision=lambda body: "hover") as server:
-        path = run(settings(server.url), tree, tmp_path / "out")
-    captions = list(read_captions(path))
+    server = TeacherServer(lambda number, body: "schema_ignored", decision=lambda body: "hover")
+    with server, pytest.raises(NothingKept):
+        run(settings(server.url), tree, tmp_path / "out")
+    captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))
     failed = [caption for caption in captions if caption.drop_reason == "regeneration_failed"]
     assert failed
     assert all(caption.repair.asks == 3 and caption.repair.outcome == "failed" for caption in failed)
