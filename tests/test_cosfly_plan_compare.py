@@ -12,14 +12,15 @@ from specimens_planning import CANYON, town_of, walk_along
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import NoPathError, NothingKept
+from cosfly.errors import ConfigError, NoPathError, NothingKept, ResumeError
 from cosfly.planners import compare, compare_plots
-from cosfly.planners.contract import PlanConfig
+from cosfly.planners.compare import CompareConfig
+from cosfly.planners.contract import PLANNERS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
 
-CFG = PlanConfig()
+CFG = CompareConfig()
 
 # tab:appendix_h_tastar_muco_delta and tab:appendix_h_four_axis_scores of the paper.
 PAPER = {
@@ -126,13 +127,13 @@ def test_the_record_is_what_the_flights_are(made):
         assert record["means"][planner]["blocked_fraction"] == pytest.approx(1 - seen, abs=1e-3)
         assert record["means"][planner]["collision_fraction"] == 0
         assert manifest["timings"][planner]["mean_ms"] > 0
-    assert record["win_rates"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}
+    assert record["win_rates"]["muco"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}
 
 
 def test_pictures_hold_both_colors(made):
     for name in ("compare_overlay.png", "compare_series.png", "compare_radar.png"):
         picture = cv2.imread(str(made / name))[..., ::-1].reshape(-1, 3).astype(int)
-        for color in compare_plots.COLORS.values():
+        for color in map(compare_plots.color_of, PLANNERS):
             assert (np.abs(picture - color).max(axis=1) <= 2).sum() > 100, name
 
 
@@ -148,13 +149,12 @@ def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkey
     code = (
         "import os, pathlib, signal, sys\n"
         "from cosfly.planners import compare\n"
-        "from cosfly.planners.contract import PlanConfig\n"
         "real = compare.plan_flight\n"
         "def deadly(walk, *rest):\n"
         "    if walk.path_id == 'b': os.kill(os.getpid(), signal.SIGKILL)\n"
         "    return real(walk, *rest)\n"
         "compare.plan_flight = deadly\n"
-        "compare.run(PlanConfig(), *map(pathlib.Path, sys.argv[1:]))\n"
+        "compare.run(compare.CompareConfig(), *map(pathlib.Path, sys.argv[1:]))\n"
     )
     killed = subprocess.run([sys.executable, "-c", code, *map(str, inputs), str(tmp_path)], check=False)
     assert killed.returncode == -signal.SIGKILL
@@ -179,12 +179,12 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
     record = json.loads(compare.run(CFG, *inputs, tmp_path / "out").read_text())
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"]["dropped"] == {"no_muco_flight": 1}
-    assert {(row["id"], row["planner"]) for row in record["left_out"]} == {("into_wall", "both"), ("b", "muco")}
+    assert {(row["id"], row["planner"]) for row in record["left_out"]} == {("into_wall", "all"), ("b", "muco")}
 
 
 def test_nothing_to_compare_is_an_error(inputs, tmp_path):
     write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
-    with pytest.raises(NothingKept, match="both planners"):
+    with pytest.raises(NothingKept, match="all planners"):
         compare.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "out")
     assert not (tmp_path / "out/manifest.json").exists()
 
@@ -199,10 +199,42 @@ def test_the_command_prints_the_tables(inputs, made):
 
 
 def test_rows_for_the_terminal(made):
-    tables = compare.table_rows(made / "compare.json")
-    assert len(tables["figures"]) == len(compare.FIGURES) + 1
-    assert ["both collision free", "2 of 2", "1.000"] in tables["wins"]
-    assert [row[0] for row in tables["axes"]] == ["visibility", "path efficiency", "smoothness", "safety", "mean"]
+    figures, axes, wins = compare.text_tables(made / "compare.json")
+    assert len(figures.rows) == len(compare.FIGURES) + 1
+    assert figures.columns == ["figure", "TA* + Smooth", "MuCO", "difference", "%"]
+    assert ["both collision free", "2 of 2", "1.000"] in wins.rows
+    assert wins.title == "TA* + Smooth against MuCO, walk by walk"
+    assert [row[0] for row in axes.rows] == ["visibility", "path efficiency", "smoothness", "safety", "mean"]
+
+
+def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
+    monkeypatch.setitem(PLANNERS, "again", PLANNERS["muco"])
+    out = tmp_path / "three"
+    cfg = CompareConfig(planners=("muco", "again", "track_astar"))
+    record = json.loads(compare.run(cfg, *inputs, out).read_text())
+    assert list(record["planners"]) == list(record["means"]) == ["muco", "again", "track_astar"]
+    assert {row["delta"] for row in record["deltas"]["again"].values()} == {0.0}
+    assert record["deltas"]["track_astar"]["length_m"]["delta"] != 0
+    assert len(read_traces(out / "drone_trace_again.json")) == 2
+    tables = compare.text_tables(out / "compare.json")
+    assert tables[0].columns == ["figure", "MuCO", "again", "TA* + Smooth", "less again", "%", "less TA* + Smooth", "%"]
+    assert {len(row) for row in tables[0].rows} == {8}
+    assert [table.title for table in tables[2:]] == [
+        "MuCO against again, walk by walk", "MuCO against TA* + Smooth, walk by walk"
+    ]  # fmt: skip
+    with pytest.raises(ResumeError):
+        compare.run(CFG, *inputs, out)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [(["muco"], "at least 2"), (["muco", "muco"], "named twice"), (["muco", "track"], "did you mean 'track_astar'")],
+)
+def test_what_is_no_comparison(inputs, tmp_path, names, words):
+    given = [word for name in names for word in ("--planner", name)]
+    result = CliRunner().invoke(app, ["plan", "compare", *map(str, inputs), "--out", str(tmp_path / "out"), *given])
+    assert isinstance(result.exception, ConfigError)
+    assert words in str(result.exception)
 
 
 @pytest.mark.parametrize("missing", ["--map", "--paths", "--out"])

@@ -123,38 +123,35 @@ def plan_compare(
     map_: Annotated[Path, typer.Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
     paths: Annotated[Path, typer.Argument(metavar="PATHS", help="Walks: path.json.")],
     out: OutOption,
+    planner: Annotated[
+        list[str] | None,
+        typer.Option(help="A planner to compare; repeat it. The others are held against the first. [default: all]"),
+    ] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
     seed: Seed = None,
     workers: Workers = None,
     resume: ResumeOption = ResumeMode.if_same,
 ) -> None:
-    """Both planners on the same walks: a table, compare.json, the flights, and pictures."""
-    import cosfly.planners.compare
-
-    cfg = resolve(config, overrides, seed, workers)
-    product = cosfly.planners.compare.run(cfg.plan, map_, paths, out, seed=cfg.seed, **manner(cfg, resume))
-    _compare_tables(cosfly.planners.compare.table_rows(product))
-    typer.echo(product)
-
-
-def _compare_tables(tables: dict[str, list[list[str]]]) -> None:
+    """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from rich.table import Table
 
+    import cosfly.planners.compare
+    from cosfly.config import build
     from cosfly.console import console
 
-    planners = ("TA* + Smooth", "MuCO")
-    for name, title, columns in (
-        ("figures", "Means over the walks that both fly", ("figure", *planners, "difference", "%")),
-        ("axes", "Axis scores, higher is better", ("axis", *planners)),
-        ("wins", "TA* + Smooth against MuCO, walk by walk", ("criterion", "count", "rate")),
-    ):
-        table = Table(title=title, title_justify="left")
-        for k, column in enumerate(columns):
+    cfg = resolve(config, overrides, seed, workers)
+    settings = cfg.plan.model_dump() | ({"planners": planner} if planner else {})
+    compared = build(cosfly.planners.compare.CompareConfig, settings, "--planner")
+    product = cosfly.planners.compare.run(compared, map_, paths, out, seed=cfg.seed, **manner(cfg, resume))
+    for text in cosfly.planners.compare.text_tables(product):
+        table = Table(title=text.title, title_justify="left")
+        for k, column in enumerate(text.columns):
             table.add_column(column, justify="right" if k else "left")
-        for row in tables[name]:
+        for row in text.rows:
             table.add_row(*row)
         console.print(table)
+    typer.echo(product)
 
 
 @app.command()

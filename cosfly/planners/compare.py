@@ -3,18 +3,22 @@
 The paper's axes, as its table's figures have them: visibility is the mean; path efficiency is the shortest mean length of a planner
 without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 - collision fraction) * clamp(least
 clearance / 5 m); each from the planner's means over all walks. "Blocked" is what is not visible, of all rays.
-Only walks that both planners fly are compared; the others are counted by the planner that failed.
+Any two or more planners can be compared: the first is the one that the others are held against. Only walks that all of them fly are
+compared; the others are counted by the planner that failed.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field, field_validator
 
 from cosfly.errors import NoPathError
-from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
@@ -23,8 +27,7 @@ from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
 from cosfly.store import read_json, write_bytes, write_json
 
-SCHEMA, VERSION = "cosfly.plan_compare", "1.0"
-FIRST, SECOND = "track_astar", "muco"  # deltas are the first's less the second's, rates the first's wins
+SCHEMA, VERSION = "cosfly.plan_compare", "2.0"
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
 # Figures of one flight, in the order of the tables: name, title, digits.
@@ -114,31 +117,45 @@ def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
     Args:
         flights: planner -> traces, the same walks in the same order, at least one.
     Returns:
-        The tables of `compare.json`.
+        The tables of `compare.json`. `deltas` and `win_rates` are by the other planner: the first's less its own, the first's wins.
     """
+    first, *others = flights
     figures = {planner: [flight_figures(trace) for trace in traces] for planner, traces in flights.items()}
     means = {planner: mean_figures(rows) for planner, rows in figures.items()}
-    ids = [trace.path_id for trace in flights[FIRST]]
+    ids = [trace.path_id for trace in flights[first]]
     return {
         "means": means,
-        "deltas": deltas(means[FIRST], means[SECOND]),
+        "deltas": {other: deltas(means[first], means[other]) for other in others},
         "axes": axis_scores(means),
-        "win_rates": win_rates(figures[FIRST], figures[SECOND]),
+        "win_rates": {other: win_rates(figures[first], figures[other]) for other in others},
         "scenarios": [
             {"id": path_id, **{planner: rows[i] for planner, rows in figures.items()}} for i, path_id in enumerate(ids)
         ],
     }
 
 
+class CompareConfig(PlanConfig):
+    """Settings of a comparison: those of step 4, whose `planner` counts for nothing here, and who takes part."""
+
+    planners: tuple[str, ...] = Field(tuple(PLANNERS), min_length=2, description="who is compared, against the first")
+
+    @field_validator("planners")
+    @classmethod
+    def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("a planner is named twice")
+        return tuple(known_planner(name) for name in names)
+
+
 # --- stage ------------------------------------------------------------------------------------------------------------
 
 
-def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
-    """Load and index the map once; give the function that plans one walk with both planners."""
+def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
+    """Load and index the map once; give the function that plans one walk with each of the planners."""
     from cosfly.kernels import obstacle_index
 
     obstacles = obstacle_index(read_boxes(simplified_map))
-    settings = {name: cfg.model_copy(update={"planner": name}) for name in (FIRST, SECOND)}
+    settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
     for planner in settings.values():
         warm_up(planner)
 
@@ -154,7 +171,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
                 errors[name] = error
             times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
         if len(errors) == len(settings):
-            raise errors[FIRST]
+            raise errors[cfg.planners[0]]
         missing = f"no_{next(iter(errors))}_flight" if errors else None
         result = {"flights": flights, "errors": {k: str(e) for k, e in errors.items()}, "times_ms": times_ms}
         return Outcome(result, missing)
@@ -163,7 +180,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
 
 
 def run(
-    cfg: PlanConfig,
+    cfg: CompareConfig,
     simplified_map: Path,
     paths: Path,
     out: Path,
@@ -172,13 +189,13 @@ def run(
     workers: int = 1,
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `compare.json`, both planners' flights and three pictures; gives the first.
+    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and three pictures; gives the first.
 
-    A walk that one planner cannot fly is dropped with that planner's name, one that neither can is a failure.
+    A walk that a planner cannot fly is dropped with that planner's name, one that none can is a failure.
 
     Raises:
         InputError: a file is not what it must be.
-        NothingKept: there is no walk that both fly.
+        NothingKept: there is no walk that all fly.
     """
     from cosfly.planners.compare_plots import draw_overlay, draw_radar, draw_series
 
@@ -193,10 +210,10 @@ def run(
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
     shared = finished.kept
     if not shared:
-        raise stage.nothing_kept(finished.tally, expected="a walk that both planners fly")
+        raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
     flights = {
         name: [DroneTrace.from_json(r.result["flights"][name], f"{out}/items.jsonl: {r.id}: {name}") for r in shared]
-        for name in (FIRST, SECOND)
+        for name in cfg.planners
     }
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
     summary = {
@@ -219,52 +236,77 @@ def run(
     for name, picture in pictures.items():
         outputs.append(out / name)
         write_bytes(outputs[-1], picture)
-    stage.finish(outputs, finished.tally, timings=_timings(shared))
+    stage.finish(outputs, finished.tally, timings=_timings(shared, cfg.planners))
     return product
 
 
 def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
-    """Walks that are not compared, with the reason of the planner that failed; of a walk that neither flies, the shared one."""
+    """Walks that are not compared, with the reason of the planner that failed; of a walk that none flies, the first one's."""
     rows = []
     for record in records:
         if isinstance(record, Failed):
-            rows.append({"id": record.id, "planner": "both", "message": record.message})
+            rows.append({"id": record.id, "planner": "all", "message": record.message})
         elif isinstance(record, Dropped):
             rows += [{"id": record.id, "planner": k, "message": v} for k, v in record.result["errors"].items()]
     return rows
 
 
-def _timings(shared: list[Kept]) -> dict[str, dict[str, float]]:
+def _timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str, float]]:
     """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
-    for name in (FIRST, SECOND):
+    for name in planners:
         times_ms = np.array([record.result["times_ms"][name] for record in shared])
         table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
     return table
 
 
-def table_rows(product: Path) -> dict[str, list[list[str]]]:
-    """Read `compare.json` and its manifest back as rows of text for the terminal: figures, axes, wins."""
+# --- for the terminal -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table for the terminal; the first column is words, the others are numbers."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
+
+
+def text_tables(product: Path) -> list[TextTable]:
+    """Read `compare.json` and its manifest back as tables of text: figures, axes, and wins against each other planner."""
     record = read_json(product, what="comparison")
-    timings = read_manifest(product.parent).facts["timings"]
-    means, change = record["means"], record["deltas"]
-    figures = []
-    for name, title, digits in FIGURES:
-        relative = change[name]["relative_percent"]
-        figures.append([
-            title, *(f"{means[planner][name]:.{digits}f}" for planner in (FIRST, SECOND)),
-            f"{change[name]['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}",
-        ])  # fmt: skip
-    if timings:
-        figures.append(
-            ["planning time (ms)", *(f"{timings[planner]['mean_ms']:.1f}" for planner in (FIRST, SECOND)), "", ""]
-        )
+    first, *others = planners = list(record["means"])
+    titles = [title_of(planner) for planner in planners]
     axes = [
-        [name.replace("_", " "), *(f"{record['axes'][planner][name]:.3f}" for planner in (FIRST, SECOND))]
+        [name.replace("_", " "), *(f"{record['axes'][planner][name]:.3f}" for planner in planners)]
         for name in (*AXES, "mean")
     ]
-    wins = [
-        [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
-        for name, row in record["win_rates"].items()
+    differences = ["difference"] if len(others) == 1 else [f"less {title_of(other)}" for other in others]
+    columns = ["figure", *titles, *(column for title in differences for column in (title, "%"))]
+    tables = [
+        TextTable(
+            "Means over the walks that all fly",
+            columns,
+            _figure_rows(record, read_manifest(product.parent).facts["timings"]),
+        ),
+        TextTable("Axis scores, higher is better", ["axis", *titles], axes),
     ]
-    return {"figures": figures, "axes": axes, "wins": wins}
+    for other, rates in record["win_rates"].items():
+        rows = [
+            [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
+            for name, row in rates.items()
+        ]
+        against = f"{title_of(first)} against {title_of(other)}, walk by walk"
+        tables.append(TextTable(against, ["criterion", "count", "rate"], rows))
+    return tables
+
+
+def _figure_rows(record: dict, timings: dict) -> list[list[str]]:
+    means, rows = record["means"], []
+    for name, title, digits in FIGURES:
+        rows.append([title, *(f"{figures[name]:.{digits}f}" for figures in means.values())])
+        for change in record["deltas"].values():
+            relative = change[name]["relative_percent"]
+            rows[-1] += [f"{change[name]['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
+    times = [f"{timings[planner]['mean_ms']:.1f}" for planner in means]
+    return [*rows, ["planning time (ms)", *times, *[""] * 2 * len(record["deltas"])]]

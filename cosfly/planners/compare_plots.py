@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
+from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import Walk
 from cosfly.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 
-TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}
-COLORS = {"track_astar": (30, 100, 210), "muco": (235, 120, 20)}  # RGB, the paper's blue and orange
+# RGB: the paper's blue and orange, then others that differ in brightness too.
+PALETTE = ((30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190))
+LEGEND_PX = 160  # of one planner
 FAINT = (215, 215, 215)
 
 
-def _legend(picture: np.ndarray, x: float, y: float) -> None:
-    for planner, title in TITLES.items():
-        draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), COLORS[planner], 3)
-        x = draw_text(picture, title, x + 42, y) + 18
+def color_of(planner: str) -> tuple[int, int, int]:
+    """Give a planner's color, the same in every comparison."""
+    return PALETTE[list(PLANNERS).index(planner) % len(PALETTE)]
+
+
+def _legend(picture: np.ndarray, planners: Collection[str], y: float) -> None:
+    x = float(picture.shape[1] - LEGEND_PX * len(planners))
+    for planner in planners:
+        draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), color_of(planner), 3)
+        x = draw_text(picture, title_of(planner), x + 42, y) + 18
 
 
 # --- from above -------------------------------------------------------------------------------------------------------
@@ -30,10 +40,10 @@ def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[Dro
     for planner, traces in flights.items():
         for trace in traces:
             line = view.pixels(trace.positions_m)
-            draw_line(picture, line, COLORS[planner], 2, halo=5)
-            draw_dot(picture, line[0], 5, COLORS[planner])
+            draw_line(picture, line, color_of(planner), 2, halo=5)
+            draw_dot(picture, line[0], 5, color_of(planner))
     caption = add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark); dots are starts")
-    _legend(caption, caption.shape[1] - 320, 25)
+    _legend(caption, flights, 25)
     return png_bytes(caption)
 
 
@@ -55,7 +65,7 @@ def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> byte
     _panel(picture, (90, 480, 1360, 820), "five-ray visibility", (-0.03, 1.05), end_s, times, seen)
     draw_text(picture, "time (s)", 725, 866, align=0.5)
     draw_text(picture, f"{len(walks)} walks: every flight thin, the mean of those still flying thick", 90, 28, 0.6)
-    _legend(picture, 1080, 28)
+    _legend(picture, flights, 28)
     return png_bytes(picture)
 
 
@@ -75,13 +85,13 @@ def _panel(picture, frame, title, bounds, end_s, times, values) -> None:
         draw_line(picture, np.array([pixels([tick], [bounds[0]])[0], pixels([tick], [bounds[1]])[0]]), FAINT)
         draw_text(picture, f"{tick:g}", pixels([tick], [bounds[0]])[0, 0], bottom + 20, 0.5, align=0.5)
     for planner, rows in values.items():
-        pale = tuple(int(0.35 * c + 0.65 * p) for c, p in zip(COLORS[planner], PAPER, strict=True))
+        pale = tuple(int(0.35 * c + 0.65 * p) for c, p in zip(color_of(planner), PAPER, strict=True))
         for t, v in zip(times[planner], rows, strict=True):
             draw_line(picture, pixels(t, v), pale)
     for planner, rows in values.items():
         longest = max(times[planner], key=len)
         mean = [np.mean([row[i] for row in rows if len(row) > i]) for i in range(len(longest))]
-        draw_line(picture, pixels(longest, mean), COLORS[planner], 3)
+        draw_line(picture, pixels(longest, mean), color_of(planner), 3)
     draw_line(picture, np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), INK, closed=True)
     draw_text(picture, title, left, top - 10)
 
@@ -100,9 +110,9 @@ def _ticks(low: float, high: float) -> np.ndarray:
 
 def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
     """Draw the four axis scores of each planner, 0 in the middle and 1 at the rim; PNG bytes."""
-    picture = np.full((760, 900, 3), PAPER, dtype=np.uint8)
+    picture = np.full((700 + 30 * len(axes), 900, 3), PAPER, dtype=np.uint8)  # a line of words for each planner
     names = [name for name in next(iter(axes.values())) if name != "mean"]
-    middle, radius_px = np.array([450.0, 400.0]), 270.0
+    middle, radius_px = np.array([450.0, 340.0 + 30.0 * len(axes)]), 270.0
     angles = np.arange(len(names)) * 2.0 * np.pi / len(names) - np.pi / 2.0
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for share in (0.25, 0.5, 0.75, 1.0):
@@ -116,11 +126,11 @@ def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
     for planner, scores in axes.items():
         shape = middle + radius_px * spokes * np.clip([[scores[name]] for name in names], 0.0, 1.0)
         filled = picture.copy()
-        draw_area(filled, shape, COLORS[planner])
+        draw_area(filled, shape, color_of(planner))
         picture[:] = (0.82 * picture + 0.18 * filled).astype(np.uint8)
-        draw_line(picture, shape, COLORS[planner], 3, closed=True)
+        draw_line(picture, shape, color_of(planner), 3, closed=True)
     for row, (planner, scores) in enumerate(axes.items()):
         words = ", ".join(f"{name.replace('_', ' ')} {scores[name]:.3f}" for name in names)
-        draw_line(picture, np.array([[40, 30 + 30 * row], [74, 30 + 30 * row]]), COLORS[planner], 3)
-        draw_text(picture, f"{TITLES[planner]}: mean {scores['mean']:.3f} ({words})", 84, 35 + 30 * row, 0.5)
+        draw_line(picture, np.array([[40, 30 + 30 * row], [74, 30 + 30 * row]]), color_of(planner), 3)
+        draw_text(picture, f"{title_of(planner)}: mean {scores['mean']:.3f} ({words})", 84, 35 + 30 * row, 0.5)
     return png_bytes(picture)

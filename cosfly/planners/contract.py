@@ -26,11 +26,28 @@ from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RM
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
 
-# In the order of comparisons: deltas and win rates are the first's against each other one.
+# In the order of comparisons, which hold the first against each of the others.
 PLANNERS = {
     "track_astar": "cosfly.planners.track_astar.track_astar:plan",
     "muco": "cosfly.planners.muco.muco:plan",
 }
+TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}  # in tables and pictures; others go by their names
+
+
+def title_of(name: str) -> str:
+    """Give a planner's name for people."""
+    return TITLES.get(name, name.replace("_", " "))
+
+
+def known_planner(name: str) -> str:
+    """Give the name back.
+
+    Raises:
+        ValueError: it is not in PLANNERS.
+    """
+    if name not in PLANNERS:
+        raise ValueError(f"there is no such planner{nearest(name, PLANNERS)}; there are {', '.join(PLANNERS)}")
+    return name
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -137,12 +154,7 @@ class PlanConfig(Config):
     muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
     track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
 
-    @field_validator("planner")
-    @classmethod
-    def _is_known(cls, name: str) -> str:
-        if name not in PLANNERS:
-            raise ValueError(f"there is no such planner{nearest(name, PLANNERS)}; there are {', '.join(PLANNERS)}")
-        return name
+    _is_known = field_validator("planner")(known_planner)
 
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:
