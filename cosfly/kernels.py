@@ -27,6 +27,12 @@ RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0
 RAY_SPREAD_M = 0.8  # the longest of the offsets
 
 
+# Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in BoxIndex.grid.
+CENTER_X, CENTER_Y, CENTER_Z, HALF_X, HALF_Y, HALF_Z, XU, XV, XW, YU, YV, YW, ZU, ZV, ZW = range(15)
+LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z = range(15, 21)
+ORIGIN_X, ORIGIN_Y, CELL = range(3)
+
+
 class BoxIndex(NamedTuple):
     """Oriented boxes and the cells that hold them; k boxes.
 
@@ -108,26 +114,25 @@ def _fill_cells(first, last, shape):
 # --- one box ----------------------------------------------------------------------------------------------------------
 
 
-# Columns of BoxIndex.rows: 0-2 centre, 3-5 half extents, 6-14 rotation, 15-17 low corner, 18-20 high corner. Single numbers are
-# read, not slices: a slice costs two atomic reference counts, more than the arithmetic around it.
+# Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic around it.
 
 
 @njit(cache=True, inline="always")
-def _in_box_frame(rows, box, x, y, z):
+def in_box_frame(rows, box, x, y, z):
     """Give the coordinates of a world point in a box's frame."""
-    dx, dy, dz = x - rows[box, 0], y - rows[box, 1], z - rows[box, 2]
+    dx, dy, dz = x - rows[box, CENTER_X], y - rows[box, CENTER_Y], z - rows[box, CENTER_Z]
     return (
-        rows[box, 6] * dx + rows[box, 9] * dy + rows[box, 12] * dz,
-        rows[box, 7] * dx + rows[box, 10] * dy + rows[box, 13] * dz,
-        rows[box, 8] * dx + rows[box, 11] * dy + rows[box, 14] * dz,
+        rows[box, XU] * dx + rows[box, YU] * dy + rows[box, ZU] * dz,
+        rows[box, XV] * dx + rows[box, YV] * dy + rows[box, ZV] * dz,
+        rows[box, XW] * dx + rows[box, YW] * dy + rows[box, ZW] * dz,
     )
 
 
 @njit(cache=True)
 def distance_to_box(rows, box, x, y, z):
     """Signed distance of a point to a box, m: negative inside (depth below the nearest face)."""
-    u, v, w = _in_box_frame(rows, box, x, y, z)
-    qx, qy, qz = abs(u) - rows[box, 3], abs(v) - rows[box, 4], abs(w) - rows[box, 5]
+    u, v, w = in_box_frame(rows, box, x, y, z)
+    qx, qy, qz = abs(u) - rows[box, HALF_X], abs(v) - rows[box, HALF_Y], abs(w) - rows[box, HALF_Z]
     deepest = max(qx, qy, qz)
     if deepest <= 0.0:
         return deepest
@@ -141,8 +146,8 @@ def normal_of_box(rows, box, x, y, z):
 
     A tie between faces goes to the first axis, a point in the middle plane to the positive side.
     """
-    u, v, w = _in_box_frame(rows, box, x, y, z)
-    qx, qy, qz = abs(u) - rows[box, 3], abs(v) - rows[box, 4], abs(w) - rows[box, 5]
+    u, v, w = in_box_frame(rows, box, x, y, z)
+    qx, qy, qz = abs(u) - rows[box, HALF_X], abs(v) - rows[box, HALF_Y], abs(w) - rows[box, HALF_Z]
     sx, sy, sz = (1.0 if u >= 0 else -1.0), (1.0 if v >= 0 else -1.0), (1.0 if w >= 0 else -1.0)
     a, b, c = max(qx, 0.0) * sx, max(qy, 0.0) * sy, max(qz, 0.0) * sz
     length = np.sqrt(a * a + b * b + c * c)
@@ -155,14 +160,14 @@ def normal_of_box(rows, box, x, y, z):
     else:
         a, b, c = 0.0, 0.0, sz
     return (
-        rows[box, 6] * a + rows[box, 7] * b + rows[box, 8] * c,
-        rows[box, 9] * a + rows[box, 10] * b + rows[box, 11] * c,
-        rows[box, 12] * a + rows[box, 13] * b + rows[box, 14] * c,
+        rows[box, XU] * a + rows[box, XV] * b + rows[box, XW] * c,
+        rows[box, YU] * a + rows[box, YV] * b + rows[box, YW] * c,
+        rows[box, ZU] * a + rows[box, ZV] * b + rows[box, ZW] * c,
     )
 
 
 @njit(cache=True, inline="always")
-def _clip(origin, direction, half, enter, leave):
+def clip(origin, direction, half, enter, leave):
     """Clip the part [enter, leave] of a segment to one slab; enter > leave means nothing is left."""
     if abs(direction) < 1e-12:
         return (enter, leave) if abs(origin) <= half else (1.0, 0.0)
@@ -173,17 +178,17 @@ def _clip(origin, direction, half, enter, leave):
 @njit(cache=True)
 def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
     """Tell whether a segment touches a box grown by `inflate_m` on every side (slab method, Kay and Kajiya 1986)."""
-    if min(ax, bx) > rows[box, 18] + inflate_m or max(ax, bx) < rows[box, 15] - inflate_m:
+    if min(ax, bx) > rows[box, HIGH_X] + inflate_m or max(ax, bx) < rows[box, LOW_X] - inflate_m:
         return False
-    if min(ay, by) > rows[box, 19] + inflate_m or max(ay, by) < rows[box, 16] - inflate_m:
+    if min(ay, by) > rows[box, HIGH_Y] + inflate_m or max(ay, by) < rows[box, LOW_Y] - inflate_m:
         return False
-    if min(az, bz) > rows[box, 20] + inflate_m or max(az, bz) < rows[box, 17] - inflate_m:
+    if min(az, bz) > rows[box, HIGH_Z] + inflate_m or max(az, bz) < rows[box, LOW_Z] - inflate_m:
         return False
-    u, v, w = _in_box_frame(rows, box, ax, ay, az)
-    u1, v1, w1 = _in_box_frame(rows, box, bx, by, bz)
-    enter, leave = _clip(u, u1 - u, rows[box, 3] + inflate_m, 0.0, 1.0)
-    enter, leave = _clip(v, v1 - v, rows[box, 4] + inflate_m, enter, leave)
-    enter, leave = _clip(w, w1 - w, rows[box, 5] + inflate_m, enter, leave)
+    u, v, w = in_box_frame(rows, box, ax, ay, az)
+    u1, v1, w1 = in_box_frame(rows, box, bx, by, bz)
+    enter, leave = clip(u, u1 - u, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
+    enter, leave = clip(v, v1 - v, rows[box, HALF_Y] + inflate_m, enter, leave)
+    enter, leave = clip(w, w1 - w, rows[box, HALF_Z] + inflate_m, enter, leave)
     return enter <= leave
 
 
@@ -201,12 +206,12 @@ def nearest_box(index, x, y, z, reach_m):
         return best, best_box
     num_x, num_y = index.shape[0], index.shape[1]
     # The grid is convex: the distance from the nearest point of the grid is a lower bound of the distance from outside it.
-    gx = min(max((x - index.grid[0]) / index.grid[2], 0.0), float(num_x))
-    gy = min(max((y - index.grid[1]) / index.grid[2], 0.0), float(num_y))
+    gx = min(max((x - index.grid[ORIGIN_X]) / index.grid[CELL], 0.0), float(num_x))
+    gy = min(max((y - index.grid[ORIGIN_Y]) / index.grid[CELL], 0.0), float(num_y))
     cx, cy = min(int(gx), num_x - 1), min(int(gy), num_y - 1)
-    border_m = min(gx - cx, cx + 1 - gx, gy - cy, cy + 1 - gy) * index.grid[2]
+    border_m = min(gx - cx, cx + 1 - gx, gy - cy, cy + 1 - gy) * index.grid[CELL]
     for ring in range(max(cx, num_x - 1 - cx, cy, num_y - 1 - cy) + 1):
-        if ring > 0 and (ring - 1) * index.grid[2] + border_m >= best:
+        if ring > 0 and (ring - 1) * index.grid[CELL] + border_m >= best:
             break
         for ix in range(max(cx - ring, 0), min(cx + ring, num_x - 1) + 1):
             # A column inside the ring has two cells of it, a column at its edge all.
@@ -217,9 +222,9 @@ def nearest_box(index, x, y, z, reach_m):
                 cell = ix * num_y + iy
                 for place in range(index.starts[cell], index.starts[cell + 1]):
                     box = index.members[place]
-                    dx = max(index.rows[box, 15] - x, 0.0, x - index.rows[box, 18])
-                    dy = max(index.rows[box, 16] - y, 0.0, y - index.rows[box, 19])
-                    dz = max(index.rows[box, 17] - z, 0.0, z - index.rows[box, 20])
+                    dx = max(index.rows[box, LOW_X] - x, 0.0, x - index.rows[box, HIGH_X])
+                    dy = max(index.rows[box, LOW_Y] - y, 0.0, y - index.rows[box, HIGH_Y])
+                    dz = max(index.rows[box, LOW_Z] - z, 0.0, z - index.rows[box, HIGH_Z])
                     gap = dx * dx + dy * dy + dz * dz
                     if gap > 0.0 and (best <= 0.0 or gap >= best * best):
                         continue
@@ -238,8 +243,8 @@ def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
     found = 0
     if len(index.rows) == 0 or len(out) == 0:
         return found
-    cell, num_x, num_y = index.grid[2], index.shape[0], index.shape[1]
-    ox, oy = index.grid[0], index.grid[1]
+    cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
+    ox, oy = index.grid[ORIGIN_X], index.grid[ORIGIN_Y]
     first_x = max(int(np.floor((min(ax, bx) - inflate_m - ox) / cell)), 0)
     last_x = min(int(np.floor((max(ax, bx) + inflate_m - ox) / cell)), num_x - 1)
     dx = bx - ax
@@ -285,48 +290,6 @@ def free_rays(index, boxes, num_boxes, x, y, z, target):
         if not blocked:
             free += 1
     return free / 5.0
-
-
-@njit(cache=True)
-def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
-    """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
-
-    From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve ends of the rays once.
-    """
-    blocked = np.zeros((7, 5), dtype=np.bool_)
-    ends, feet = np.empty((7, 3)), np.empty((5, 3))
-    for k in range(num_boxes):
-        box = boxes[k]
-        for place in range(7):
-            shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2
-            ends[place, 0], ends[place, 1], ends[place, 2] = _in_box_frame(
-                rows,
-                box,
-                x + (shift if place > 0 and axis == 0 else 0.0),
-                y + (shift if place > 0 and axis == 1 else 0.0),
-                z + (shift if place > 0 and axis == 2 else 0.0),
-            )
-        for ray in range(5):
-            feet[ray, 0], feet[ray, 1], feet[ray, 2] = _in_box_frame(
-                rows,
-                box,
-                tx + RAY_OFFSETS_M[ray, 0],
-                ty + RAY_OFFSETS_M[ray, 1],
-                tz + RAY_OFFSETS_M[ray, 2],
-            )
-        for place in range(7):
-            for ray in range(5):
-                if blocked[place, ray]:
-                    continue
-                enter, leave = 0.0, 1.0
-                for axis in range(3):
-                    foot = feet[ray, axis]
-                    enter, leave = _clip(foot, ends[place, axis] - foot, rows[box, 3 + axis], enter, leave)
-                    if enter > leave:
-                        break
-                blocked[place, ray] = enter <= leave
-    for place in range(7):
-        free[place] = 1.0 - blocked[place].sum() / 5.0
 
 
 # --- arrays -----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.stage import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.stage import RenderConfig
-from cosfly.simplify.stage import SimplifyConfig
+from cosfly.simplify.passes import SimplifyConfig
 from distill.dataset import PrepareConfig
 from distill.evaluate import EvaluateConfig
 from distill.infer import InferConfig

@@ -17,7 +17,8 @@ from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.render.contract import GROUND_PLANE_DROP_M
 from cosfly.render.stage import open_renderer
-from cosfly.simplify.stage import SimplifyConfig, report, simplify
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.simplify.stage import report
 
 LIFT_M = 2.0
 LIFT = np.array([0.0, 0.0, LIFT_M])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from cosfly import kernels
 from cosfly.geometry import rotation_matrices, rotation_matrix
+from cosfly.planners.muco.window import window_rays
 from cosfly.products.boxes import make_box_map
 from cosfly.products.kinds import KINDS
 
@@ -251,7 +252,7 @@ def test_a_window_of_rays_is_seven_bundles():
     everything, seen = np.arange(120), set()
     for _ in range(40):
         point, target = rng.uniform(-40, 40, (2, 3))
-        kernels.window_rays(index.rows, everything, 120, *point, 0.5, *target, free)
+        window_rays(index.rows, everything, 120, *point, 0.5, *target, free)
         moves = np.vstack([np.zeros(3), *([-axis, axis] for axis in 0.5 * np.eye(3))])
         np.testing.assert_allclose(free, kernels.visibility(index, point + moves, np.repeat(target[None], 7, axis=0)))
         seen.update(np.round(free, 1).tolist())

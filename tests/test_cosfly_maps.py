@@ -22,7 +22,8 @@ from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.simplify.stage import cross_validate
 from cosfly.topview import TopView, draw_map
 
 

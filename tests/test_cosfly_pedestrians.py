@@ -394,7 +394,7 @@ def test_the_report_sums_up_its_lines():
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     from cosfly.maps.simworld import SimWorldConfig, load
-    from cosfly.simplify.stage import SimplifyConfig, simplify
+    from cosfly.simplify.passes import SimplifyConfig, simplify
 
     folder = shared_data / "simworld-progen"
     city = load(SimWorldConfig(world=folder / "progen_world.json", sizes=[folder / "Bbox.json"]))

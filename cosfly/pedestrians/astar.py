@@ -20,6 +20,8 @@ _STEP_X = np.array([1, 0, -1, 0, 1, -1, -1, 1], dtype=np.int64)
 _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
+TOTAL, TO_GO = range(2)  # columns of the heap's keys
+STRAIGHT, DIAGONAL = range(2)  # columns of the steps
 
 
 def find_route(free: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
@@ -69,7 +71,7 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
     size = 0
 
     state[origin] = _OPEN
-    steps[origin, 0] = steps[origin, 1] = 0
+    steps[origin, STRAIGHT] = steps[origin, DIAGONAL] = 0
     from_direction[origin] = -1
     heap_key, heap_cell, size = _push(heap_key, heap_cell, size, 0.0, 0.0, origin)
     while size > 0:
@@ -90,14 +92,14 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
             neighbour = next_y * num_x + next_x
             if state[neighbour] == _CLOSED:
                 continue
-            straight = steps[cell, 0] + (1 if direction < 4 else 0)
-            diagonal = steps[cell, 1] + (1 if direction >= 4 else 0)
+            straight = steps[cell, STRAIGHT] + (1 if direction < 4 else 0)
+            diagonal = steps[cell, DIAGONAL] + (1 if direction >= 4 else 0)
             if state[neighbour] == _OPEN:
-                known = steps[neighbour, 0] + steps[neighbour, 1] * SQRT2
+                known = steps[neighbour, STRAIGHT] + steps[neighbour, DIAGONAL] * SQRT2
                 if straight + diagonal * SQRT2 >= known:
                     continue
             state[neighbour] = _OPEN
-            steps[neighbour, 0], steps[neighbour, 1] = straight, diagonal
+            steps[neighbour, STRAIGHT], steps[neighbour, DIAGONAL] = straight, diagonal
             from_direction[neighbour] = direction
             apart_x, apart_y = abs(target_x - next_x), abs(target_y - next_y)
             left_diagonal = min(apart_x, apart_y)
@@ -114,16 +116,20 @@ def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (c
     if size == len(heap_cell):
         grown_key, grown_cell = np.empty((2 * size, 2)), np.empty(2 * size, dtype=np.int64)
         for k in range(size):
-            grown_key[k, 0], grown_key[k, 1], grown_cell[k] = heap_key[k, 0], heap_key[k, 1], heap_cell[k]
+            grown_key[k, TOTAL], grown_key[k, TO_GO], grown_cell[k] = (
+                heap_key[k, TOTAL],
+                heap_key[k, TO_GO],
+                heap_cell[k],
+            )
         heap_key, heap_cell = grown_key, grown_cell
     place = size
     while place > 0:
         parent = (place - 1) // 2
-        if not _is_before(total, to_go, heap_key[parent, 0], heap_key[parent, 1]):
+        if not _is_before(total, to_go, heap_key[parent, TOTAL], heap_key[parent, TO_GO]):
             break
         _move(heap_key, heap_cell, parent, place)
         place = parent
-    heap_key[place, 0], heap_key[place, 1], heap_cell[place] = total, to_go, cell
+    heap_key[place, TOTAL], heap_key[place, TO_GO], heap_cell[place] = total, to_go, cell
     return heap_key, heap_cell, size + 1
 
 
@@ -131,26 +137,28 @@ def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (c
 def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
     """Remove the first entry of the heap; gives the new size."""
     size -= 1
-    total, to_go, cell = heap_key[size, 0], heap_key[size, 1], heap_cell[size]
+    total, to_go, cell = heap_key[size, TOTAL], heap_key[size, TO_GO], heap_cell[size]
     place = 0
     while True:
         child = 2 * place + 1
         if child >= size:
             break
         other = child + 1
-        if other < size and _is_before(heap_key[other, 0], heap_key[other, 1], heap_key[child, 0], heap_key[child, 1]):
+        if other < size and _is_before(
+            heap_key[other, TOTAL], heap_key[other, TO_GO], heap_key[child, TOTAL], heap_key[child, TO_GO]
+        ):
             child = other
-        if not _is_before(heap_key[child, 0], heap_key[child, 1], total, to_go):
+        if not _is_before(heap_key[child, TOTAL], heap_key[child, TO_GO], total, to_go):
             break
         _move(heap_key, heap_cell, child, place)
         place = child
-    heap_key[place, 0], heap_key[place, 1], heap_cell[place] = total, to_go, cell
+    heap_key[place, TOTAL], heap_key[place, TO_GO], heap_cell[place] = total, to_go, cell
     return size
 
 
 @njit(cache=True)
 def _move(heap_key, heap_cell, source, place):  # pragma: no cover (compiled)
-    heap_key[place, 0], heap_key[place, 1] = heap_key[source, 0], heap_key[source, 1]
+    heap_key[place, TOTAL], heap_key[place, TO_GO] = heap_key[source, TOTAL], heap_key[source, TO_GO]
     heap_cell[place] = heap_cell[source]
 
 

@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.merge import clusters
-from cosfly.simplify.stage import SimplifyConfig, cross_validate, simplify
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.simplify.stage import cross_validate
 
 
 def peer_clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:

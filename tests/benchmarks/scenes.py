@@ -17,7 +17,7 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import Walk
-from cosfly.simplify.stage import SimplifyConfig, simplify
+from cosfly.simplify.passes import SimplifyConfig, simplify
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM_WALKS, SEED = 20, 0

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.compiled import int64, njit
-from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box, window_rays
+from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
+from cosfly.planners.muco.window import window_rays
 
 TERM_NAMES = (
     "tracking",
@@ -27,6 +28,8 @@ TERM_NAMES = (
     "pitch",
 )
 TRACKING, SMOOTHNESS, JERK, SAFETY, VISIBILITY, VIEW_ANGLE, PATH_LENGTH, ALTITUDE, PITCH = range(9)
+LEAST, PREFERRED, GREATEST = range(3)  # altitudes
+BELOW, ABOVE, SWING = range(3)  # altitude weights; the swing is the oscillation
 BAND_ROWS = 10  # jerk couples x_i with x_{i+3}, nine places on in x_0 y_0 z_0 x_1 ...
 
 SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
@@ -146,7 +149,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
     anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
     targets, headings, weights = problem.targets, problem.headings_rad, problem.weights
     influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
-    low, high = problem.altitudes[0], problem.altitudes[1]
+    low, high = problem.altitudes[LEAST], problem.altitudes[PREFERRED]
     for i in range(begin, end):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         dx, dy, dz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
@@ -184,9 +187,13 @@ def point_terms(points, begin, end, problem, index, masked, state):
             _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
 
         if z < low:
-            _add_square(terms, gradient, band, ALTITUDE, i, problem.altitude_weights[0], low - z, 0.0, 0.0, -1.0, True)
+            _add_square(
+                terms, gradient, band, ALTITUDE, i, problem.altitude_weights[BELOW], low - z, 0.0, 0.0, -1.0, True
+            )
         if z > high:
-            _add_square(terms, gradient, band, ALTITUDE, i, problem.altitude_weights[1], z - high, 0.0, 0.0, 1.0, True)
+            _add_square(
+                terms, gradient, band, ALTITUDE, i, problem.altitude_weights[ABOVE], z - high, 0.0, 0.0, 1.0, True
+            )
 
 
 @njit(cache=True)
@@ -244,7 +251,7 @@ def chain_curvature(problem, state):
                     value = 2.0 * weight * coefficients[k] * coefficients[m]
                     for axis in range(3):
                         band[3 * (k - m), 3 * (first + m) + axis] += value
-    swing = 2.0 * problem.altitude_weights[2]
+    swing = 2.0 * problem.altitude_weights[SWING]
     for i in range(num_points - 1):
         band[0, 3 * i + 2] += swing
         band[0, 3 * i + 5] += swing
@@ -259,7 +266,7 @@ def chain_terms(points, begin, end, problem, state):
     """
     num_points, weights, gradient = len(points), problem.weights, state.gradient
     smoothness, jerk = weights[SMOOTHNESS], weights[JERK]
-    swing = problem.altitude_weights[2]
+    swing = problem.altitude_weights[SWING]
     bends, jerks, swings = 0.0, 0.0, 0.0
     for i in range(max(begin, 0), min(end, num_points - 1)):
         for axis in range(3):
@@ -331,7 +338,7 @@ def difference_gradient(points, problem, index, masked, state, gradient):
             for side in range(2):
                 places[side] = middle + (2 * side - 1) * problem.difference_m
                 if axis == 2:
-                    places[side] = min(max(places[side], problem.altitudes[0]), problem.altitudes[2])
+                    places[side] = min(max(places[side], problem.altitudes[LEAST]), problem.altitudes[GREATEST])
                 points[i, axis] = places[side]
                 state.terms.fill(0.0)
                 point_terms(points, i, i + 1, problem, index, masked, state)

@@ -15,7 +15,7 @@ from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, visibility
 from cosfly.planners.behind import behind, smoothed_headings
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
-from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
+from cosfly.planners.muco.loss import PREFERRED, TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.start import search_start
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, is_feasible, project
@@ -72,7 +72,7 @@ def start_trajectory(
         NoPathError: neither is feasible.
     """
     targets = problem.targets
-    plain = behind(targets, headings_rad, cfg.behind_distance_m, float(problem.altitudes[1]))
+    plain = behind(targets, headings_rad, cfg.behind_distance_m, float(problem.altitudes[PREFERRED]))
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
     if plain_is_free and visibility(obstacles, plain, targets).mean() >= cfg.muco.start_visibility:
         return plain, "behind"

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosfly.compiled import boolean, int64, njit
 from cosfly.kernels import collect_hits, nearest_box, normal_of_box
-from cosfly.planners.muco.loss import BAND_ROWS, difference_gradient, evaluate, remember_boxes
+from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, difference_gradient, evaluate, remember_boxes
 from cosfly.planners.muco.nearby import known, nearest_among, nearest_of, nothing_nearby
 
 TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
@@ -52,8 +52,8 @@ def hold_bounds(points, problem, contacts, band, gradient):
                 gradient[i, a] -= into * normal[a]
                 for b in range(a + 1):
                     band[a - b, 3 * i + b] += 1e5 * normal[a] * normal[b]
-        at_floor = points[i, 2] <= problem.altitudes[0] + 1e-9 and gradient[i, 2] > 0.0
-        at_ceiling = points[i, 2] >= problem.altitudes[2] - 1e-9 and gradient[i, 2] < 0.0
+        at_floor = points[i, 2] <= problem.altitudes[LEAST] + 1e-9 and gradient[i, 2] > 0.0
+        at_ceiling = points[i, 2] >= problem.altitudes[GREATEST] - 1e-9 and gradient[i, 2] < 0.0
         if at_floor or at_ceiling:
             gradient[i, 2] = 0.0
             band[0, 3 * i + 2] += 1e7
@@ -274,7 +274,7 @@ def push_out(point, problem, index, nearby, i):
     best, bx, by, bz = -np.inf, point[0], point[1], point[2]
     last_x, last_y, last_z, share = 0.0, 0.0, 0.0, 1.0
     for push in range(problem.pushes_max + 1):
-        point[2] = min(max(point[2], problem.altitudes[0]), problem.altitudes[2])
+        point[2] = min(max(point[2], problem.altitudes[LEAST]), problem.altitudes[GREATEST])
         gap, box = nearest_of(nearby, i, index, point[0], point[1], point[2], problem.safety_m)
         if gap > best:
             best, bx, by, bz = gap, point[0], point[1], point[2]
@@ -299,7 +299,7 @@ def project(points, problem, index, begin, end, nearby):
     Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
     longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a box.
     """
-    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    low, high, step_max = problem.altitudes[LEAST], problem.altitudes[GREATEST], problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(begin, end):
         points[i, 2] = min(max(points[i, 2], low), high)
@@ -334,7 +334,7 @@ def is_feasible(points, problem, index):
 @njit(cache=True)
 def _is_feasible(points, problem, index, nearby):
     one, before = np.empty(1, dtype=np.int64), 0.0
-    low, high, step_max = problem.altitudes[0], problem.altitudes[2], problem.step_max_m
+    low, high, step_max = problem.altitudes[LEAST], problem.altitudes[GREATEST], problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

@@ -7,7 +7,32 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.compiled import njit
-from cosfly.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, _clip, _in_box_frame
+from cosfly.kernels import (
+    CELL,
+    HALF_X,
+    HALF_Y,
+    HALF_Z,
+    HIGH_X,
+    HIGH_Y,
+    HIGH_Z,
+    LOW_X,
+    LOW_Y,
+    ORIGIN_X,
+    ORIGIN_Y,
+    RAY_OFFSETS_M,
+    RAY_SPREAD_M,
+    XU,
+    XV,
+    XW,
+    YU,
+    YV,
+    YW,
+    ZU,
+    ZV,
+    ZW,
+    clip,
+    in_box_frame,
+)
 
 NUM_SECTORS = 128  # of the horizon round a target
 
@@ -60,11 +85,11 @@ def _boxes_round(index, target, reach_m):
     near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
     if len(index.rows) == 0:
         return boxes, near, slopes, spans
-    cell, num_x, num_y = index.grid[2], index.shape[0], index.shape[1]
-    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[0]) / cell)), 0), num_x)
-    last_x = min(int(np.floor((target[0] + reach_m - index.grid[0]) / cell)), num_x - 1)
-    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[1]) / cell)), 0), num_y)
-    last_y = min(int(np.floor((target[1] + reach_m - index.grid[1]) / cell)), num_y - 1)
+    cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
+    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[ORIGIN_X]) / cell)), 0), num_x)
+    last_x = min(int(np.floor((target[0] + reach_m - index.grid[ORIGIN_X]) / cell)), num_x - 1)
+    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[ORIGIN_Y]) / cell)), 0), num_y)
+    last_y = min(int(np.floor((target[1] + reach_m - index.grid[ORIGIN_Y]) / cell)), num_y - 1)
     known, low = np.zeros(len(index.rows), dtype=np.bool_), target[2] + FOOT_LOW_M
     for ix in range(first_x, last_x + 1):
         for iy in range(first_y, last_y + 1):
@@ -74,13 +99,13 @@ def _boxes_round(index, target, reach_m):
                     continue
                 known[box] = True
                 rows = index.rows[box]
-                dx = max(rows[15] - target[0], 0.0, target[0] - rows[18])
-                dy = max(rows[16] - target[1], 0.0, target[1] - rows[19])
+                dx = max(rows[LOW_X] - target[0], 0.0, target[0] - rows[HIGH_X])
+                dy = max(rows[LOW_Y] - target[1], 0.0, target[1] - rows[HIGH_Y])
                 distance = np.sqrt(dx * dx + dy * dy)
-                if distance > reach_m + FOOT_SIDE_M or rows[20] < low:
+                if distance > reach_m + FOOT_SIDE_M or rows[HIGH_Z] < low:
                     continue
                 boxes[num], near[num] = box, max(distance - FOOT_SIDE_M, 0.0)
-                slopes[num] = (rows[20] - low) / near[num] if near[num] > 1e-6 else np.inf
+                slopes[num] = (rows[HIGH_Z] - low) / near[num] if near[num] > 1e-6 else np.inf
                 spans[num, 0], spans[num, 1] = _span(rows, target, distance)
                 num += 1
     return boxes[:num], near[:num], slopes[:num], spans[:num]
@@ -91,10 +116,10 @@ def _span(rows, target, distance_m):
     """Give the azimuths under which rays to a target may touch a box: those of its bounds, and the feet's spread."""
     if distance_m < 1.0:
         return 0.0, 2.0 * np.pi
-    middle = np.arctan2(0.5 * (rows[16] + rows[19]) - target[1], 0.5 * (rows[15] + rows[18]) - target[0])
+    middle = np.arctan2(0.5 * (rows[LOW_Y] + rows[HIGH_Y]) - target[1], 0.5 * (rows[LOW_X] + rows[HIGH_X]) - target[0])
     left, right = 0.0, 0.0
     for corner in range(4):
-        x, y = rows[15 + 3 * (corner % 2)], rows[16 + 3 * (corner // 2)]
+        x, y = rows[LOW_X + 3 * (corner % 2)], rows[LOW_Y + 3 * (corner // 2)]
         turn = np.arctan2(y - target[1], x - target[0]) - middle
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
         left, right = min(left, turn), max(right, turn)
@@ -128,12 +153,12 @@ def look(index, horizon, target, x, y, z):
 def _blocked_rays(rows, box, x, y, z, target, blocked):
     """Add to the bits of `blocked` the rays to a target that touch a box: the point and the hip turned into its frame once."""
     tx, ty, tz = target[0], target[1], target[2]
-    if min(x, tx - FOOT_SIDE_M) > rows[box, 18] or max(x, tx + FOOT_SIDE_M) < rows[box, 15]:
+    if min(x, tx - FOOT_SIDE_M) > rows[box, HIGH_X] or max(x, tx + FOOT_SIDE_M) < rows[box, LOW_X]:
         return blocked
-    if min(y, ty) > rows[box, 19] or max(y, ty) < rows[box, 16] or tz + FOOT_LOW_M > rows[box, 20]:
+    if min(y, ty) > rows[box, HIGH_Y] or max(y, ty) < rows[box, LOW_Y] or tz + FOOT_LOW_M > rows[box, HIGH_Z]:
         return blocked
-    u, v, w = _in_box_frame(rows, box, x, y, z)
-    hip_u, hip_v, hip_w = _in_box_frame(rows, box, tx, ty, tz)
+    u, v, w = in_box_frame(rows, box, x, y, z)
+    hip_u, hip_v, hip_w = in_box_frame(rows, box, tx, ty, tz)
     # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked, deep inside all are.
     if not _touches(rows, box, hip_u, hip_v, hip_w, u, v, w, RAY_SPREAD_M):
         return blocked
@@ -143,12 +168,12 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
         if (blocked >> ray) & 1:
             continue
         a, b, c = RAY_OFFSETS_M[ray, 0], RAY_OFFSETS_M[ray, 1], RAY_OFFSETS_M[ray, 2]
-        foot_u = hip_u + rows[box, 6] * a + rows[box, 9] * b + rows[box, 12] * c
-        foot_v = hip_v + rows[box, 7] * a + rows[box, 10] * b + rows[box, 13] * c
-        foot_w = hip_w + rows[box, 8] * a + rows[box, 11] * b + rows[box, 14] * c
-        enter, leave = _clip(foot_u, u - foot_u, rows[box, 3], 0.0, 1.0)
-        enter, leave = _clip(foot_v, v - foot_v, rows[box, 4], enter, leave)
-        enter, leave = _clip(foot_w, w - foot_w, rows[box, 5], enter, leave)
+        foot_u = hip_u + rows[box, XU] * a + rows[box, YU] * b + rows[box, ZU] * c
+        foot_v = hip_v + rows[box, XV] * a + rows[box, YV] * b + rows[box, ZV] * c
+        foot_w = hip_w + rows[box, XW] * a + rows[box, YW] * b + rows[box, ZW] * c
+        enter, leave = clip(foot_u, u - foot_u, rows[box, HALF_X], 0.0, 1.0)
+        enter, leave = clip(foot_v, v - foot_v, rows[box, HALF_Y], enter, leave)
+        enter, leave = clip(foot_w, w - foot_w, rows[box, HALF_Z], enter, leave)
         if enter <= leave:
             blocked |= 1 << ray
     return blocked
@@ -157,8 +182,8 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
 @njit(cache=True, inline="always")
 def _touches(rows, box, a, b, c, u, v, w, inflate_m):
     """Tell whether a segment in a box's frame touches the box grown (or shrunk) on every side; a box shrunk away never is."""
-    enter, leave = _clip(a, u - a, rows[box, 3] + inflate_m, 0.0, 1.0)
-    enter, leave = _clip(b, v - b, rows[box, 4] + inflate_m, enter, leave)
-    enter, leave = _clip(c, w - c, rows[box, 5] + inflate_m, enter, leave)
-    least = min(rows[box, 3], rows[box, 4], rows[box, 5]) + inflate_m
+    enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
+    enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
+    enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
+    least = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z]) + inflate_m
     return enter <= leave and least >= 0.0

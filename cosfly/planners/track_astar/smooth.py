@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from cosfly.planners.contract import PlanConfig, TrackAStarConfig
 
 ROUNDING_M = 1e-9
+GAP, STEP, LOW, HIGH = range(4)  # places in `limits`: least distance to boxes, longest step, least and greatest z
 
 
 def smooth_flight(
@@ -84,11 +85,11 @@ def judge(
 
 @njit(cache=True)
 def candidate_is_valid(x, y, z, target, floor, index, limits, blockers):
-    """Tell whether a waypoint keeps distance, altitude and sight. limits: (4,) safety, longest step, least and greatest z, m."""
-    if z < limits[2] - ROUNDING_M or z > limits[3] + ROUNDING_M:
+    """Tell whether a waypoint keeps distance, altitude and sight. limits: (4,) m, places above."""
+    if z < limits[LOW] - ROUNDING_M or z > limits[HIGH] + ROUNDING_M:
         return False
-    gap, _ = nearest_box(index, x, y, z, limits[0])
-    if gap < limits[0]:
+    gap, _ = nearest_box(index, x, y, z, limits[GAP])
+    if gap < limits[GAP]:
         return False
     if floor <= 0.0:
         return True
@@ -100,10 +101,10 @@ def candidate_is_valid(x, y, z, target, floor, index, limits, blockers):
 def step_is_valid(ax, ay, az, bx, by, bz, index, limits, one):
     """Tell whether a step between two valid waypoints is short enough and hits nothing."""
     length = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
-    if length > limits[1] + ROUNDING_M:
+    if length > limits[STEP] + ROUNDING_M:
         return False
     # Both ends keep the safety distance: a step shorter than twice that reaches no box.
-    return length < 2.0 * limits[0] or collect_hits(index, ax, ay, az, bx, by, bz, 0.0, one) == 0
+    return length < 2.0 * limits[GAP] or collect_hits(index, ax, ay, az, bx, by, bz, 0.0, one) == 0
 
 
 @njit(cache=True)

@@ -34,13 +34,17 @@ MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
 # The 26 neighbours of a voxel and itself.
 MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
 STAY = 13
+UNKNOWN, FREE, BLOCKED = range(3)  # edges between voxels
+
+WEIGHTS = ("tracking", "visibility", "path", "safety", "smoothness")
+TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
 
 
 class Voxels(NamedTuple):
     """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m.
 
     columns: (nx, ny) bool, inside the corridor. Caches, filled when first asked: clearances (cells,) m, NaN is unknown;
-    edges (cells, 27): 0 unknown, 1 free, 2 blocked.
+    edges (cells, 27): UNKNOWN, FREE or BLOCKED.
     """
 
     low: np.ndarray
@@ -52,7 +56,7 @@ class Voxels(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Weights and lengths of the search; order of weights as in the module's docstring."""
+    """Weights and lengths of the search; weights: (5,), places below."""
 
     weights: np.ndarray
     behind_m: float
@@ -101,7 +105,7 @@ def search_flight(
     start = behind(targets[:1], smoothed_headings(targets, cfg.heading_smoothing_s)[:1], cfg.behind_distance_m, 0.0)[0]
     preferred_z = scenario.ground_m + cfg.altitude_preferred_m
     costs = Costs(
-        weights=np.array([getattr(settings, f"weight_{name}") for name in ("tracking", "visibility", "path", "safety", "smoothness")]),
+        weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
         behind_m=cfg.behind_distance_m, preferred_z=preferred_z, influence_m=settings.influence_m, safety_m=safety_m,
         start=np.array([start[0], start[1], preferred_z]),
     )  # fmt: skip
@@ -237,7 +241,7 @@ def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came
                     continue
                 z = voxels.low[2] + iz * voxels.size[2]
                 away = np.sqrt((x - costs.start[0]) ** 2 + (y - costs.start[1]) ** 2 + (z - costs.start[2]) ** 2)
-                best[cell] = costs.weights[2] * away / voxels.size[0]
+                best[cell] = costs.weights[PATH] * away / voxels.size[0]
                 came_from[cell], came_by[cell], touched[num] = -1, STAY, cell
                 num += 1
     return num
@@ -267,14 +271,14 @@ def _expand(
             there = (jx * num_y + jy) * num_z + jz
             cost = (
                 cost_before[b]
-                + costs.weights[2] * lengths[move] / voxels.size[0]
-                + costs.weights[4] * bends[move_before[b], move]
+                + costs.weights[PATH] * lengths[move] / voxels.size[0]
+                + costs.weights[SMOOTHNESS] * bends[move_before[b], move]
             )
             if cost >= best[there] or not voxels.columns[jx, jy]:
                 continue
-            if voxels.edges[cell, move] == 0:
-                voxels.edges[cell, move] = 1 if _edge_is_free(cell, there, voxels, costs, index) else 2
-            if voxels.edges[cell, move] == 2:
+            if voxels.edges[cell, move] == UNKNOWN:
+                voxels.edges[cell, move] = FREE if _edge_is_free(cell, there, voxels, costs, index) else BLOCKED
+            if voxels.edges[cell, move] == BLOCKED:
                 continue
             if best[there] == np.inf:
                 touched[num] = there
@@ -299,21 +303,21 @@ def _choose(touched, best, target, voxels, costs, index, beam):
         near = max(0.0, 1.0 - gap / costs.influence_m)
         bounds[k] = (
             best[cell]
-            + costs.weights[0] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
-            + costs.weights[3] * near * near
+            + costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
+            + costs.weights[SAFETY] * near * near
         )
     horizon = make_horizon(index, target, reach_m)
     total, num = np.full(len(touched), np.inf), 0
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
     for k in range(len(touched)):  # those that would stay if all saw everything
         if bounds[k] <= limit:
-            total[k] = bounds[k] + costs.weights[1] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            total[k] = bounds[k] + costs.weights[VISIBILITY] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
     if num < len(touched):
         limit = np.partition(total, beam - 1)[beam - 1]
     for k in range(len(touched)):  # and those that are cheaper than what has turned out to be hidden
         if total[k] == np.inf and bounds[k] < limit:
-            total[k] = bounds[k] + costs.weights[1] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            total[k] = bounds[k] + costs.weights[VISIBILITY] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
             if num % 256 == 0:
                 limit = np.partition(total, beam - 1)[beam - 1]

@@ -1,0 +1,340 @@
+"""The passes of Step 2: fewer boxes that keep the layout of obstacles (sec:step2): merge, crop_tree, crop_below_ground, prune_nested.
+
+Two rules of the paper lose more than they should on real maps, so each has a guard, on by default, that a setting turns off.
+*merge* replaces a cluster by its enclosing axis-aligned box: rows of houses that stand askew would swallow the street between them,
+so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`, `min_canopy_fill`; 0 is the
+paper's rule).
+*crop_tree* keeps the full footprint below the cut, so that nobody walks below a tree, although that is what the cut is for:
+`trunk: stem` leaves stems instead (`trunk: full` is the paper's rule). The report holds the walkable area of both.
+
+The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants are settings: `merge_by: center`,
+`crop_strategy: adaptive`, `below_ground: clip`, `nested_tolerance_m: 1e-6`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.compiled import njit
+from cosfly.config import Config
+from cosfly.geometry import axis_aligned_half_extents
+from cosfly.products.boxes import BoxMap, SimplifyPass
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.simplify.merge import MergeRule, merge
+
+VEGETATION, WATER = KINDS["Vegetation"], KINDS["Water"]
+# Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0, and a renderer needs them.
+SURFACE_KINDS = np.array(sorted(GROUND_KINDS | {WATER, KINDS["Bridge"]}), dtype=np.uint8)
+
+
+class MergeGaps(Config):
+    """Largest gap on every axis between boxes that count as neighbours, m; null: this kind is not merged."""
+
+    Vegetation: float | None = Field(2.0, ge=0.0, description="canopy parts of simulators stand closer than this, m")
+    Buildings: float | None = Field(5.0, ge=0.0, description="wall segments of one building stand closer than this, m")
+    Walls: float | None = Field(None, ge=0.0, description="free-standing walls, m; null: not merged")
+    Fences: float | None = Field(None, ge=0.0, description="fences, m; null: not merged")
+    Static: float | None = Field(None, ge=0.0, description="street furniture, m; null: not merged")
+
+
+class SimplifyConfig(Config):
+    """The four passes of Step 2."""
+
+    merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
+    merge_by: Literal["gap", "center"] = Field(
+        "gap",
+        description="neighbours: boxes with gaps below merge_gap_m on every axis, or with centres so near (SimWorld)",
+    )
+    merge_gap_m: MergeGaps = Field(default_factory=MergeGaps, description="neighbourhood by kind")
+    min_fill: float = Field(
+        0.85,
+        ge=0.0,
+        le=1.0,
+        description="share of a merged box's footprint that its members must cover; 0: the paper's rule",
+    )
+    min_canopy_fill: float = Field(
+        0.5,
+        ge=0.0,
+        le=1.0,
+        description="the same for vegetation, whose round crowns never fill a box; 0: the paper's rule",
+    )
+    crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
+    crop_strategy: Literal["fixed", "adaptive"] = Field(
+        "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
+    )
+    cut_height_m: float = Field(2.0, gt=0.0, description="height over the ground of the split, m")
+    lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
+    trunk: Literal["stem", "full"] = Field(
+        "stem", description="below the cut: stems, or the full footprint as in the paper"
+    )
+    stem_radius_m: float = Field(0.25, gt=0.0, description="half width of a stem, m")
+    split_z_m: float = Field(5.0, gt=0.0, description="adaptive: height over the ground of the lowest cut, m")
+    adaptive_height_m: float = Field(5.0, gt=0.0, description="adaptive: vegetation higher than this is cut, m")
+    cell_size_m: float = Field(0.5, gt=0.0, description="adaptive: width of what stands below the lowest cut, m")
+    crop_below_ground: bool = Field(True, description="drop boxes, surfaces apart, whose top lies below the ground")
+    below_ground: Literal["drop", "clip"] = Field(
+        "drop", description="clip: also cut off what a box has below the ground (SimWorld); drop: leave boxes whole"
+    )
+    prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
+    nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
+    picture_px: int = Field(
+        1000, ge=200, le=8000, description="longer side of each half of the before/after picture, px"
+    )
+
+
+@dataclass(frozen=True)
+class Simplified:
+    """A simplified map and what each pass left: (name of the pass, boxes by kind), the first entry is the input."""
+
+    box_map: BoxMap
+    passes: list[tuple[str, dict[str, int]]]
+
+
+def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
+    """Apply the passes in the paper's order.
+
+    The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a tree's canopy keeps
+    its own, stems and trunks get the smallest numbers that the input does not use.
+    """
+    passes = [("input", box_map.counts())]
+    feet = _feet(box_map, cfg) if _has_stems(cfg) else None
+    used_ids = box_map.ids
+    result = box_map
+    if cfg.merge:
+        result = merge(result, _merge_rules(cfg), _merge_groups(box_map, cfg), by_center=cfg.merge_by == "center")
+        passes.append(("merge", result.counts()))
+    if cfg.crop_tree:
+        fixed = cfg.crop_strategy == "fixed"
+        result = crop_tree(result, cfg, used_ids, feet) if fixed else crop_tree_adaptive(result, cfg, used_ids)
+        passes.append(("crop_tree", result.counts()))
+    if cfg.crop_below_ground:
+        result = crop_below_ground(result, clip=cfg.below_ground == "clip")
+        passes.append(("crop_below_ground", result.counts()))
+    if cfg.prune_nested:
+        result = prune_nested(result, cfg.nested_tolerance_m)
+        passes.append(("prune_nested", result.counts()))
+    told = {
+        "passes": [SimplifyPass(name=name, counts=counts) for name, counts in passes],
+        "simplify": cfg.model_dump(mode="json", exclude={"picture_px"}),
+    }
+    return Simplified(replace(result, header=box_map.header.model_copy(update=told)), passes)
+
+
+def _concatenate(one: BoxMap, other: BoxMap) -> BoxMap:
+    names = ("centers", "half_extents", "rotations_deg", "kinds", "ids")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names}
+    return replace(one, **joined)
+
+
+def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
+    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.model_dump().items() if gap is not None}
+    return {
+        kind: MergeRule(gap, cfg.min_canopy_fill if kind == VEGETATION else cfg.min_fill) for kind, gap in gaps.items()
+    }
+
+
+def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
+    """Groups that never merge with each other, (n,). With stems, bushes and hedges must not vanish below the cut of a tree."""
+    if not _has_stems(cfg):
+        return np.zeros(len(box_map), dtype=bool)
+    return box_map.maxs[:, 2] > box_map.header.ground_z_m + cfg.cut_height_m
+
+
+def _has_stems(cfg: SimplifyConfig) -> bool:
+    return cfg.crop_tree and cfg.crop_strategy == "fixed" and cfg.trunk == "stem"
+
+
+# --- crop_tree --------------------------------------------------------------------------------------------------------
+
+
+def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
+    """Where trees stand, (k, 4): x, y and half widths of a stem for every vegetation box that spans the cut height.
+
+    Taken before the merge, because a merged grove still has one stem for each of its trees.
+    """
+    mins, maxs = box_map.mins[:, 2], box_map.maxs[:, 2]
+    ground_z_m = box_map.header.ground_z_m
+    cut = ground_z_m + cfg.cut_height_m
+    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (mins < cut) & (maxs > cut))
+    # A box that hangs above the ground is a part of a crown, not a tree that stands, unless it comes down to a metre.
+    rows = rows[mins[rows] <= ground_z_m + 1.0]
+    half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
+    return np.column_stack([box_map.centers[rows, :2], half, half])
+
+
+def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: np.ndarray | None) -> BoxMap:
+    """Split vegetation that spans the cut height into what stands on the ground and a lifted canopy.
+
+    Boxes wholly below the cut (bushes, hedges) and wholly above it stay as they are, so a second pass changes nothing.
+
+    Args:
+        used_ids: ids that new boxes may not take. feet: (k, 4) stems to stand below the canopies; None: full footprints.
+    Source: sec:step2, "Crop tree operation"; stems are ours.
+    """
+    ground_z_m = box_map.header.ground_z_m
+    cut = ground_z_m + cfg.cut_height_m
+    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut))
+    is_tilted = (box_map.rotations_deg[rows][:, [0, 2]] != 0).any(axis=1)
+    rotations = np.where(is_tilted[:, None], 0.0, box_map.rotations_deg[rows])
+    bounds = axis_aligned_half_extents(box_map.half_extents[rows], box_map.rotations_deg[rows])
+    half = np.where(is_tilted[:, None], bounds, box_map.half_extents[rows])
+    tops = box_map.centers[rows, 2] + bounds[:, 2]
+
+    centers, half_extents, all_rotations = (
+        a.copy() for a in (box_map.centers, box_map.half_extents, box_map.rotations_deg)
+    )
+    centers[rows, 2] = (cut + tops) / 2 + cfg.lift_m
+    half_extents[rows] = np.column_stack([half[:, :2], (tops - cut) / 2])
+    all_rotations[rows] = rotations
+    canopies = replace(box_map, centers=centers, half_extents=half_extents, rotations_deg=all_rotations)
+
+    if feet is None:
+        places, widths, turns = box_map.centers[rows, :2], half[:, :2], rotations
+    else:
+        places, widths, turns = feet[:, :2], feet[:, 2:], np.zeros((len(feet), 3))
+    count = len(places)
+    trunks = BoxMap(
+        np.column_stack([places, np.full(count, ground_z_m + cfg.cut_height_m / 2)]),
+        np.column_stack([widths, np.full(count, cfg.cut_height_m / 2)]),
+        turns,
+        np.full(count, VEGETATION, dtype=np.uint8),
+        _free_ids(used_ids, count),
+    )
+    return _concatenate(canopies, trunks)
+
+
+def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
+    """Cut vegetation that is higher than `adaptive_height_m` into a stem below `split_z_m` and pieces no higher than that above.
+
+    The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid from afar, but
+    no rule; this is ours. The stem is one cell wide. The lowest piece above the cut keeps the id; without one, the stem does.
+
+    Args:
+        used_ids: ids that new boxes may not take.
+    Source: app:simworld:step3, "crop_tree".
+    """
+    ground_z_m = box_map.header.ground_z_m
+    split = ground_z_m + cfg.split_z_m
+    low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
+    is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
+    rows, is_first, lows, highs = [], [], [], []
+    for row in np.flatnonzero(is_tall):
+        cuts = [float(low[row])]
+        if low[row] < split < high[row]:
+            cuts.append(split)
+        num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
+        cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
+        rows += [row] * (len(cuts) - 1)
+        is_first += [piece == int(len(cuts) > 2 and low[row] < split) for piece in range(len(cuts) - 1)]
+        lows += cuts[:-1]
+        highs += cuts[1:]
+    pieces = np.array(rows, dtype=np.int64)
+    low_z, high_z = np.array(lows), np.array(highs)
+    is_tilted = (box_map.rotations_deg[pieces][:, [0, 2]] != 0).any(axis=1)[:, None]
+    bounds = axis_aligned_half_extents(box_map.half_extents[pieces], box_map.rotations_deg[pieces])
+    half = np.where(is_tilted, bounds, box_map.half_extents[pieces])
+    is_stem = ((low_z < split) & (low_z <= ground_z_m + 1.0))[:, None]
+    half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
+    half[:, 2] = (high_z - low_z) / 2
+    keeps_id = np.array(is_first, dtype=bool)
+    ids = box_map.ids[pieces].copy()
+    ids[~keeps_id] = _free_ids(used_ids, int((~keeps_id).sum()))
+    cut = BoxMap(
+        np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2]),
+        half,
+        np.where(is_tilted, 0.0, box_map.rotations_deg[pieces]),
+        box_map.kinds[pieces],
+        ids,
+    )
+    return _concatenate(box_map.select(~is_tall), cut)
+
+
+def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
+    """Give the smallest positive numbers that are not used, (count,) uint64. Not max + 1: CARLA's ids fill 64 bits."""
+    candidates = np.arange(1, len(used) + count + 1, dtype=np.uint64)
+    return candidates[~np.isin(candidates, used)][:count]
+
+
+# --- removal ----------------------------------------------------------------------------------------------------------
+
+
+def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
+    """Drop boxes whose top face lies below the ground; surfaces stay (sec:step2, "Below-ground removal").
+
+    Args:
+        clip: also cut off what upright boxes, surfaces apart, have below the ground; what only just reaches it goes too
+            (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
+    """
+    ground_z_m = box_map.header.ground_z_m
+    is_surface = np.isin(box_map.kinds, SURFACE_KINDS)
+    lows, tops = box_map.mins[:, 2], box_map.maxs[:, 2]
+    if not clip:
+        return box_map.select((tops >= ground_z_m) | is_surface)
+    is_upright = (box_map.rotations_deg[:, [0, 2]] == 0).all(axis=1)
+    is_cut = (lows < ground_z_m) & (tops > ground_z_m) & is_upright & ~is_surface
+    centers, half_extents = box_map.centers.copy(), box_map.half_extents.copy()
+    centers[is_cut, 2] = (tops[is_cut] + ground_z_m) / 2
+    half_extents[is_cut, 2] = (tops[is_cut] - ground_z_m) / 2
+    clipped = replace(box_map, centers=centers, half_extents=half_extents)
+    return clipped.select((tops > ground_z_m) | is_surface)
+
+
+def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
+    """Drop boxes that lie inside another of the same kind; of equal boxes the one with the smallest id stays.
+
+    Inside means: all corners of the axis-aligned bounds in the other box as it is turned. For unturned boxes that is the paper's
+    rule (sec:step2); for turned ones it never drops a box that sticks out of a turned one's empty corners.
+    """
+    keep = np.ones(len(box_map), dtype=bool)
+    mins, maxs = box_map.mins, box_map.maxs
+    # Bigger first, then the smaller id: a total order, so that two boxes can never drop each other.
+    volumes = np.prod(box_map.half_extents, axis=1)
+    rank = np.empty(len(box_map), dtype=np.int64)
+    rank[np.lexsort((box_map.ids, -volumes))] = np.arange(len(box_map))
+    is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
+    yaw = np.radians(box_map.rotations_deg[:, 1])
+    for kind in np.unique(box_map.kinds):
+        rows = np.flatnonzero(box_map.kinds == kind)
+        axis = int(np.argmax(maxs[rows].max(axis=0)[:2] - mins[rows].min(axis=0)[:2]))
+        order = rows[np.argsort(mins[rows, axis], kind="stable")]
+        _sweep_nested(
+            mins, maxs, box_map.centers, box_map.half_extents, np.cos(yaw), np.sin(yaw), is_tilted, rank, order, axis,
+            tolerance_m + 1e-9, keep,
+        )  # fmt: skip
+    return box_map.select(keep)
+
+
+@njit(cache=True)
+def _sweep_nested(
+    mins, maxs, centers, halves, cos, sin, is_tilted, rank, order, axis, tolerance, keep
+):  # pragma: no cover (compiled)
+    for i in range(len(order)):
+        a = order[i]
+        reach = maxs[a, axis] + tolerance
+        for j in range(i + 1, len(order)):
+            b = order[j]
+            if mins[b, axis] > reach:
+                break
+            outer, inner = (a, b) if rank[a] < rank[b] else (b, a)
+            if is_tilted[outer] or not keep[inner]:
+                continue
+            inside = True
+            for k in range(3):
+                if mins[inner, k] < mins[outer, k] - tolerance or maxs[inner, k] > maxs[outer, k] + tolerance:
+                    inside = False
+                    break
+            if inside:
+                for x in (mins[inner, 0], maxs[inner, 0]):
+                    for y in (mins[inner, 1], maxs[inner, 1]):
+                        dx, dy = x - centers[outer, 0], y - centers[outer, 1]
+                        if (
+                            abs(dx * cos[outer] + dy * sin[outer]) > halves[outer, 0] + tolerance
+                            or abs(dy * cos[outer] - dx * sin[outer]) > halves[outer, 1] + tolerance
+                        ):
+                            inside = False
+            if inside:
+                keep[inner] = False
