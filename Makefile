@@ -15,7 +15,7 @@ quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
 
 test: lint  ## What must hold, without the tests that take long; with SLOW=1 everything
-	$(BIN)/python -m pytest $(if $(SLOW),,-m "not slow")
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(if $(SLOW),,-m "not slow")
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -10,11 +10,15 @@ import cv2
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.frames import SKY_DEPTH_M, read_depth, read_instance, read_rgb
+from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, read_depth, read_instance, read_rgb
 from cosfly.products.kinds import KINDS
 
 View = Literal["rgb", "depth", "segmentation"]
-VIEW_FILES: dict[View, str] = {"rgb": "rgb.png", "depth": "depth.npy", "segmentation": "instance.png"}
+VIEW_FILES: dict[View, str] = {
+    "rgb": FILE_NAMES["rgb"],
+    "depth": FILE_NAMES["depth"],
+    "segmentation": FILE_NAMES["instance"],
+}
 DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; flights keep their target within a third of it
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
