@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import cosfly
 from cosfly import compiled
 from cosfly.planners import ahead
@@ -58,6 +60,7 @@ def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
 # --- ahead of use -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_compiled_ahead_is_found_by_the_planner(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the spare process
     monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
