@@ -231,11 +231,13 @@ class StageFolder:
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )
-        is_complete = (out / "manifest.json").exists() and not read_manifest(out).counts.failed
+        is_complete = (out / "manifest.json").exists()
+        if is_complete and read_manifest(out).counts.failed:
+            (out / "manifest.json").unlink()  # failed items are tried again; the others stand in the journal
+            is_complete = False
         if is_complete:
             _check_outputs_exist(out, read_manifest(out))
-        else:  # failed items are tried again; the others stand in the journal
-            (out / "manifest.json").unlink(missing_ok=True)
+        else:
             write_model(stage_file, record, schema=STAGE_SCHEMA, version=VERSION)
             remove_partials(out)
         return cls(out, stage, is_complete)
