@@ -353,10 +353,10 @@ def test_a_walled_in_person_is_not_moved():
 
 def test_ground_height_finds_the_pavement():
     surroundings = Surroundings(street())
-    assert surroundings.ground_z_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
-    assert surroundings.ground_z_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
-    assert surroundings.ground_z_m(500.0, 500.0, 0.4) == 0.4
-    assert surroundings.ground_z_m(0.0, -9.0, 20.0) == 20.0
+    assert surroundings.surface_z_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
+    assert surroundings.surface_z_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
+    assert surroundings.surface_z_m(500.0, 500.0, 0.4) == 0.4
+    assert surroundings.surface_z_m(0.0, -9.0, 20.0) == 20.0
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------

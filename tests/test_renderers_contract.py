@@ -34,7 +34,7 @@ from cosfly.render.contract import (
     NO_INSTANCE,
     PERSON_ID,
     PosedPerson,
-    ground_z_m,
+    plane_z_m,
 )
 from cosfly.render.person import choose_clothes
 from cosfly.render.stage import RENDERERS, RenderConfig, open_renderer, run
@@ -102,12 +102,12 @@ def pose_towards(eye, target) -> np.ndarray:
     return world_from_camera(np.asarray(eye, float), np.degrees([pitch, yaw, 0.0]))
 
 
-def traced(box_map: BoxMap, ground_z_m: float, pose: np.ndarray, intrinsic: np.ndarray):
+def traced(box_map: BoxMap, plane_z_m: float, pose: np.ndarray, intrinsic: np.ndarray):
     """Slow and obvious: every pixel's ray against every box in float64. Depth, kinds, ids."""
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(intrinsic).T @ pose[:3, :3].T
     middle = (box_map.bounds()[0] + box_map.bounds()[1]) / 2.0
-    plane = np.array([np.round(middle[0]), np.round(middle[1]), ground_z_m - GROUND_PLANE_DROP_M - 0.5])
+    plane = np.array([np.round(middle[0]), np.round(middle[1]), plane_z_m - GROUND_PLANE_DROP_M - 0.5])
     centers = np.vstack([box_map.centers, plane])
     halves = np.vstack([box_map.half_extents, [GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5]])
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
@@ -167,7 +167,7 @@ VIEWS = [
 def test_depth_and_ids_agree_with_computed_rays(renderer, eye, target, fov_deg):
     pose, intrinsic = pose_towards(eye, target), intrinsic_matrix(*SIZE, fov_deg)
     frame = renderer.render(pose, intrinsic, None)
-    depth, kinds, ids = traced(street(), ground_z_m(street()), pose, intrinsic)
+    depth, kinds, ids = traced(street(), plane_z_m(street()), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids)
     assert inner.mean() > 0.5
     near = inner & (depth < 60.0)
@@ -184,7 +184,7 @@ def test_an_intrinsic_matrix_is_used_as_it_stands(renderer):
     intrinsic = np.array([[230.0, 0.0, 131.5], [0.0, 260.0, 104.25], [0.0, 0.0, 1.0]])
     pose = pose_towards(*VIEWS[0][:2])
     frame = renderer.render(pose, intrinsic, None)
-    depth, _, ids = traced(street(), ground_z_m(street()), pose, intrinsic)
+    depth, _, ids = traced(street(), plane_z_m(street()), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids)
     assert np.abs(frame.depth - depth)[inner & (depth < 60.0)].max() < DEPTH_TOLERANCE_M
     np.testing.assert_array_equal(frame.ids[inner], ids[inner])
@@ -212,7 +212,7 @@ def test_depth_is_exact_far_from_the_world_origin(renderer_name):
         intrinsic_matrix(*SIZE, 60.0),
     )
     frame = renderer.render(pose, intrinsic, None)
-    depth, _, ids = traced(street(offset), ground_z_m(street(offset)), pose, intrinsic)
+    depth, _, ids = traced(street(offset), plane_z_m(street(offset)), pose, intrinsic)
     inner = away_from_silhouettes(depth, ids) & (depth < 60.0)
     renderer.close()
     assert np.abs(frame.depth - depth)[inner].max() < DEPTH_TOLERANCE_M

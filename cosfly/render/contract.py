@@ -130,7 +130,7 @@ def scene_origin(box_map: BoxMap) -> np.ndarray:
     return np.round((low + high) / 2.0)
 
 
-def ground_z_m(box_map: BoxMap) -> float:
+def plane_z_m(box_map: BoxMap) -> float:
     """Height of the ground plane: the map's own figure, but never above a slab that covers it."""
     tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
     return float(tops.min(initial=box_map.header.ground_z_m))
@@ -139,7 +139,7 @@ def ground_z_m(box_map: BoxMap) -> float:
 def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
     """Centre and half sizes, (3,) each, world, of the flat box of Terrain under everything; its id is NO_INSTANCE."""
     x, y, _ = scene_origin(box_map)
-    center = np.array([x, y, ground_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
+    center = np.array([x, y, plane_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
     return center, np.array([GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5])
 
 

@@ -96,7 +96,7 @@ class Surroundings:
         self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
         self._tops = slabs.maxs[:, 2]
 
-    def ground_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
+    def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
         """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
@@ -144,13 +144,13 @@ def _shift(
     """Apply one frame's position event, or note why not."""
     target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
-    target[2] = surroundings.ground_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
+    target[2] = surroundings.surface_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
     drone = planned.positions_m[i] + drone_offset
     # The camera is aimed at the shifted person as it was aimed at the unshifted one.
     aimed = planned.rotations_deg[i].copy()
     aimed[:2] += _aim_deg(drone, target) - _aim_deg(planned.positions_m[i], planned.targets_m[i])
     aimed[1] = wrap_deg(aimed[1])
-    ground_z = surroundings.ground_z_m(drone[0], drone[1], feet_z)
+    ground_z = surroundings.surface_z_m(drone[0], drone[1], feet_z)
     distances, _ = signed_distances(surroundings.obstacles, np.stack([drone, target, target + HEAD_OFFSET_M]))
     if distances[0] < cfg.min_clearance_m or drone[2] < ground_z + cfg.min_clearance_m:
         result.states[i]["position"] = "fallback: drone clearance"

@@ -169,7 +169,7 @@ class GlRenderer:
     def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
         """A height map from above, blurred: what stands higher than a point darkens it."""
         parts = self.scene.parts
-        ground_z = self.scene.ground_z_m - self.scene.origin_m[2]
+        ground_z = self.scene.plane_z_m - self.scene.origin_m[2]
         top = float((parts.object_centers[casting, 2] + parts.object_radii[casting]).max(initial=ground_z)) + 1.0
         depth_m = top - ground_z + 10.0
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
@@ -235,7 +235,7 @@ class GlRenderer:
             "world_from_camera": world_from_camera,
             "camera_position": eye,
             "world_offset": offset,
-            "ground_z": self.scene.ground_z_m - self.scene.origin_m[2],
+            "ground_z": self.scene.plane_z_m - self.scene.origin_m[2],
             "shadow_map": 0,
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,

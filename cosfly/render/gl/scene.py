@@ -9,7 +9,7 @@ import numpy as np
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import NO_INSTANCE, ground_plane, ground_z_m, instance_ids, scene_origin
+from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import GRASS, Boxes, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, plain
@@ -19,11 +19,11 @@ HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the sh
 
 @dataclass(frozen=True)
 class Scene:
-    """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; ground_z_m: the ground plane, world."""
+    """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world."""
 
     parts: Parts
     origin_m: np.ndarray
-    ground_z_m: float
+    plane_z_m: float
 
 
 def build_scene(box_map: BoxMap) -> Scene:
@@ -48,7 +48,7 @@ def build_scene(box_map: BoxMap) -> Scene:
     ids, seeds = np.full(1, NO_INSTANCE, np.uint16), np.zeros(1)
     ground = Boxes((center - origin)[None], half[None], np.eye(3)[None], ids, seeds, KINDS["Terrain"])
     builder.add(ground, meshes.BOX, half[None], GRASS, np.array([0.105, 0.14, 0.045]), layer=0)
-    return Scene(builder.finish(), origin, ground_z_m(box_map))
+    return Scene(builder.finish(), origin, plane_z_m(box_map))
 
 
 def seeds_of(ids: np.ndarray) -> np.ndarray:
