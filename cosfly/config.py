@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.resources
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -24,8 +24,12 @@ MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
 class Config(BaseModel):
-    """Base of every stage's settings: frozen, and an unknown key is an error."""
+    """Base of every stage's settings: frozen, and an unknown key is an error.
 
+    `formerly`: setting of an earlier version -> the hint that its users get.
+    """
+
+    formerly: ClassVar[dict[str, str]] = {}
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
@@ -128,27 +132,26 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
     field = ".".join(str(part) for part in detail["loc"]) or "settings"
     if detail["type"] == "extra_forbidden":
         *parents, last = detail["loc"]
-        known, formerly = _known(model, parents)
-        hint = nearest(formerly.get(str(last), str(last)), known) or (
-            f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else ""
-        )
+        group = _group(model, parents)
+        if last in getattr(group, "formerly", {}):
+            return f"{field}: unknown setting ({group.formerly[last]})"
+        known = list(getattr(group, "model_fields", {}))
+        hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
         return f"{field}: unknown setting{hint}"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
     what = "not a group of settings" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
     return f"{field}: {what}{got}"
 
 
-def _known(model: Any, parents: Iterable[Any]) -> tuple[list[str], dict[str, str]]:
-    """Names of the settings of the group at `parents`, and what became of former names (`formerly` on a field)."""
+def _group(model: Any, parents: Iterable[Any]) -> Any:
+    """Give the model of the group of settings at `parents`, None where there is none."""
     for parent in parents:
         field = getattr(model, "model_fields", {}).get(parent)
         if field is None:
             continue  # the tag of a union, or a position in a list
         kinds = [field.annotation, *get_args(field.annotation)]
         model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-    fields = getattr(model, "model_fields", {})
-    extras = {name: field.json_schema_extra for name, field in fields.items()}
-    return list(fields), {str(extra.get("formerly")): name for name, extra in extras.items() if isinstance(extra, dict)}
+    return model
 
 
 def shipped(name: str) -> Path:

@@ -5,9 +5,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-hypothesis.settings.register_profile(
-    "cosfly", deadline=None
-)  # a busy machine is not a failure; pytest-timeout ends what hangs
+# A busy machine is not a failure; pytest-timeout ends what hangs.
+hypothesis.settings.register_profile("cosfly", deadline=None)
 hypothesis.settings.load_profile("cosfly")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

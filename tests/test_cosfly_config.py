@@ -1,5 +1,7 @@
 """Settings: strict, all problems at once, the nearest name."""
 
+from typing import ClassVar
+
 import pytest
 from pydantic import Field
 
@@ -8,7 +10,8 @@ from cosfly.errors import ConfigError
 
 
 class Inner(Config):
-    altitude_m: float = Field(20.0, gt=0, description="", json_schema_extra={"formerly": "flies_at"})
+    formerly: ClassVar = {"flies_at": "did you mean 'altitude_m'?"}
+    altitude_m: float = Field(20.0, gt=0, description="")
 
 
 class Outer(Config):

@@ -62,7 +62,7 @@ def test_a_foreign_header_survives(tmp_path):
     ("change", "words"),
     [
         (lambda v: v.update(ground_z_m="low"), r"boxes_3d.json: ground_z_m.*low"),
-        (lambda v: v.update(licence="CC BY 4.0"), r"licence.*CC BY 4.0"),
+        (lambda v: v.update(licence="CC BY 4.0"), r"licence: not a licence identifier.*hub.*CC BY 4.0"),
         (lambda v: v["boxes"][1].update(extent=[1, -2, 1]), r"box 2: extent.*-2"),
         (lambda v: v["boxes"][1].update(center=[1, "x", 1]), r"boxes\[1\].center"),
         (lambda v: v["boxes"][1].update(center=[1, "2", 1]), r"boxes\[1\].center"),

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -132,6 +132,7 @@ class TrackAStarConfig(Config):
 class PlanConfig(Config):
     """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walk."""
 
+    formerly: ClassVar = {"visibility_min": "did you mean 'five_ray_mean_min'?"}
     planner: str = Field("muco", description="which planner flies: a name in PLANNERS")
     safety_distance_m: float = Field(3.0, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(2.5, gt=0, description="distance that must be kept where the nominal one cannot, m")
@@ -144,9 +145,11 @@ class PlanConfig(Config):
         4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
     )
     five_ray_mean_min: float = Field(
-        FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a flight whose mean five-ray visibility is below this; 0: never",
-        json_schema_extra={"formerly": "visibility_min"},
-    )  # fmt: skip
+        FIVE_RAY_MEAN_MIN,
+        ge=0,
+        le=1,
+        description="drop a flight whose mean five-ray visibility is below this; 0: never",
+    )
     accel_rms_max_mps2: float = Field(
         ACCEL_RMS_MAX_MPS2, gt=0, description="drop a flight of greater RMS acceleration, m/s^2"
     )
