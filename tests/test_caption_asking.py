@@ -19,14 +19,17 @@ import pytest
 from rich.console import Console
 from teacher_server import TeacherServer, is_mirror, kept_answers
 
+from caption.run.compare import run as compare_strategies
+from caption.run.forecast import make_forecast
 from caption.run.progress import Display, duration
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat import answers
 from cosfly.chat.answers import AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
+from cosfly.chat.contract import Usage
 from cosfly.chat.protocol import encode_body, with_image_ids
-from cosfly.errors import ConfigError, TeacherError
+from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -126,6 +129,20 @@ def test_a_budget_needs_a_server_that_counts_and_a_price():
         pass
     with pytest.raises(TeacherError, match="reports no token usage"):
         budget.note(None, "http://x")
+
+
+def test_what_a_judge_took_is_no_measure_of_a_request_with_pictures():
+    """After a restart the first answer may be a judge's, all before it being known."""
+    used = Counter()
+    budget = Budget(BudgetConfig(max_tokens=1500), used, first_prompt=900, first_completion=100)
+    with budget.request():
+        pass
+    budget.note(Usage(prompt_tokens=10, completion_tokens=5), "http://x")
+    with budget.request(15), pytest.raises(BudgetSpent, match="0 of at most 1,500"), budget.request(15):
+        pass
+    budget.note(Usage(prompt_tokens=400, completion_tokens=50), "http://x", 15)
+    with budget.request(15), budget.request(), budget.request(15):  # now both kinds are known
+        pass
 
 
 # --- what failed ------------------------------------------------------------------------------------------------------
@@ -287,6 +304,36 @@ def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
     assert lines[1].strip() == "caption: 43 of 100 windows"
 
 
+# --- a folder of an earlier version -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resume", ["if-same", "force"])
+def test_a_folder_whose_answers_stand_in_one_file_is_refused_and_nothing_is_paid_twice(tree, tmp_path, resume):
+    out = tmp_path / "out"
+    with hovering() as server:
+        cfg = settings(server.url, limit=3)
+        path = run(cfg, tree, out)
+        num_asked = len(server.bodies)
+        Journal(out / "answers.jsonl").append({"key": "k"})
+        assert run(cfg, tree, out, resume=resume) == path  # complete: nothing would be asked
+        with pytest.raises(ResumeError, match=r"answers.jsonl.*earlier version"):
+            run(cfg.model_copy(update={"limit": 5}), tree, out)
+        assert (out / "manifest.json").exists()
+        (out / "manifest.json").unlink()
+        before = sorted((path, path.read_bytes()) for path in out.rglob("*") if path.is_file())
+        other = settings(server.url, endpoint={"temperature": 0.1})
+        refused = r"answers.jsonl.*earlier version.*the version that began it, or choose another --out"
+        for changed in (cfg, other):
+            with pytest.raises(ResumeError, match=refused):
+                run(changed, tree, out, resume=resume)
+            with pytest.raises(ResumeError, match=refused):
+                make_forecast(changed, tree, out, resume=resume)
+        with pytest.raises(ResumeError, match=refused):
+            compare_strategies(cfg, tree, out)
+        assert before == sorted((path, path.read_bytes()) for path in out.rglob("*") if path.is_file())
+    assert len(server.bodies) == num_asked
+
+
 # --- the book of answers ----------------------------------------------------------------------------------------------
 
 
@@ -373,6 +420,30 @@ def test_a_lost_line_of_totals_costs_time_only(tmp_path, damage):
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 20
         assert book.get(flight_name(3), record(3, 2)["key"]) == record(3, 2)
+
+
+def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):
+    fill(tmp_path, 1, 4, set())
+    path = tmp_path / journal_name(flight_name(0))
+
+    async def go_on(window: int) -> None:
+        await AnswerBook(tmp_path).put(
+            flight_name(0), record(0, window)
+        )  # and is killed before the next line of totals
+
+    for window in (4, 5):
+        asyncio.run(go_on(window))
+        assert AnswerBook(tmp_path).totals == {
+            "answers": window + 1,
+            "prompt_tokens": 10 * window + 10,
+            "completion_tokens": 2 * window + 2,
+        }
+    with AnswerBook(tmp_path) as book:
+        assert all(book.get(flight_name(0), record(0, window)["key"]) for window in range(6))
+    assert list(Journal(path).read())[-1]["totals"]["answers"] == 6
+    with AnswerBook(tmp_path) as book:
+        assert book.totals["answers"] == 6
+    assert len(list(Journal(path).read())) == 8
 
 
 def test_a_torn_line_is_not_an_answer_and_the_journal_goes_on(tmp_path):

@@ -12,7 +12,7 @@ from caption.run.compare import STRATEGIES, compare, run, text_distance
 from caption.schema import CaptionConfig
 from caption.window_loop import Trial
 from cosfly.cli import app
-from cosfly.errors import InputError
+from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import Coc
 from specimens import make_playback_tree
 
@@ -24,6 +24,14 @@ def tree(tmp_path_factory):
 
 def coc(text: str) -> Coc:
     return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
+
+
+def test_a_budget_that_is_used_up_is_one_clear_error(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 12)
+    with TeacherServer(decision=lambda body: "hover") as server:
+        cfg = CaptionConfig.model_validate({"teacher": server.url, "budget": {"max_tokens": 5_000}})
+        with pytest.raises(TeacherError, match=r"budget.max_tokens: .* of at most 5,000 tokens are used; raise it"):
+            run(cfg, tree, tmp_path / "out")
 
 
 def test_text_distance():

@@ -114,6 +114,20 @@ def test_what_is_kept_is_not_asked_again(name, tmp_path):
     assert (record["model"], record["sample_id"], record["purpose"]) == (engine.model, "flight_frame_00004", "free/0")
 
 
+def test_two_that_ask_the_same_at_once_pay_once(tmp_path):
+    engine = PlainEngine()
+
+    async def ask() -> list[Reply]:
+        async with started(engine):
+            with AnswerBook(tmp_path / "answers") as book:
+                kept = KeptAnswers(engine, book)
+                asked = [kept.ask(request_of("go"), "flight", f"flight_frame_{i:05d}", "judge") for i in range(5)]
+                return await asyncio.gather(*asked)
+
+    assert len(set(asyncio.run(ask()))) == 1
+    assert engine.num_answers == len(kept_answers(tmp_path)) == 1
+
+
 def test_an_engine_is_closed_whatever_came_of_its_start():
     class Broken(PlainEngine):
         async def start(self) -> None:

@@ -158,8 +158,8 @@ class Asking:
         try:
             caption = await caption_window(window, teacher, self.cfg, self.judge)
         except BudgetSpent as error:
-            self.stopped = self.stopped or str(error)
-            self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=str(error)))
+            self.stopped = self.stopped or error.what
+            self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=error.what))
         except NoAnswer as error:
             failure = Failed(id=sample_id, code=error.cause, message=str(error))
             if error.cause == "not_asked":

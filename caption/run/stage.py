@@ -19,6 +19,7 @@ from caption.run.report import write_page
 from caption.schema import CaptionConfig
 from caption.teachers.teacher import RuleTeacher, Teacher
 from caption.window_loop import caption_window
+from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
@@ -88,8 +89,11 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     """Open the stage's folder for these settings.
 
     Raises:
-        ResumeError: it holds work made with another prompt, model or input; names what differs.
+        ResumeError: it holds work made with another prompt, model or input; names what differs. Or the answers of an
+            earlier version.
     """
+    if not (out / "manifest.json").exists():
+        refuse_one_file(out / ANSWERS)
     return StageFolder.open(out, "caption", config=cfg, inputs={"data": data}, seed=seed, resume=resume)
 
 
@@ -98,6 +102,7 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
     limit = read_manifest(stage.path).facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
+    refuse_one_file(stage.path / ANSWERS)
     (stage.path / "manifest.json").unlink()
     return True
 

@@ -17,11 +17,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Usage
 from cosfly.chat.protocol import answer_key
-from cosfly.errors import CosflyError
+from cosfly.errors import CosflyError, ResumeError
 from cosfly.journal import Journal
 from cosfly.store import sha256_bytes
 
@@ -38,6 +39,21 @@ def journal_name(flight: str) -> str:
     return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
 
 
+def refuse_one_file(folder: Path) -> None:
+    """Refuse to go on where an earlier version kept the answers in one file, `answers.jsonl`: all would be asked again.
+
+    Raises:
+        ResumeError: there is such a file.
+    """
+    one_file = folder.with_name(f"{folder.name}.jsonl")
+    if one_file.exists():
+        raise ResumeError(
+            "an earlier version kept the answers in this file; this one would ask and pay for them again",
+            where=one_file,
+            fix="finish the folder with the version that began it, or choose another --out",
+        )
+
+
 @dataclass
 class _Flight:
     """One flight's journal, its answers by key, and what it says of their number and tokens."""
@@ -52,7 +68,12 @@ class AnswerBook:
     """The journals of one folder. Use as a context manager; all methods run on one event loop."""
 
     def __init__(self, folder: Path) -> None:
-        """Count what the journals of earlier runs hold."""
+        """Count what the journals of earlier runs hold.
+
+        Raises:
+            ResumeError: an earlier version kept the answers in one file.
+        """
+        refuse_one_file(folder)
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):
@@ -170,6 +191,7 @@ class KeptAnswers:
             only: sample ids that may be asked about; None: all. Of the others only what the book holds is given.
         """
         self.engine, self.book, self.budget, self.only = engine, book, budget, only
+        self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # key -> held while it is asked
 
     async def ask(self, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
         """
@@ -177,30 +199,31 @@ class KeptAnswers:
             NoAnswer: there is none. BudgetSpent: one more request might pass a limit. TeacherError: none will be answered.
         """
         key = answer_key(self.engine.model, request)
-        known = None if self.book is None else self.book.get(flight, key)
-        if known is not None:
-            usage = Usage(**known["usage"]) if known["usage"] else None
-            return Reply(known["text"], usage, known.get("structured", ""), known.get("finish_reason"))
-        if self.only is not None and sample_id not in self.only:
-            raise NoAnswer("not_asked", "this run asks about other windows only")
-        if self.budget is None:
-            return await self._make(key, request, flight, sample_id, purpose)
-        with self.budget.request():
-            reply = await self._make(key, request, flight, sample_id, purpose)
-        self.budget.note(reply.usage, self.engine.where)
-        return reply
+        lock = self._asking.setdefault(key, asyncio.Lock())
+        async with lock:  # two windows may ask the same: the second takes the answer of the first
+            known = None if self.book is None else self.book.get(flight, key)
+            if known is not None:
+                usage = Usage(**known["usage"]) if known["usage"] else None
+                return Reply(known["text"], usage, known.get("structured", ""), known.get("finish_reason"))
+            if self.only is not None and sample_id not in self.only:
+                raise NoAnswer("not_asked", "this run asks about other windows only")
+            if self.budget is None:
+                return await self._make(key, request, flight, sample_id, purpose)
+            with self.budget.request(len(request.digests)):
+                reply = await self._make(key, request, flight, sample_id, purpose)
+            self.budget.note(reply.usage, self.engine.where, len(request.digests))
+            return reply
 
     async def _make(self, key: str, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
         start_s = time.monotonic()
         reply = await self.engine.answer(request)
         if self.book is not None:
-            record: dict[str, Any] = {
-                "key": key,
-                "sample_id": sample_id,
-                "purpose": purpose,
+            record: dict[str, Any] = {"key": key, "sample_id": sample_id, "purpose": purpose}
+            record |= {
                 "model": self.engine.model,
+                "text": reply.text,
+                "usage": reply.usage.model_dump() if reply.usage else {},
             }
-            record |= {"text": reply.text, "usage": reply.usage.model_dump() if reply.usage else {}}
             record |= {"structured": reply.structured, "finish_reason": reply.finish_reason}
             record |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
             await self.book.put(flight, record)  # on the disk before anything is derived from it

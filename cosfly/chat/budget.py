@@ -38,8 +38,8 @@ class BudgetConfig(Config):
         return (prompt_tokens * self.price_prompt + completion_tokens * self.price_completion) / MILLION
 
 
-class BudgetSpent(Exception):
-    """The next request might pass a limit; `args[0]` says which."""
+class BudgetSpent(TeacherError):
+    """The next request might pass a limit; `what` says which."""
 
 
 class Budget:
@@ -52,8 +52,8 @@ class Budget:
             first_prompt, first_completion: tokens that a request is taken for until one was answered.
         """
         self.cfg, self._counts = cfg, counts
-        self.num_in_flight = 0
-        self._largest = (first_prompt, first_completion)
+        self._first = self._largest = (first_prompt, first_completion)
+        self._num_in_flight = self._most_pictures = 0
         self._is_measured = False
 
     @property
@@ -71,27 +71,31 @@ class Budget:
         return self.cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
 
     @contextlib.contextmanager
-    def request(self) -> Iterator[None]:
+    def request(self, num_pictures: int = 0) -> Iterator[None]:
         """Hold one request's share of the budget.
 
         Raises:
             BudgetSpent: it does not fit.
         """
-        reserved = self.num_in_flight + 1
-        prompt, completion = (count * reserved for count in self._largest)
+        if num_pictures > self._most_pictures:  # what a judge or a mirror took tells nothing of a request with pictures
+            self._most_pictures, self._is_measured = num_pictures, False
+            self._largest = _larger(self._first, self._largest)
+        prompt, completion = (count * (self._num_in_flight + 1) for count in self._largest)
         totals = self.totals
         tokens = totals["prompt_tokens"] + totals["completion_tokens"]
         if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
-            raise BudgetSpent(f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used")
+            spent = f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used"
+            raise BudgetSpent(spent, where="budget.max_tokens", fix="raise it")
         if self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
-            raise BudgetSpent(f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent")
-        self.num_in_flight += 1
+            spent = f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent"
+            raise BudgetSpent(spent, where="budget.max_cost", fix="raise it")
+        self._num_in_flight += 1
         try:
             yield
         finally:
-            self.num_in_flight -= 1
+            self._num_in_flight -= 1
 
-    def note(self, usage: Usage | None, where: str) -> None:
+    def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
         """Learn from an answer how large requests are.
 
         Raises:
@@ -104,5 +108,11 @@ class Budget:
                 fix="leave out --max-cost and --max-tokens, and use --limit",
             )
         seen = (usage.prompt_tokens, usage.completion_tokens) if usage else (0, 0)
-        self._largest = (max(self._largest[0], seen[0]), max(self._largest[1], seen[1])) if self._is_measured else seen
-        self._is_measured = True
+        if num_pictures < self._most_pictures or self._is_measured:
+            self._largest = _larger(self._largest, seen)
+        else:
+            self._largest, self._is_measured = seen, True
+
+
+def _larger(one: tuple[int, int], two: tuple[int, int]) -> tuple[int, int]:
+    return max(one[0], two[0]), max(one[1], two[1])
