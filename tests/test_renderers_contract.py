@@ -260,6 +260,27 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0)
 
 
+def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(renderer_name):
+    """Each tree is one box from the ground up, which the person stands in; `plants_of` says where its crown begins."""
+    hip = np.array([0.0, 0.0, 0.9])
+    trees = make_box_map(
+        [(-1.5, 0.0, 3.0), (1.5, 0.0, 3.0)], [(2.0, 2.0, 3.0)] * 2, np.zeros((2, 3)), [KINDS["Vegetation"]] * 2
+    )
+    renderer, camera = opened(renderer_name, trees), Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
+    walker = PosedPerson(hip, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    seen = {}
+    for name, eye in {"side": (0.0, -12.0, 1.2), "above": (0.0, -1.0, 15.0), "through": (-14.0, 0.0, 0.9)}.items():
+        pose = pose_towards(eye, hip)
+        frame = renderer.render(pose, camera.intrinsic, walker)
+        seen[name] = rendered_visibility(frame, hip, view_target(hip, pose, camera), pose, camera)
+        assert set(np.unique(frame.ids)) >= {1, 2}
+    renderer.close()
+    assert seen["side"][0] > 0.98
+    assert seen["side"][1] > 500, "pixels of the person"
+    assert seen["above"][0] < 0.5, "the crowns close over the person"
+    assert 0.2 < seen["through"][0] < 0.95, "a stem hides a strip"
+
+
 def test_a_pose_that_is_not_finite_is_refused(renderer):
     intrinsic = intrinsic_matrix(*SIZE, 60.0)
     with pytest.raises(RenderError, match="not finite"):

@@ -3,6 +3,7 @@
 Any renderer draws the same things in the same places, so that depth, kinds and ids do not depend on who draws:
 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
+- of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain under everything (`ground_plane`), and sky where nothing stands between NEAR_M and FAR_M;
 - of coplanar surfaces the one of the higher layer (`layers_of`).
 """
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
@@ -34,6 +36,10 @@ LAYER_STEP = 1e-4
 LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
 STANDING_LAYER = 7
 LAWN_HALF_M = 0.2  # vegetation of a smaller half height is a lawn; it lies in the layer of road lines
+
+# What a box of vegetation is drawn as. Lawns, hedges and trunks fill their box, the others are round, the last two on a stem.
+LAWN, HEDGE, TRUNK, BUSH, CROWN, CONIFER, BROADLEAF = range(7)
+CONIFER_LOW = -0.78  # of a conifer's half height
 
 
 @dataclass(frozen=True)
@@ -149,6 +155,57 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
     table[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
     is_lawn = (box_map.kinds == KINDS["Vegetation"]) & (box_map.half_extents[:, 2] < LAWN_HALF_M)
     return np.where(is_lawn, LAYERS["RoadLines"], table[box_map.kinds])
+
+
+def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tell plants apart by the shapes of their boxes.
+
+    Args:
+        centers_m, half_m: (n, 3); seeds: (n,), `seeds_of` their ids.
+    Returns:
+        forms (n,), LAWN .. BROADLEAF; crown_low (n,): where foliage begins, in units of the half height, -1 the box's bottom. What
+        is under it is a stem of `stem_radius_m` along the box's axis, and air.
+    """
+    hx, hy, hz = half_m.T
+    wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
+    is_lawn = hz < LAWN_HALF_M
+    is_hedge = (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
+    is_trunk = (hz >= 1.3) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
+    is_crown = _over_a_trunk(centers_m, half_m, is_trunk)
+    is_conifer = (chance(seeds, 5) < 0.18) & (hz > 1.6 * wide)
+    is_form = [is_lawn, is_hedge, hz < 1.3, is_trunk, is_crown, is_conifer]
+    forms = np.select(is_form, [LAWN, HEDGE, BUSH, TRUNK, CROWN, CONIFER], BROADLEAF)
+    broadleaf_low = np.where(hz > wide, -0.38, -0.55)
+    return forms, np.select([forms == BROADLEAF, forms == CONIFER], [broadleaf_low, CONIFER_LOW], -1.0)
+
+
+def stem_radius_m(half_m: np.ndarray) -> np.ndarray:
+    """Radius of the stem of a tree that is one box, (n,)."""
+    narrow = half_m[:, :2].min(axis=1)
+    return np.minimum(np.clip(0.075 * narrow, 0.05, 0.32), narrow)
+
+
+def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarray) -> np.ndarray:
+    """Tell which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
+    if not is_trunk.any():
+        return np.zeros(len(centers_m), dtype=bool)
+    gap, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
+    foot = (centers_m[is_trunk, 2] - half_m[is_trunk, 2])[nearest]
+    return (gap < half_m[:, :2].max(axis=1) + 1.0) & (centers_m[:, 2] - half_m[:, 2] > foot + 0.8)
+
+
+def seeds_of(ids: np.ndarray) -> np.ndarray:
+    """A fixed number in [0, 1) for each box id, so that a house keeps its colour between runs (splitmix64)."""
+    with np.errstate(over="ignore"):
+        x = np.asarray(ids, dtype=np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return ((x ^ (x >> np.uint64(31))) >> np.uint64(40)).astype(np.float64) / 2.0**24
+
+
+def chance(seeds: np.ndarray, number: int) -> np.ndarray:
+    """A further fixed number in [0, 1) for each seed."""
+    return np.mod(seeds * 9973.0 + number * 0.61803399, 1.0)
 
 
 def check_pose(camera_pose: np.ndarray, intrinsic: np.ndarray) -> None:

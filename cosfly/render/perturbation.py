@@ -105,11 +105,7 @@ class Surroundings:
 
 
 def perturb(
-    planned: Poses,
-    camera: Camera,
-    surroundings: Surroundings,
-    cfg: PerturbationConfig,
-    rng: np.random.Generator,
+    planned: Poses, camera: Camera, surroundings: Surroundings, cfg: PerturbationConfig, rng: np.random.Generator
 ) -> Perturbed:
     """Perturb every frame of a flight. The same number of random draws is used for every frame, whatever happens in it."""
     result = Perturbed.nothing(planned)

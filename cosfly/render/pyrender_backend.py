@@ -1,4 +1,4 @@
-"""The second renderer, a cross-check of the default one: plain boxes and a plain figure through trimesh and pyrender (EGL).
+"""The second renderer, a cross-check of the default one: plain boxes, trees and a plain figure through trimesh and pyrender (EGL).
 
 Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is drawn three
 times in pyrender's segmentation mode, with our own two shaders: tags, colours, and the float32 bits of the depth. The depth
@@ -25,7 +25,7 @@ from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedPerso
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
-PLAIN_COLOR = (0.42, 0.40, 0.37)
+PLAIN_COLOR, STEM_COLOR = (0.42, 0.40, 0.37), (0.16, 0.11, 0.075)
 COLORS = {
     "Roads": (0.11, 0.11, 0.115), "Sidewalks": (0.36, 0.345, 0.32), "Buildings": (0.50, 0.38, 0.29), "Vegetation": (0.09, 0.165, 0.04),
     "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16), "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63),
@@ -70,7 +70,7 @@ def _keep_display(platform: Any) -> None:
 
 
 class PyrenderRenderer:
-    """Draws a map as plain boxes. Positions on the device are relative to the map's middle."""
+    """Draws a map as plain boxes and round crowns. Positions on the device are relative to the map's middle."""
 
     def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
         self._screen, self._look = _open_screen(width_px, height_px), look
@@ -146,24 +146,40 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
 
 
 def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of every box and of the ground plane."""
+    """Triangles, colours and tags of every box and of the ground plane; crowns are ellipsoids, on stems that end in their middle."""
     import trimesh
 
-    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     center, half = contract.ground_plane(box_map)
     centers = np.vstack([box_map.centers, center]) - origin
     halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
-    corners = np.einsum("nij,nvj->nvi", turns, halves[:, None] * box.vertices) + centers[:, None]
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
     tags = _tags(
         kinds, np.append(contract.instance_ids(box_map).ids, NO_INSTANCE), np.append(contract.layers_of(box_map), 0)
     )
-    num_faces = len(box.faces)
-    triangles = corners[:, box.faces].reshape(-1, 3, 3)
-    return triangles, np.repeat(table[kinds], num_faces, axis=0), np.repeat(tags, num_faces, axis=0)
+    is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
+    plants = np.flatnonzero(kinds == KINDS["Vegetation"])
+    forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))
+    is_round[plants] = forms >= contract.BUSH
+    middle, radius = (1.0 + low) / 2.0, contract.stem_radius_m(halves)
+    crowns = halves * np.column_stack([np.ones((len(low), 2)), (1.0 - low) / 2.0])
+    stems = np.column_stack([radius, radius, halves[:, 2] * (1.0 + middle) / 2.0])
+    box, ball = trimesh.creation.box(extents=(2.0, 2.0, 2.0)), trimesh.creation.icosphere(subdivisions=1)
+    solids = [
+        (box, ~is_round, halves, 0.0 * low, table[kinds]),
+        (ball, is_round, crowns, middle, table[kinds]),
+        (box, low > -1.0, stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
+    ]
+    triangles, colors, tagged = [], [], []
+    for mesh, rows, size, lift, paint in solids:  # lift: of the middle over the box's, in half heights
+        middles = centers[rows] + turns[rows, :, 2] * (lift * halves[:, 2])[rows, None]
+        corners = np.einsum("nij,nvj->nvi", turns[rows], size[rows, None] * mesh.vertices) + middles[:, None]
+        triangles.append(corners[:, mesh.faces].reshape(-1, 3, 3))
+        colors.append(np.repeat(paint[rows], len(mesh.faces), axis=0))
+        tagged.append(np.repeat(tags[rows], len(mesh.faces), axis=0))
+    return np.concatenate(triangles), np.concatenate(colors), np.concatenate(tagged)
 
 
 def _figure(person: PosedPerson, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -33,10 +33,7 @@ from cosfly.store import CHECKSUMS, atomic_folder, write_json
 
 log = logging.getLogger(__name__)
 
-RENDERERS = {
-    "gl": "cosfly.render.gl.backend:GlRenderer",
-    "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer",
-}
+RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer", "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer"}
 VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
 IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 
@@ -145,12 +142,7 @@ def script_flight(
         clothes=clothes,
         look=cfg.look,
         is_original=track == "clean",
-        source={
-            "path_index": number,
-            "scenario_id": trace.path_id,
-            "scenario_name": town,
-            "algorithm": trace.planner,
-        },
+        source={"path_index": number, "scenario_id": trace.path_id, "scenario_name": town, "algorithm": trace.planner},
     )
 
 

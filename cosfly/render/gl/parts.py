@@ -4,12 +4,12 @@ material number that the shader knows. Knows nothing of OpenGL, nor of what thin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cosfly.render.contract import LAYER_STEP, STANDING_LAYER
+from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, chance
 
 # Materials, the same numbers as in scene.frag.glsl.
 (
@@ -61,9 +61,8 @@ class Boxes:
         return len(self.centers)
 
     def select(self, keep: np.ndarray) -> Boxes:
-        return Boxes(
-            self.centers[keep], self.half[keep], self.turns[keep], self.ids[keep], self.seeds[keep], self.kind
-        )  # fmt: skip
+        columns = ("centers", "half", "turns", "ids", "seeds")
+        return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
     def lengthwise(self) -> Boxes:
         """The same boxes with x as their longer horizontal axis: turned by 90 degrees where it is not."""
@@ -71,11 +70,11 @@ class Boxes:
         half, turns = self.half.copy(), self.turns.copy()
         half[across] = half[across][:, [1, 0, 2]]
         turns[across] = turns[across] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        return Boxes(self.centers, half, turns, self.ids, self.seeds, self.kind)
+        return replace(self, half=half, turns=turns)
 
     def chance(self, number: int) -> np.ndarray:
         """A further fixed number in [0, 1) per box."""
-        return np.mod(self.seeds * 9973.0 + number * 0.61803399, 1.0)
+        return chance(self.seeds, number)
 
     def pick(self, palette: np.ndarray, number: int = 0) -> np.ndarray:
         return palette[(self.chance(number) * len(palette)).astype(int)]

@@ -9,7 +9,7 @@ import numpy as np
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin
+from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin, seeds_of
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import GRASS, Boxes, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, plain
@@ -49,12 +49,3 @@ def build_scene(box_map: BoxMap) -> Scene:
     ground = Boxes((center - origin)[None], half[None], np.eye(3)[None], ids, seeds, KINDS["Terrain"])
     builder.add(ground, meshes.BOX, half[None], GRASS, np.array([0.105, 0.14, 0.045]), layer=0)
     return Scene(builder.finish(), origin, plane_z_m(box_map))
-
-
-def seeds_of(ids: np.ndarray) -> np.ndarray:
-    """A fixed number in [0, 1) for each box id, so that a house keeps its colour between runs (splitmix64)."""
-    with np.errstate(over="ignore"):
-        x = np.asarray(ids, dtype=np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return ((x ^ (x >> np.uint64(31))) >> np.uint64(40)).astype(np.float64) / 2.0**24

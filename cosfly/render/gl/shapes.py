@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import LAWN_HALF_M, LAYERS
+from cosfly.render import contract
+from cosfly.render.contract import LAYERS
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder
 
@@ -91,27 +91,19 @@ def _buildings(builder: PartBuilder, boxes: Boxes) -> None:
 
 def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
     """Trees, bushes, hedges and lawns, told apart by the shape of the box."""
-    hx, hy, hz = boxes.half.T
-    wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
-    is_lawn = hz < LAWN_HALF_M
-    is_hedge = ~is_lawn & (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
-    is_bush = ~is_lawn & ~is_hedge & (hz < 1.3)
-    is_trunk = ~(is_lawn | is_bush) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
-    is_tree = ~(is_lawn | is_hedge | is_bush | is_trunk)
+    forms, crown_low = contract.plants_of(boxes.centers, boxes.half, boxes.seeds)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
-    builder.add(
-        boxes.select(is_lawn), meshes.BOX, boxes.half[is_lawn], parts.GRASS, leaf[is_lawn], layer=LAYERS["RoadLines"]
-    )
-    builder.add(boxes.select(is_hedge), meshes.BOX, boxes.half[is_hedge], parts.LEAVES, leaf[is_hedge])
-    _bushes(builder, boxes.select(is_bush), leaf[is_bush])
-    trunks = boxes.select(is_trunk)
+    of = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
+    (lawns, grass), (hedges, green), (trunks, _) = of[contract.LAWN], of[contract.HEDGE], of[contract.TRUNK]
+    builder.add(lawns, meshes.BOX, lawns.half, parts.GRASS, grass, layer=LAYERS["RoadLines"])
+    builder.add(hedges, meshes.BOX, hedges.half, parts.LEAVES, green)
+    _bushes(builder, *of[contract.BUSH])
     builder.add(trunks, meshes.CYLINDER, trunks.half, parts.BARK, BARK_COLOR)
-    is_crown = is_tree & _over_a_trunk(boxes, trunks)
-    _crowns(builder, boxes.select(is_crown), leaf[is_crown], np.full(int(is_crown.sum()), -1.0))
-    is_tree &= ~is_crown
-    is_conifer = is_tree & (boxes.chance(5) < 0.18) & (hz > 1.6 * wide)
-    _conifers(builder, boxes.select(is_conifer), leaf[is_conifer])
-    _broadleaves(builder, boxes.select(is_tree & ~is_conifer), leaf[is_tree & ~is_conifer])
+    _crowns(builder, *of[contract.CROWN], crown_low[forms == contract.CROWN])
+    _conifers(builder, *of[contract.CONIFER])
+    trees, low = of[contract.BROADLEAF][0], crown_low[forms == contract.BROADLEAF]
+    _stems(builder, trees, low + 0.75)
+    _crowns(builder, *of[contract.BROADLEAF], low)
 
 
 def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
@@ -120,32 +112,8 @@ def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
     builder.add(boxes, meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX)
     for side in (-1.0, 1.0):
         offset = h * [0.42 * side, 0.25 * side, -0.25]
-        builder.add(
-            boxes,
-            meshes.BLOB,
-            h * [0.56, 0.6, 0.72],
-            parts.LEAVES,
-            leaf * (1.0 + 0.12 * side),
-            offset=offset,
-            min_px=FAR_PX,
-        )
-
-
-def _over_a_trunk(boxes: Boxes, trunks: Boxes) -> np.ndarray:
-    """Tell which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
-    if len(trunks) == 0:
-        return np.zeros(len(boxes), dtype=bool)
-    gap, nearest = cKDTree(trunks.centers[:, :2]).query(boxes.centers[:, :2])
-    foot = trunks.centers[nearest, 2] - trunks.half[nearest, 2]
-    return (gap < boxes.half[:, :2].max(axis=1) + 1.0) & (boxes.centers[:, 2] - boxes.half[:, 2] > foot + 0.8)
-
-
-def _broadleaves(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
-    """A trunk and a crown over it."""
-    h = boxes.half
-    crown_low = np.where(h[:, 2] > 1.0 * np.maximum(h[:, 0], h[:, 1]), -0.38, -0.55)
-    _trunk(builder, boxes, crown_low + 0.75)
-    _crowns(builder, boxes, leaf, crown_low)
+        shade = leaf * (1.0 + 0.12 * side)
+        builder.add(boxes, meshes.BLOB, h * [0.56, 0.6, 0.72], parts.LEAVES, shade, offset=offset, min_px=FAR_PX)
 
 
 def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> None:
@@ -170,17 +138,15 @@ def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
     h = boxes.half
     dark = leaf * [0.6, 0.75, 0.85]
     builder.add(boxes, meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
-    _trunk(builder, boxes, np.full(len(h), -0.5))
-    for low, top, radius in ((-0.78, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
+    _stems(builder, boxes, np.full(len(h), -0.5))
+    for low, top, radius in ((contract.CONIFER_LOW, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
         size = h * [radius, radius, (top - low) / 2.0]
         builder.add(boxes, meshes.CONE, size, parts.LEAVES, dark, offset=h * [0, 0, (low + top) / 2.0], min_px=FAR_PX)
 
 
-def _trunk(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
-    """A trunk from the box's bottom to `top` (n,), in units of the half height."""
-    h = boxes.half
-    radius = np.clip(0.075 * np.minimum(h[:, 0], h[:, 1]), 0.05, 0.32)
-    radius = np.minimum(radius, np.minimum(h[:, 0], h[:, 1]))
+def _stems(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
+    """A stem from each box's bottom to `top` (n,), in units of the half height."""
+    h, radius = boxes.half, contract.stem_radius_m(boxes.half)
     size = np.stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0], axis=1)
     offset = np.stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0], axis=1)
     builder.add(boxes, meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
