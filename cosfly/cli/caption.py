@@ -7,23 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosfly.cli.options import (
-    ConfigFile,
-    DataOption,
-    Overrides,
-    ResumeMode,
-    ResumeOption,
-    Seed,
-    Workers,
-    data_folder,
-    manner,
-    resolve,
-    tell_product,
-)
+from cosfly.cli import options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from caption.schema import CaptionConfig
 
 app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
@@ -41,14 +27,14 @@ def caption(
     keyframes: Annotated[
         bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
     ] = None,
-    data: DataOption = None,
+    data: options.Data = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")
     ] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
     limit: Annotated[int | None, typer.Option(help="Caption at most this many windows; a later run goes on.")] = None,
     max_cost: Annotated[
         float | None, typer.Option(help="Stop before this cost is passed; prices: caption.budget.price_*.")
@@ -63,80 +49,58 @@ def caption(
     check: Annotated[
         bool, typer.Option(help="Before the first request of a folder, try what the endpoint can do.")
     ] = True,
-    resume: ResumeOption = ResumeMode.if_same,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
     if context.invoked_subcommand is not None:
         return
-    import caption.run.stage
+    from caption.run import stage
 
     chosen: dict[str, Any] = {"caption.teacher": teacher, "caption.endpoint.model": model}
     chosen |= {"caption.judge.url": judge, "caption.window.keyframes": keyframes, "caption.limit": limit}
     chosen |= {"caption.budget.max_cost": max_cost, "caption.budget.max_tokens": max_tokens}
-    extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
-    cfg = resolve(config, [*(overrides or []), *extra], seed, workers)
-    tree = data_folder(data)
+    chosen |= {"seed": seed, "workers": workers}
+    cfg = options.resolve(config, overrides, chosen)
+    tree = options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
     if check and cfg.caption.teacher_kind == "endpoint" and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption)
     if plan_only:
         from caption.run.forecast import make_forecast
+        from cosfly.console import console
 
-        forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume.value)
-        _print_rows("What this run will take", forecast.rows())
+        forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume)
+        console.print(options.plain_table("What this run will take", forecast.rows()))
         return
-    tell_product(
-        caption.run.stage.run(
-            cfg.caption, tree, target, seed=cfg.seed, retry_failed=retry_failed, **manner(cfg, resume)
-        ),
-        target,
-        cfg,
-    )
+    given = options.manner(cfg, resume) | {"seed": cfg.seed, "retry_failed": retry_failed}
+    options.tell_product(stage.run(cfg.caption, tree, target, **given), target, cfg)
 
 
 @app.command("doctor")
 def caption_doctor(
     url: Annotated[str, typer.Argument(help="URL of an OpenAI-compatible endpoint.")],
     model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
 ) -> None:
     """Try what an endpoint can do: images, schema, thinking, context length. Exit 1 if captioning cannot work."""
-    extra = [f"caption.endpoint.model={model}"] if model is not None else []
-    _examine_endpoint(url, resolve(config, [*(overrides or []), *extra]).caption)
+    _examine_endpoint(url, options.resolve(config, overrides, {"caption.endpoint.model": model}).caption)
 
 
 def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
-    from rich.markup import escape
-
     from caption.teachers.doctor import examine_endpoint
-
-    findings = examine_endpoint(url, cfg)
-    color = {"ok": "green", "warning": "yellow", "unusable": "red"}
-    rows = [(f.name, f"[{color[f.state]}]{f.state}[/]", escape(f.detail)) for f in findings]
-    _print_rows("What the endpoint can do", rows)
-    if any(finding.state == "unusable" for finding in findings):
-        raise typer.Exit(1)
-
-
-def _print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:
-    from rich.table import Table
-
     from cosfly.console import console
 
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+    options.tell_checks(examine_endpoint(url, cfg), console, "What the endpoint can do")
 
 
 @app.command("judge-check")
 def caption_judge_check(
     url: Annotated[str, typer.Argument(help="OpenAI-compatible endpoint of the judge.")],
     model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
 ) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
@@ -144,29 +108,26 @@ def caption_judge_check(
     from caption.truth.judge import check_judge, judge_check_table, read_gold
     from cosfly.console import console
 
-    chosen = {"caption.judge.url": url, "caption.judge.model": model}
-    extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
-    cfg = resolve(config, [*(overrides or []), *extra])
+    cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
     console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, read_gold(), cfg.seed))))
 
 
 @app.command("compare-strategies")
 def caption_compare_strategies(
     out: Annotated[Path, typer.Option(help="Folder for compare_strategies.json and the answers.")],
-    data: DataOption = None,
+    data: options.Data = None,
     teacher: Annotated[str | None, typer.Option(help="rules, or the URL of an endpoint. [default: rules]")] = None,
     model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
     conflicts: Annotated[int, typer.Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
     from caption.run import compare
     from cosfly.console import console
 
-    chosen = {"caption.teacher": teacher, "caption.endpoint.model": model}
-    extra = [f"{key}={value}" for key, value in chosen.items() if value is not None]
-    cfg = resolve(config, [*(overrides or []), *extra], seed)
-    comparisons = compare.run(cfg.caption, data_folder(data), out, seed=cfg.seed, conflicts=conflicts)
+    chosen = {"caption.teacher": teacher, "caption.endpoint.model": model, "seed": seed}
+    cfg = options.resolve(config, overrides, chosen)
+    comparisons = compare.run(cfg.caption, options.data_folder(data), out, seed=cfg.seed, conflicts=conflicts)
     console.print(compare.comparison_table(comparisons))

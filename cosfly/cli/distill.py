@@ -7,17 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cosfly.cli.options import (
-    ConfigFile,
-    DataOption,
-    OutOption,
-    Overrides,
-    ResumeMode,
-    ResumeOption,
-    Seed,
-    data_folder,
-    resolve,
-)
+from cosfly.cli import options
 
 app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set, LoRA, inference, evaluation.")
 
@@ -27,94 +17,85 @@ ModelOption = Annotated[Path, typer.Option(help="Folder of the student's base mo
 
 
 @app.command("tiny-student")
-def distill_tiny_student(out: OutOption, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
+def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
     """Make a tiny, randomly initialised student, to try the way without weights."""
-    import distill.student
+    from distill.student import make_tiny_student
 
-    typer.echo(distill.student.make_tiny_student(out, seed))
+    typer.echo(make_tiny_student(out, seed))
 
 
 @app.command("prepare")
 def distill_prepare(
     captions: Annotated[Path, typer.Option(help="captions.jsonl")],
-    out: OutOption,
-    data: DataOption = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    out: options.Out,
+    data: options.Data = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Captions to a training set with splits that share no trajectory."""
-    import distill.dataset
+    from distill import dataset
 
-    cfg = resolve(config, overrides, seed)
-    typer.echo(
-        distill.dataset.run(cfg.distill.prepare, captions, data_folder(data), out, seed=cfg.seed, resume=resume.value)
-    )
+    cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
+    typer.echo(dataset.run(cfg.distill.prepare, captions, tree, out, seed=cfg.seed, resume=resume))
 
 
 @app.command("train")
 def distill_train(
     dataset: DatasetOption,
     model: ModelOption,
-    out: OutOption,
-    data: DataOption = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    out: options.Out,
+    data: options.Data = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Train LoRA adapters; continues from its last checkpoint."""
-    import distill.train
+    from distill import train
 
-    cfg = resolve(config, overrides, seed)
-    typer.echo(
-        distill.train.run(cfg.distill.train, dataset, data_folder(data), model, out, seed=cfg.seed, resume=resume.value)
-    )
+    cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
+    typer.echo(train.run(cfg.distill.train, dataset, tree, model, out, seed=cfg.seed, resume=resume))
 
 
 @app.command("infer")
 def distill_infer(
     dataset: DatasetOption,
     model: Annotated[str, typer.Option(help="Folder of the student's base model; with --engine endpoint its URL.")],
-    out: OutOption,
+    out: options.Out,
     engine: Annotated[
         str | None, typer.Option(help="transformers, endpoint (a server) or vllm. [default: transformers]")
     ] = None,
     adapter: Annotated[Path | None, typer.Option(help="Adapter folder; none: the base model as it is.")] = None,
-    data: DataOption = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    data: options.Data = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Let the student answer a split; continues where it stopped."""
-    import distill.infer
+    from distill import infer
 
-    extra = [] if engine is None else [f"distill.infer.engine={engine}"]
-    cfg = resolve(config, [*(overrides or []), *extra])
-    typer.echo(
-        distill.infer.run(
-            cfg.distill.infer, dataset, data_folder(data), model, out, adapter=adapter, resume=resume.value
-        )
-    )
+    cfg, tree = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folder(data)
+    typer.echo(infer.run(cfg.distill.infer, dataset, tree, model, out, adapter=adapter, resume=resume))
 
 
 @app.command("evaluate")
 def distill_evaluate(
     dataset: DatasetOption,
     predictions: Annotated[Path, typer.Option(help="Predictions, the output of `distill infer`.")],
-    out: OutOption,
+    out: options.Out,
     bertscore_model: Annotated[
         Path | None, typer.Option(help="Local model folder for BERTScore; none: not computed.")
     ] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """JSON parse rate, decision accuracy beside the majority floor, BERTScore beside a shuffled floor."""
-    import distill.evaluate
+    from distill import evaluate
 
-    cfg = resolve(config, overrides, seed)
-    given: Any = {"bertscore_model": bertscore_model, "seed": cfg.seed, "resume": resume.value}
-    typer.echo(distill.evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))
+    cfg = options.resolve(config, overrides, {"seed": seed})
+    given: Any = {"bertscore_model": bertscore_model, "seed": cfg.seed, "resume": resume}
+    typer.echo(evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from cosfly.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from cosfly.settings import RunConfig
     from cosfly.stage_folder import Tally
-
-
-class ResumeMode(StrEnum):
-    never = "never"
-    if_same = "if-same"
-    force = "force"
 
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with the settings of a run.")]
@@ -27,27 +24,25 @@ Overrides = Annotated[
 ]
 Seed = Annotated[int | None, typer.Option(help="Seed; every random choice derives from it.")]
 Workers = Annotated[int | None, typer.Option(help="Worker processes; 0 takes one per core.")]
-ResumeOption = Annotated[
-    ResumeMode,
+Resume = Annotated[
+    Literal["never", "if-same", "force"],
     typer.Option(
         help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
     ),
 ]
-OutOption = Annotated[Path, typer.Option(help="Output folder.")]
-MapOption = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
-DataOption = Annotated[
+Out = Annotated[Path, typer.Option(help="Output folder.")]
+Map = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
+Data = Annotated[
     Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
 ]
 
 
-def resolve(
-    config: Path | None, overrides: list[str] | None, seed: int | None = None, workers: int | None = None
-) -> RunConfig:
-    """Resolve the settings: defaults, file, --set, then the plain options."""
+def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
+    """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings; None is not given."""
     from cosfly.config import load
     from cosfly.settings import RunConfig
 
-    extra = [f"{name}={value}" for name, value in (("seed", seed), ("workers", workers)) if value is not None]
+    extra = [f"{name}={value}" for name, value in given.items() if value is not None]
     return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
 
 
@@ -67,11 +62,11 @@ def _config_path(config: Path | None) -> Path | None:
     return config
 
 
-def manner(cfg: RunConfig, resume: ResumeMode) -> dict[str, Any]:
+def manner(cfg: RunConfig, resume: Resume) -> dict[str, Any]:
     """How a stage works, whatever it makes: arguments that all stages with workers take."""
     from cosfly.settings import num_workers
 
-    return {"workers": num_workers(cfg.workers), "resume": resume.value}
+    return {"workers": num_workers(cfg.workers), "resume": resume}
 
 
 def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
@@ -105,3 +100,24 @@ def data_folder(data: Path | None) -> Path:
     raise InputError(
         "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
     )
+
+
+def plain_table(title: str | None, rows: Iterable[Sequence[str]]) -> Table:
+    """A table without lines and without a header."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False, box=None)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def tell_checks(checks: Sequence[Any], console: Console, title: str | None = None) -> None:
+    """Print what was examined, each with name, state and detail; exit 1 where something that is needed does not work."""
+    from rich.markup import escape
+
+    colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}
+    rows = [(check.name, f"[{colors[check.state]}]{check.state}[/]", escape(check.detail)) for check in checks]
+    console.print(plain_table(title, rows))
+    if any(colors[check.state] == "red" for check in checks):
+        raise typer.Exit(1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cosfly.cli.options import Overrides, ResumeMode, ResumeOption, Seed, Workers, check_failures, resolve
+from cosfly.cli import options
 
 if TYPE_CHECKING:
     from cosfly.pipeline import StageResult
@@ -22,19 +22,19 @@ def run(
         Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, simworld, delft.")
     ],
     out: Annotated[Path | None, typer.Option(help="Run folder; by default runs/<name>.")] = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again to continue."""
     from cosfly import pipeline
 
-    cfg = resolve(config, overrides, seed, workers)
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
-    results = pipeline.run(cfg, out, resume=resume.value)
+    results = pipeline.run(cfg, out, resume=resume)
     _closing_table(results, out)
-    check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
+    options.check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
 
 
 def _closing_table(results: list[StageResult], out: Path) -> None:
@@ -65,10 +65,10 @@ app.add_typer(config_app, name="config")
 @config_app.command("check")
 def config_check(
     config: Annotated[Path, typer.Argument(help="YAML file, or the name of one that ships.")],
-    overrides: Overrides = None,
+    overrides: options.Overrides = None,
 ) -> None:
     """Check a configuration without running it; reports all problems at once."""
-    resolve(config, overrides)
+    options.resolve(config, overrides)
     typer.echo(f"{config}: ok")
 
 
@@ -77,12 +77,12 @@ def config_show(
     config: Annotated[
         Path | None, typer.Argument(help="YAML file, or the name of one that ships; none: the defaults.")
     ] = None,
-    overrides: Overrides = None,
+    overrides: options.Overrides = None,
 ) -> None:
     """Print the resolved configuration: every setting with its value."""
     import yaml
 
-    cfg = resolve(config, overrides)
+    cfg = options.resolve(config, overrides)
     typer.echo(yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True), nl=False)
 
 
@@ -93,16 +93,7 @@ def doctor(
 ) -> None:
     """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
     from cosfly import doctor as examination
 
-    checks = examination.examine(out, teacher)
-    table = Table(show_header=False, box=None)
-    for check in checks:
-        color = {"ok": "green", "missing": "red", "optional": "yellow"}[check.state]
-        table.add_row(check.name, f"[{color}]{check.state}[/]", escape(check.detail))
-    Console().print(table)
-    if any(check.state == "missing" for check in checks):
-        raise typer.Exit(1)
+    options.tell_checks(examination.examine(out, teacher), Console())

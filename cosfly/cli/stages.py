@@ -7,80 +7,61 @@ from typing import Annotated
 
 import typer
 
-from cosfly.cli.options import (
-    ConfigFile,
-    DataOption,
-    MapOption,
-    OutOption,
-    Overrides,
-    ResumeMode,
-    ResumeOption,
-    Seed,
-    Workers,
-    data_folder,
-    manner,
-    resolve,
-    tell_product,
-)
+from cosfly.cli import options
 
 app = typer.Typer()
 
 
 @app.command()
 def maps(
-    out: OutOption,
+    out: options.Out,
     source: Annotated[
         str | None, typer.Option(help="synthetic, simworld or cityjson; short for --set maps.source=...")
     ] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 1: make boxes_3d.json from a map source."""
-    import cosfly.maps.stage
+    from cosfly.maps import stage
 
-    cfg = resolve(config, [*(overrides or []), *([f"maps.source={source}"] if source else [])], seed)
-    typer.echo(cosfly.maps.stage.run(cfg.maps, out, seed=cfg.seed, resume=resume.value))
+    cfg = options.resolve(config, overrides, {"maps.source": source, "seed": seed})
+    typer.echo(stage.run(cfg.maps, out, seed=cfg.seed, resume=resume))
 
 
 @app.command()
 def simplify(
-    map_: MapOption,
-    out: OutOption,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    map_: options.Map,
+    out: options.Out,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
-    import cosfly.simplify.stage
+    from cosfly.simplify import stage
 
-    cfg = resolve(config, overrides)
-    typer.echo(cosfly.simplify.stage.run(cfg.simplify, map_, out, resume=resume.value))
+    cfg = options.resolve(config, overrides)
+    typer.echo(stage.run(cfg.simplify, map_, out, resume=resume))
 
 
 @app.command()
 def pedestrians(
-    map_: MapOption,
-    out: OutOption,
+    map_: options.Map,
+    out: options.Out,
     roi: Annotated[Path | None, typer.Option(help="Region of interest: roi_polygon.json.")] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
-    import cosfly.pedestrians.stage
+    from cosfly.pedestrians import stage
 
-    cfg = resolve(config, overrides, seed, workers)
-    tell_product(
-        cosfly.pedestrians.stage.run(
-            cfg.pedestrians, map_, out, seed=cfg.seed, roi=roi or cfg.roi, **manner(cfg, resume)
-        ),
-        out,
-        cfg,
-    )
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    given = options.manner(cfg, resume) | {"seed": cfg.seed, "roi": roi or cfg.roi}
+    options.tell_product(stage.run(cfg.pedestrians, map_, out, **given), out, cfg)
 
 
 plan_app = typer.Typer(invoke_without_command=True, help="Step 4: drone flights.")
@@ -93,22 +74,21 @@ def plan(
     map_: Annotated[Path | None, typer.Option("--map", help="Boxes: step2_simplified.json. [required]")] = None,
     paths: Annotated[Path | None, typer.Option(help="Walks: path.json. [required]")] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder. [required]")] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 4: a drone flight for every walk, drone_trace.json."""
     if context.invoked_subcommand is not None:
         return
-    import cosfly.planners.stage
+    from cosfly.planners import stage
 
     box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
-    cfg = resolve(config, overrides, seed, workers)
-    tell_product(
-        cosfly.planners.stage.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **manner(cfg, resume)), folder, cfg
-    )
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    product = stage.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **options.manner(cfg, resume))
+    options.tell_product(product, folder, cfg)
 
 
 def _needed(name: str, value: Path | None) -> Path:
@@ -122,29 +102,29 @@ def _needed(name: str, value: Path | None) -> Path:
 def plan_compare(
     map_: Annotated[Path, typer.Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
     paths: Annotated[Path, typer.Argument(metavar="PATHS", help="Walks: path.json.")],
-    out: OutOption,
+    out: options.Out,
     planner: Annotated[
         list[str] | None,
         typer.Option(help="A planner to compare; repeat it. The others are held against the first. [default: all]"),
     ] = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from rich.table import Table
 
-    import cosfly.planners.compare
     from cosfly.config import build
     from cosfly.console import console
+    from cosfly.planners import compare
 
-    cfg = resolve(config, overrides, seed, workers)
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     settings = cfg.plan.model_dump() | ({"planners": planner} if planner else {})
-    compared = build(cosfly.planners.compare.CompareConfig, settings, "--planner")
-    product = cosfly.planners.compare.run(compared, map_, paths, out, seed=cfg.seed, **manner(cfg, resume))
-    for text in cosfly.planners.compare.text_tables(product):
+    compared = build(compare.CompareConfig, settings, "--planner")
+    product = compare.run(compared, map_, paths, out, seed=cfg.seed, **options.manner(cfg, resume))
+    for text in compare.text_tables(product):
         table = Table(title=text.title, title_justify="left")
         for k, column in enumerate(text.columns):
             table.add_column(column, justify="right" if k else "left")
@@ -156,36 +136,33 @@ def plan_compare(
 
 @app.command()
 def render(
-    map_: MapOption,
+    map_: options.Map,
     simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
     traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
     out: Annotated[Path, typer.Option(help="Output folder, the playback tree.")],
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
-    import cosfly.render.stage
+    from cosfly.render import stage
 
-    cfg = resolve(config, overrides, seed, workers)
-    tell_product(
-        cosfly.render.stage.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **manner(cfg, resume)),
-        out,
-        cfg,
-    )
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    product = stage.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
+    options.tell_product(product, out, cfg)
 
 
 @app.command()
 def gallery(
     out: Annotated[Path, typer.Option(help="Folder for contact_sheet.png and preview.gif.")],
-    data: DataOption = None,
+    data: options.Data = None,
 ) -> None:
     """A contact sheet and a preview GIF of a playback tree."""
     from cosfly.gallery import contact_sheet, preview_gif
 
-    tree = data_folder(data)
+    tree = options.data_folder(data)
     contact_sheet(tree, out / "contact_sheet.png")
     preview_gif(tree, out / "preview.gif")
     typer.echo(out)
@@ -194,17 +171,16 @@ def gallery(
 @app.command()
 def inspect(
     traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: OutOption,
-    data: DataOption = None,
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    workers: Workers = None,
-    resume: ResumeOption = ResumeMode.if_same,
+    out: options.Out,
+    data: options.Data = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
 ) -> None:
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
-    import cosfly.inspection.stage
+    from cosfly.inspection import stage
 
-    cfg = resolve(config, overrides, None, workers)
-    tell_product(
-        cosfly.inspection.stage.run(cfg.inspect, traces, data_folder(data), out, **manner(cfg, resume)), out, cfg
-    )
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    product = stage.run(cfg.inspect, traces, options.data_folder(data), out, **options.manner(cfg, resume))
+    options.tell_product(product, out, cfg)
