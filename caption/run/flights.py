@@ -6,7 +6,6 @@ limit does not take for finished; one in which a window has no answer yet is `pa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,14 +95,13 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[All
     return allotted, False
 
 
-def name_of_part(path: Path) -> str:
-    """Give the flight's name of a part file."""
-    return re.sub(r"(\.jsonl|\.gap|\.\d+\.cut)$", "", path.name)
-
-
 def parts_of(stage_path: Path, allotted: list[Allotted], with_gaps: bool) -> list[Path]:
-    """Give the part files of a run in the order of the product."""
-    found = [flight.part(stage_path) for flight in allotted]
-    if with_gaps:
-        found += [flight.gap(stage_path) for flight in allotted if not flight.part(stage_path).exists()]
-    return sorted((path for path in found if path.exists()), key=lambda path: f"{name_of_part(path)}_frame_")
+    """Give the part files of a run in the order of the product, which is that of the flights."""
+    found: list[Path] = []
+    for flight in allotted:
+        part, gap = flight.part(stage_path), flight.gap(stage_path)
+        if part.exists():
+            found.append(part)
+        elif with_gaps and gap.exists():
+            found.append(gap)
+    return found

@@ -6,7 +6,6 @@ hash of what was asked.
 
 from __future__ import annotations
 
-import hashlib
 import re
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -19,7 +18,7 @@ from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from cosfly.frame_views import View
 from cosfly.products.captions import ACTIONS, Coc, Language, Prompt
-from cosfly.store import dump_json
+from cosfly.store import dump_json, sha256_bytes
 
 PROMPTS = Path(__file__).with_name("prompts")
 
@@ -92,17 +91,8 @@ def build_prompts(window: ObservedWindow, facts: Facts, views: tuple[View, ...],
 
 
 def prompt_hash(prompts: dict[Language, Prompt]) -> str:
-    digest = hashlib.sha256()
-    for number, prompt in enumerate(prompts.values()):
-        digest.update(b"\x00" if number else b"")
-        digest.update(_encoded(prompt.system))
-        digest.update(b"\x00" + prompt.user.encode())
-    return digest.hexdigest()[:16]
-
-
-@lru_cache(maxsize=8)
-def _encoded(system: str) -> bytes:
-    return system.encode()
+    texts = "\x00".join(text for prompt in prompts.values() for text in (prompt.system, prompt.user))
+    return sha256_bytes(texts.encode())[:16]
 
 
 def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, images: str, language: Language) -> str:

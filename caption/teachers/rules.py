@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -41,11 +42,9 @@ def find_cues(facts: Facts) -> Cues:
     first, last = facts.distance_m[0], facts.distance_m[-1]
     # The camera follows the line of sight, which is the heading less the target's place in the picture: one shaky frame
     # moves both and leaves their difference as it is.
-    offsets = (
-        [offset or 0 for offset in facts.offset_x_px] if None not in facts.offset_x_px else [0] * len(facts.yaw_deg)
-    )
+    offsets = facts.offset_x_px if None not in facts.offset_x_px else [0] * len(facts.yaw_deg)
     degrees = DEGREES_PER_IMAGE_WIDTH / facts.width_px
-    sight_deg = [yaw_deg - degrees * offset for yaw_deg, offset in zip(facts.yaw_deg, offsets, strict=True)]
+    sight_deg = [yaw_deg - degrees * (offset or 0) for yaw_deg, offset in zip(facts.yaw_deg, offsets, strict=True)]
     speed = facts.speed_mps[-1] or 0.0
     return Cues(
         offset_share=0.0 if dx is None else dx / facts.width_px,
@@ -131,117 +130,79 @@ def _causes(f: Facts, token: str) -> list[tuple[Both, ...]]:
     """Give the reasons for a decision that the facts hold, else its general reason."""
     cues = find_cues(f)
     found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
-    return [(wording,) for wording in found[:2]] or [_GENERAL[token]]
+    return [(wording,) for wording in found[:2] or [_GENERAL[token]]]
 
 
 Cause = Callable[[Facts, Cues], Both | None]
+_SIDES: dict[int, Both] = {1: ("left", "左"), -1: ("right", "右")}
 
 
-def _offset_cause(side: int) -> Cause:
-    en, zh = ("left", "左") if side > 0 else ("right", "右")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        if -side * c.offset_share < CENTERED_SHARE:
-            return None
-        n = abs(f.offset_x_px[-1] or 0)
-        return (
-            f"the target has drifted {n} px to the {en} of the image centre",
-            f"目标已偏离到画面中心{zh}侧 {n} 像素处",
-        )
-
-    return cause
+def _offset(side: int, f: Facts, c: Cues) -> Both | None:
+    if -side * c.offset_share < CENTERED_SHARE:
+        return None
+    (en, zh), n = _SIDES[side], abs(f.offset_x_px[-1] or 0)
+    return f"the target has drifted {n} px to the {en} of the image centre", f"目标已偏离到画面中心{zh}侧 {n} 像素处"
 
 
-def _turn_cause(side: int) -> Cause:
-    en, zh = ("left", "左") if side > 0 else ("right", "右")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        if side * c.last_turn_deg < 0.5 or side * f.yaw_deg[-1] < 1.0:
-            return None
-        n = abs(f.yaw_deg[-1])
-        return (
-            f"keeping the target framed has already taken {n:.1f} deg of yaw to the {en}, and the turn goes on",
-            f"为保持目标在画面内，偏航角已向{zh}转动 {n:.1f} 度，且转动仍在继续",
-        )
-
-    return cause
+def _turn(side: int, f: Facts, c: Cues) -> Both | None:
+    if side * c.last_turn_deg < 0.5 or side * f.yaw_deg[-1] < 1.0:
+        return None
+    (en, zh), n = _SIDES[side], abs(f.yaw_deg[-1])
+    return (
+        f"keeping the target framed has already taken {n:.1f} deg of yaw to the {en}, and the turn goes on",
+        f"为保持目标在画面内，偏航角已向{zh}转动 {n:.1f} 度，且转动仍在继续",
+    )
 
 
-def _bend_cause(side: int) -> Cause:
-    en, zh = ("left", "左") if side > 0 else ("right", "右")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        if f.target_turn_deg is None or side * f.target_turn_deg < 15.0:
-            return None
-        return f"the target bends to the {en}, so the line of sight keeps turning", f"目标向{zh}转弯，视线方向持续变化"
-
-    return cause
+def _bend(side: int, f: Facts, c: Cues) -> Both | None:
+    if f.target_turn_deg is None or side * f.target_turn_deg < 15.0:
+        return None
+    en, zh = _SIDES[side]
+    return f"the target bends to the {en}, so the line of sight keeps turning", f"目标向{zh}转弯，视线方向持续变化"
 
 
-def _climb_cause(side: int) -> Cause:
+def _climb(side: int, f: Facts, c: Cues) -> Both | None:
+    if side * (f.altitude_m[-1] - f.altitude_m[0]) < 0.5 or side * c.last_climb_m <= 0:
+        return None
     en, zh = ("climbing", "爬升") if side > 0 else ("descending", "下降")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        moved = f.altitude_m[-1] - f.altitude_m[0]
-        if side * moved < 0.5 or side * c.last_climb_m <= 0:
-            return None
-        return (
-            f"the drone is {en} through an altitude of {f.altitude_m[-1]:.1f} m and the viewing angle is not settled yet",
-            f"无人机正在{zh}，当前高度 {f.altitude_m[-1]:.1f} 米，俯视角度尚未稳定",
-        )
-
-    return cause
+    return (
+        f"the drone is {en} through an altitude of {f.altitude_m[-1]:.1f} m and the viewing angle is not settled yet",
+        f"无人机正在{zh}，当前高度 {f.altitude_m[-1]:.1f} 米，俯视角度尚未稳定",
+    )
 
 
-def _gap_cause(side: int) -> Cause:
+def _gap(side: int, f: Facts, c: Cues) -> Both | None:
+    if side * c.gap_m < 0.5:
+        return None
     en, zh = ("increased", "增加") if side > 0 else ("decreased", "减小")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        if side * c.gap_m < 0.5:
-            return None
-        return (
-            f"the horizontal distance has {en} to {f.distance_m[-1]:.1f} m over the observed frames",
-            f"观测期间水平距离已{zh}到 {f.distance_m[-1]:.1f} 米",
-        )
-
-    return cause
+    return (
+        f"the horizontal distance has {en} to {f.distance_m[-1]:.1f} m over the observed frames",
+        f"观测期间水平距离已{zh}到 {f.distance_m[-1]:.1f} 米",
+    )
 
 
-def _pace_cause(side: int) -> Cause:
+def _pace(side: int, f: Facts, c: Cues) -> Both | None:
+    if f.target_speed_mps is None or side * c.pace_mps < MIN_PACE_MPS:
+        return None
     en, zh = ("above", "高于") if side > 0 else ("below", "低于")
-
-    def cause(f: Facts, c: Cues) -> Both | None:
-        if f.target_speed_mps is None or side * c.pace_mps < MIN_PACE_MPS:
-            return None
-        return (
-            f"the drone speed of {c.speed_now_mps:.2f} m/s is {en} the target speed of {f.target_speed_mps:.2f} m/s",
-            f"无人机速度 {c.speed_now_mps:.2f} 米/秒{zh}目标速度 {f.target_speed_mps:.2f} 米/秒",
-        )
-
-    return cause
+    return (
+        f"the drone speed of {c.speed_now_mps:.2f} m/s is {en} the target speed of {f.target_speed_mps:.2f} m/s",
+        f"无人机速度 {c.speed_now_mps:.2f} 米/秒{zh}目标速度 {f.target_speed_mps:.2f} 米/秒",
+    )
 
 
 def _steady(f: Facts, c: Cues) -> Both | None:
     if not f.is_visible_now or abs(c.offset_share) >= CENTERED_SHARE or abs(c.last_turn_deg) >= 1.0:
         return None
-    return (
-        "the target stays near the image centre and the yaw is aligned with its path",
-        "目标保持在画面中心附近，偏航方向与其路径一致",
-    )
+    en = "the target stays near the image centre and the yaw is aligned with its path"
+    return en, "目标保持在画面中心附近，偏航方向与其路径一致"
 
 
 def _lost(f: Facts, c: Cues) -> Both | None:
     if f.is_visible_now:
         return None
-    if f.visibility[-1] == "out_of_view":
-        return (
-            "the target is out of view, so its motion can no longer be followed directly",
-            "目标在视野外，无法再直接跟随其运动",
-        )
-    return (
-        "the target is occluded, so its motion can no longer be followed directly",
-        "目标被遮挡，无法再直接跟随其运动",
-    )
+    en, zh = ("out of view", "在视野外") if f.visibility[-1] == "out_of_view" else ("occluded", "被遮挡")
+    return f"the target is {en}, so its motion can no longer be followed directly", f"目标{zh}，无法再直接跟随其运动"
 
 
 def _standing(f: Facts, c: Cues) -> Both | None:
@@ -252,51 +213,42 @@ def _standing(f: Facts, c: Cues) -> Both | None:
 
 _EVIDENCE: dict[str, tuple[Cause, ...]] = {
     "track_straight": (_steady,),
-    "yaw_left_to_follow": (_offset_cause(1), _turn_cause(1), _bend_cause(1)),
-    "yaw_right_to_follow": (_offset_cause(-1), _turn_cause(-1), _bend_cause(-1)),
-    "ascend": (_climb_cause(1),),
-    "descend": (_climb_cause(-1),),
-    "speed_up": (_gap_cause(1), _pace_cause(-1)),
-    "slow_down": (_gap_cause(-1), _pace_cause(1)),
-    "move_forward": (_gap_cause(1),),
-    "move_backward": (_gap_cause(-1),),
-    "strafe_left": (_offset_cause(1), _bend_cause(1)),
-    "strafe_right": (_offset_cause(-1), _bend_cause(-1)),
+    "yaw_left_to_follow": (partial(_offset, 1), partial(_turn, 1), partial(_bend, 1)),
+    "yaw_right_to_follow": (partial(_offset, -1), partial(_turn, -1), partial(_bend, -1)),
+    "ascend": (partial(_climb, 1),),
+    "descend": (partial(_climb, -1),),
+    "speed_up": (partial(_gap, 1), partial(_pace, -1)),
+    "slow_down": (partial(_gap, -1), partial(_pace, 1)),
+    "move_forward": (partial(_gap, 1),),
+    "move_backward": (partial(_gap, -1),),
+    "strafe_left": (partial(_offset, 1), partial(_bend, 1)),
+    "strafe_right": (partial(_offset, -1), partial(_bend, -1)),
     "hover": (_standing,),
     "search_to_reacquire_target": (_lost,),
 }
 
 # Reasons that claim nothing measurable: for a decision that the facts alone do not explain.
-_GENERAL: dict[str, tuple[Both, ...]] = {
-    "track_straight": (("the present course keeps the target in frame", "当前航向可使目标保持在画面内"),),
-    "yaw_left_to_follow": (
-        ("the line of sight to the target calls for a correction of the heading", "对准目标的视线需要修正航向"),
-    ),
-    "yaw_right_to_follow": (
-        ("the line of sight to the target calls for a correction of the heading", "对准目标的视线需要修正航向"),
-    ),
-    "circle_left": (
-        ("a view from another side of the target keeps it well in frame", "换一侧观察目标有利于将其保持在画面内"),
-    ),
-    "circle_right": (
-        ("a view from another side of the target keeps it well in frame", "换一侧观察目标有利于将其保持在画面内"),
-    ),
-    "ascend": (("a higher viewpoint keeps a free line of sight to the target", "更高的视点可保持对目标的通畅视线"),),
-    "descend": (("a lower viewpoint shows the target at a better scale", "更低的视点可让目标尺度更合适"),),
-    "move_forward": (("closing in keeps the target at a useful scale", "靠近目标可保持合适的尺度"),),
-    "move_backward": (
-        ("more room keeps the target and its surroundings in frame", "留出更多空间可将目标与周围环境保持在画面内"),
-    ),
-    "strafe_left": (
-        ("a sideways shift keeps the target framed without a turn", "侧向移动可在不转向的情况下保持目标构图"),
-    ),
-    "strafe_right": (
-        ("a sideways shift keeps the target framed without a turn", "侧向移动可在不转向的情况下保持目标构图"),
-    ),
-    "slow_down": (("the pace has to fit that of the target", "飞行节奏需要与目标相适应"),),
-    "speed_up": (("the pace has to fit that of the target", "飞行节奏需要与目标相适应"),),
-    "search_to_reacquire_target": (("contact with the target has to be secured", "需要确保与目标保持联系"),),
-    "hover": (("holding the present position keeps the target in frame", "保持当前位置可使目标留在画面内"),),
-    "break_off": (("the mission ends the pursuit here", "任务要求在此结束跟踪"),),
-    "return_to_home": (("the mission calls the drone back", "任务要求无人机返回"),),
+_CORRECTION = ("the line of sight to the target calls for a correction of the heading", "对准目标的视线需要修正航向")
+_OTHER_SIDE = ("a view from another side of the target keeps it well in frame", "换一侧观察目标有利于将其保持在画面内")
+_SHIFT = ("a sideways shift keeps the target framed without a turn", "侧向移动可在不转向的情况下保持目标构图")
+_FIT = ("the pace has to fit that of the target", "飞行节奏需要与目标相适应")
+_ROOM = "more room keeps the target and its surroundings in frame"
+_GENERAL: dict[str, Both] = {
+    "track_straight": ("the present course keeps the target in frame", "当前航向可使目标保持在画面内"),
+    "yaw_left_to_follow": _CORRECTION,
+    "yaw_right_to_follow": _CORRECTION,
+    "circle_left": _OTHER_SIDE,
+    "circle_right": _OTHER_SIDE,
+    "ascend": ("a higher viewpoint keeps a free line of sight to the target", "更高的视点可保持对目标的通畅视线"),
+    "descend": ("a lower viewpoint shows the target at a better scale", "更低的视点可让目标尺度更合适"),
+    "move_forward": ("closing in keeps the target at a useful scale", "靠近目标可保持合适的尺度"),
+    "move_backward": (_ROOM, "留出更多空间可将目标与周围环境保持在画面内"),
+    "strafe_left": _SHIFT,
+    "strafe_right": _SHIFT,
+    "slow_down": _FIT,
+    "speed_up": _FIT,
+    "search_to_reacquire_target": ("contact with the target has to be secured", "需要确保与目标保持联系"),
+    "hover": ("holding the present position keeps the target in frame", "保持当前位置可使目标留在画面内"),
+    "break_off": ("the mission ends the pursuit here", "任务要求在此结束跟踪"),
+    "return_to_home": ("the mission calls the drone back", "任务要求无人机返回"),
 }

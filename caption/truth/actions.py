@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from caption.schema import FutureMotion, LabelConfig
-from cosfly.products.captions import ACTION_GROUPS, ACTIONS, Verdict
+from cosfly.products.captions import ACTIONS, Verdict
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,8 @@ class Motion:
     forward_m: float  # displacement in the body frame at the current frame
     left_m: float
     approach_m: float  # decrease of the horizontal distance to the target
-    sweep_deg: (
-        float  # angle that the drone's bearing, seen from the target, turns clockwise: positive flies to the left
-    )
+    # The angle that the drone's bearing, seen from the target, turns clockwise: positive flies to the left.
+    sweep_deg: float
     target_path_m: float
     visible_now: bool
     visible_share: float  # of the future frames
@@ -74,10 +73,6 @@ class Action:
     implied: Predicate | None
     contradicted: Predicate
 
-    @property
-    def group(self) -> str:
-        return next(group for group, tokens in ACTION_GROUPS.items() if self.token in tokens)
-
 
 def _circles(m: Motion, c: LabelConfig, side: int) -> bool:
     # Following a walker through a bend sweeps an angle too: a circle is flown round someone who moves less than the drone.
@@ -93,6 +88,10 @@ def _strafes(m: Motion, c: LabelConfig, side: int) -> bool:
     return side * m.left_m >= c.lateral_m and abs(m.left_m) > abs(m.forward_m)
 
 
+def _gains(m: Motion, c: LabelConfig, side: int) -> bool:
+    return side * m.speed_change_mps >= c.speed_change_mps
+
+
 def _still(m: Motion, c: LabelConfig) -> bool:
     return m.mean_speed_mps < c.hover_mps and abs(m.yaw_deg) < c.yaw_deg
 
@@ -101,80 +100,36 @@ def _keeps_following(m: Motion, c: LabelConfig) -> bool:
     return m.visible_now and m.visible_share == 1.0 and m.approach_m > -c.approach_m
 
 
-TABLE: tuple[Action, ...] = (
+TABLE: tuple[Action, ...] = (  # token, implied, contradicted
     Action(
         "search_to_reacquire_target",
-        implied=lambda m, c: not m.visible_now,
-        contradicted=lambda m, c: m.visible_now and m.visible_share == 1.0,
+        lambda m, c: not m.visible_now,
+        lambda m, c: m.visible_now and m.visible_share == 1.0,
     ),
-    Action("hover", implied=_still, contradicted=lambda m, c: m.mean_speed_mps >= c.moving_mps),
-    Action(
-        "circle_left",
-        implied=lambda m, c: _circles(m, c, 1),
-        contradicted=lambda m, c: m.left_m <= -c.lateral_m or _still(m, c),
-    ),
-    Action(
-        "circle_right",
-        implied=lambda m, c: _circles(m, c, -1),
-        contradicted=lambda m, c: m.left_m >= c.lateral_m or _still(m, c),
-    ),
-    Action(
-        "yaw_left_to_follow",
-        implied=lambda m, c: m.yaw_deg >= c.yaw_deg,
-        contradicted=lambda m, c: m.yaw_deg <= -c.yaw_deg,
-    ),
-    Action(
-        "yaw_right_to_follow",
-        implied=lambda m, c: m.yaw_deg <= -c.yaw_deg,
-        contradicted=lambda m, c: m.yaw_deg >= c.yaw_deg,
-    ),
-    Action(
-        "ascend",
-        implied=lambda m, c: m.altitude_m >= c.altitude_m,
-        contradicted=lambda m, c: m.altitude_m <= -0.5 * c.altitude_m,
-    ),
-    Action(
-        "descend",
-        implied=lambda m, c: m.altitude_m <= -c.altitude_m,
-        contradicted=lambda m, c: m.altitude_m >= 0.5 * c.altitude_m,
-    ),
-    Action(
-        "speed_up",
-        implied=lambda m, c: m.speed_change_mps >= c.speed_change_mps,
-        contradicted=lambda m, c: m.speed_change_mps <= -c.speed_change_mps,
-    ),
-    Action(
-        "slow_down",
-        implied=lambda m, c: m.speed_change_mps <= -c.speed_change_mps,
-        contradicted=lambda m, c: m.speed_change_mps >= c.speed_change_mps,
-    ),
-    Action(
-        "strafe_left",
-        implied=lambda m, c: _strafes(m, c, 1),
-        contradicted=lambda m, c: m.left_m <= -0.5 * c.lateral_m,
-    ),
-    Action(
-        "strafe_right",
-        implied=lambda m, c: _strafes(m, c, -1),
-        contradicted=lambda m, c: m.left_m >= 0.5 * c.lateral_m,
-    ),
-    Action(
-        "move_backward",
-        implied=lambda m, c: m.forward_m <= -c.forward_m,
-        contradicted=lambda m, c: m.forward_m >= c.forward_m,
-    ),
+    Action("hover", _still, lambda m, c: m.mean_speed_mps >= c.moving_mps),
+    Action("circle_left", lambda m, c: _circles(m, c, 1), lambda m, c: m.left_m <= -c.lateral_m or _still(m, c)),
+    Action("circle_right", lambda m, c: _circles(m, c, -1), lambda m, c: m.left_m >= c.lateral_m or _still(m, c)),
+    Action("yaw_left_to_follow", lambda m, c: m.yaw_deg >= c.yaw_deg, lambda m, c: m.yaw_deg <= -c.yaw_deg),
+    Action("yaw_right_to_follow", lambda m, c: m.yaw_deg <= -c.yaw_deg, lambda m, c: m.yaw_deg >= c.yaw_deg),
+    Action("ascend", lambda m, c: m.altitude_m >= c.altitude_m, lambda m, c: m.altitude_m <= -0.5 * c.altitude_m),
+    Action("descend", lambda m, c: m.altitude_m <= -c.altitude_m, lambda m, c: m.altitude_m >= 0.5 * c.altitude_m),
+    Action("speed_up", lambda m, c: _gains(m, c, 1), lambda m, c: _gains(m, c, -1)),
+    Action("slow_down", lambda m, c: _gains(m, c, -1), lambda m, c: _gains(m, c, 1)),
+    Action("strafe_left", lambda m, c: _strafes(m, c, 1), lambda m, c: m.left_m <= -0.5 * c.lateral_m),
+    Action("strafe_right", lambda m, c: _strafes(m, c, -1), lambda m, c: m.left_m >= 0.5 * c.lateral_m),
+    Action("move_backward", lambda m, c: m.forward_m <= -c.forward_m, lambda m, c: m.forward_m >= c.forward_m),
     Action(
         "move_forward",
-        implied=lambda m, c: m.forward_m >= c.forward_m and m.approach_m >= c.approach_m,
-        contradicted=lambda m, c: m.forward_m <= -c.forward_m,
+        lambda m, c: m.forward_m >= c.forward_m and m.approach_m >= c.approach_m,
+        lambda m, c: m.forward_m <= -c.forward_m,
     ),
     Action(
         "track_straight",
-        implied=lambda m, c: m.forward_m >= c.forward_m,
-        contradicted=lambda m, c: abs(m.yaw_deg) >= c.hard_turn_deg or m.forward_m <= -c.forward_m,
+        lambda m, c: m.forward_m >= c.forward_m,
+        lambda m, c: abs(m.yaw_deg) >= c.hard_turn_deg or m.forward_m <= -c.forward_m,
     ),
-    Action("break_off", implied=None, contradicted=_keeps_following),
-    Action("return_to_home", implied=None, contradicted=_keeps_following),
+    Action("break_off", None, _keeps_following),
+    Action("return_to_home", None, _keeps_following),
 )
 BY_TOKEN = {action.token: action for action in TABLE}
 assert set(BY_TOKEN) == set(ACTIONS)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
-from caption.truth.glossary import Number, load_glossary
+from caption.truth.glossary import LANGUAGES, Number, load_glossary
 from cosfly.products.captions import Coc, Language
 
 Series = Sequence[float | None]
@@ -25,46 +25,30 @@ Series = Sequence[float | None]
 _CLAUSES = re.compile(r"[;；。，！？!?\n]|,(?!\s*[-−\d])|\.(?!\d)")
 
 # Keywords that say what a clause speaks of. One scan finds them all: the first alternative that fits at a place wins.
-_WORDS: dict[str, re.Pattern[str]] = {
-    language: re.compile("|".join(f"(?P<{name}>{pattern})" for name, pattern in words.items()), re.IGNORECASE)
-    for language, words in (
-        (
-            "en",
-            {
-                "distance": r"\b(?:distance|gap|range|separation)\b",
-                "horizontal": r"\bhorizontal",
-                "altitude": r"\b(?:altitude|climb\w*|descend\w*|ascend\w*)\b",
-                "target": r"\b(?:target|pedestrian|person|walk\w*|it|its)\b",
-                "drone": r"\b(?:drone|uav)\b",
-                "box": r"\bbox\b",
-                "center": r"\b(?:cent(?:re|er)\w*|offset)\b",
-                "yaw": r"\b(?:yaw|heading)\b",
-                "pitch": r"\bpitch\b",
-                "bend": r"\bbend\w*\b",
-                "decision": r"\b(?:should|must|decision|next step|correct action|proper action)\b",
-                "past": r"\b(?:was|were|earlier|previous\w*|before|briefly|first|had been)\b",
-                "stable": r"\b(?:stable|steady|unchanged|constant)\b",
-            },
-        ),
-        (
-            "zh",
-            {
-                "distance": "距离|间距",
-                "horizontal": "水平",
-                "altitude": "高度|爬升|上升|下降",
-                "target": "目标|行人|其",
-                "drone": "无人机",
-                "box": "边界框",
-                "center": "中心|中央|居中",
-                "yaw": "偏航|航向",
-                "pitch": "俯仰",
-                "bend": "转弯",
-                "decision": "应|决策|下一步",
-                "past": "曾|先前|之前|此前|早先|一度",
-                "stable": "稳定|不变|恒定",
-            },
-        ),
-    )
+_KEYWORDS: dict[str, dict[Language, str]] = {
+    "distance": {"en": r"\b(?:distance|gap|range|separation)\b", "zh": "距离|间距"},
+    "horizontal": {"en": r"\bhorizontal", "zh": "水平"},
+    "altitude": {"en": r"\b(?:altitude|climb\w*|descend\w*|ascend\w*)\b", "zh": "高度|爬升|上升|下降"},
+    "target": {"en": r"\b(?:target|pedestrian|person|walk\w*|it|its)\b", "zh": "目标|行人|其"},
+    "drone": {"en": r"\b(?:drone|uav)\b", "zh": "无人机"},
+    "box": {"en": r"\bbox\b", "zh": "边界框"},
+    "center": {"en": r"\b(?:cent(?:re|er)\w*|offset)\b", "zh": "中心|中央|居中"},
+    "yaw": {"en": r"\b(?:yaw|heading)\b", "zh": "偏航|航向"},
+    "pitch": {"en": r"\bpitch\b", "zh": "俯仰"},
+    "bend": {"en": r"\bbend\w*\b", "zh": "转弯"},
+    "decision": {
+        "en": r"\b(?:should|must|decision|next step|correct action|proper action)\b",
+        "zh": "应|决策|下一步",
+    },
+    "past": {
+        "en": r"\b(?:was|were|earlier|previous\w*|before|briefly|first|had been)\b",
+        "zh": "曾|先前|之前|此前|早先|一度",
+    },
+    "stable": {"en": r"\b(?:stable|steady|unchanged|constant)\b", "zh": "稳定|不变|恒定"},
+}
+_WORDS: dict[Language, re.Pattern[str]] = {
+    language: re.compile("|".join(f"(?P<{name}>{words[language]})" for name, words in _KEYWORDS.items()), re.IGNORECASE)
+    for language in LANGUAGES
 }
 _FROM_TO: dict[Language, re.Pattern[str]] = {
     "en": re.compile(r"\bfrom\b.*\bto\b", re.IGNORECASE),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
@@ -40,13 +41,8 @@ def encode_body(payload: dict) -> bytes:
     """Write a request as JSON. Data URLs, a megabyte of them, need no escaping: they are copied in, not scanned."""
     urls: list[str] = []
 
-    def marked(message: dict) -> dict:
-        content = message["content"]
-        if isinstance(content, str):
-            return message
-        return message | {"content": [_marked_part(part, urls) for part in content]}
-
-    text = dump_json(payload | {"messages": [marked(message) for message in payload["messages"]]})
+    messages = _with_parts(payload["messages"], lambda part: _marked_part(part, urls))
+    text = dump_json(payload | {"messages": messages})
     pieces = _IMAGE_MARK.split(text.encode())
     for at in range(1, len(pieces), 2):
         pieces[at] = b'"' + urls[int(pieces[at])].encode("ascii") + b'"'
@@ -69,30 +65,20 @@ def request_body(model: str, request: Request, *, with_ids: bool = False) -> dic
 def with_image_ids(messages: list[dict], digests: list[str]) -> list[dict]:
     """Give each image its digest as `uuid`, by which vLLM finds it in its cache."""
     left = iter(digests)
+    return _with_parts(messages, lambda part: part | {"uuid": next(left)} if part["type"] == "image_url" else part)
+
+
+def _with_parts(messages: list[dict], change: Callable[[dict], object]) -> list[dict]:
+    """Change every part of the messages; a content that is one text stays."""
     return [
-        message
-        if isinstance(message["content"], str)
-        else message
-        | {
-            "content": [
-                part | {"uuid": next(left)} if part["type"] == "image_url" else part for part in message["content"]
-            ]
-        }
+        message if isinstance(message["content"], str) else message | {"content": [*map(change, message["content"])]}
         for message in messages
     ]
 
 
 def answer_key(model: str, request: Request) -> str:
     """Hash image bytes, prompt, model and sampling: what an answer depends on."""
-    texts = [
-        {
-            "role": message["role"],
-            "content": message["content"]
-            if isinstance(message["content"], str)
-            else [part.get("text", "image") for part in message["content"]],
-        }
-        for message in request.messages
-    ]
+    texts = _with_parts(request.messages, lambda part: part.get("text", "image"))
     sampling = {"model": model, **request.sampling}
     return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
 
