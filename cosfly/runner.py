@@ -14,6 +14,7 @@ import multiprocessing
 import signal
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -111,16 +112,11 @@ def run_items(
 
 
 def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:
-    tally = Tally(input=len(records))
-    for record in records:
-        if isinstance(record, Kept):
-            tally.kept += 1
-        elif isinstance(record, Dropped):
-            tally.drop(record.reason)
-        else:
-            tally.fail(record.code)
-    write_failures(stage.path / "failures.jsonl", [record for record in records if isinstance(record, Failed)])
-    return tally
+    failures = [record for record in records if isinstance(record, Failed)]
+    write_failures(stage.path / "failures.jsonl", failures)
+    dropped = Counter(record.reason for record in records if isinstance(record, Dropped))
+    kept = len(records) - dropped.total() - len(failures)
+    return Tally(input=len(records), kept=kept, dropped=dropped, failed=Counter(failure.code for failure in failures))
 
 
 def _outcomes(items: list[Item], make_worker: Callable, worker_args: tuple, workers: int) -> Iterator[ItemRecord]:

@@ -8,19 +8,12 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    TypeAdapter,
-    field_serializer,
-    model_serializer,
-)
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 
 import cosfly
 from cosfly.config import Config
@@ -100,22 +93,16 @@ class Tally(BaseModel):
 
     input: int = 0
     kept: int = 0
-    dropped: dict[str, int] = {}
-    failed: dict[str, int] = {}
-
-    def drop(self, reason: str, count: int = 1) -> None:
-        self.dropped[reason] = self.dropped.get(reason, 0) + count
-
-    def fail(self, code: str, count: int = 1) -> None:
-        self.failed[code] = self.failed.get(code, 0) + count
+    dropped: Counter[str] = Counter()
+    failed: Counter[str] = Counter()
 
     def check(self) -> None:
         """Assert that nothing was lost: a tally that does not add up is a bug of ours, not of the input."""
-        total = self.kept + sum(self.dropped.values()) + sum(self.failed.values())
+        total = self.kept + self.dropped.total() + self.failed.total()
         assert total == self.input, f"{total} outcomes for {self.input} items: {self}"
 
     @field_serializer("dropped", "failed")
-    def _sorted(self, counts: dict[str, int]) -> dict[str, int]:
+    def _sorted(self, counts: Counter[str]) -> dict[str, int]:
         return dict(sorted(counts.items()))
 
     def __str__(self) -> str:
@@ -123,7 +110,7 @@ class Tally(BaseModel):
         for word, reasons in (("dropped", self.dropped), ("failed", self.failed)):
             if reasons:
                 listed = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
-                text += f", {sum(reasons.values())} {word} ({listed})"
+                text += f", {reasons.total()} {word} ({listed})"
         return f"{text} of {self.input}"
 
 
@@ -145,11 +132,7 @@ class StageRecord(_Record):
     seed: int
     inputs: dict[str, StageInput]
     code_version: str
-    resumed_with_other: list[str] = []
-
-    @model_serializer(mode="wrap")
-    def _without_empty(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in dump(self).items() if value or name != "resumed_with_other"}
+    resumed_with_other: list[str] = Field([], exclude_if=lambda differences: not differences)
 
 
 class Output(_Record):
@@ -173,12 +156,6 @@ class Manifest(BaseModel):
     @property
     def facts(self) -> dict[str, Any]:
         return self.model_extra or {}
-
-    @model_serializer(mode="wrap")
-    def _time_last(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        record: dict[str, Any] = dump(self)
-        record["seconds"] = record.pop("seconds")
-        return record
 
 
 def read_manifest(folder: Path) -> Manifest:

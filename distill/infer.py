@@ -149,7 +149,7 @@ def _infer(
     predictions: list[Prediction] = []
     for record, batch in zip(finished.records, batches, strict=True):
         if isinstance(record, Failed):
-            tally.fail(record.code, len(batch))
+            tally.failed[record.code] += len(batch)
             predictions += [failed_prediction(sample, cfg.split, record.code) for sample in batch]
         else:
             tally.kept += len(batch)
@@ -212,7 +212,7 @@ async def _ask(
                 tally.kept += 1
                 num_tokens = reply.usage.completion_tokens if reply.usage else 0
                 return make_prediction(sample, cfg.split, reply.text, num_tokens, reply.finish_reason != "length")
-            tally.fail(failed.code)
+            tally.failed[failed.code] += 1
             failures.append(failed)
             return failed_prediction(sample, cfg.split, failed.code)
 

@@ -141,13 +141,13 @@ class Asking:
                     break
         except InputError as error:
             self.failures.append(Failed(id=allotted.name, code=error.code, message=str(error)))
-            tally.fail(error.code)
+            tally.failed[error.code] += 1
             log.error("caption: %s: %s", allotted.name, error)
         else:
             if num_windows:
                 tally.kept += 1
             else:
-                tally.drop("too_short")
+                tally.dropped["too_short"] += 1
         self.display.correct_total(guessed, num_windows if not self.stopped else guessed)
         flight.is_read = True
         self._close_if_done(flight)

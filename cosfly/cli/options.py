@@ -79,7 +79,7 @@ def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
 
 def check_failures(counts_by_stage: dict[str, Tally], where: Path, cfg: RunConfig) -> None:
     """Exit 1, after everything was done, where more items failed than the settings accept."""
-    failed = {stage: counts.failed for stage, counts in counts_by_stage.items() if counts.failed}
+    failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
     if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
         raise InputError(
             "some items failed; the others are done",
