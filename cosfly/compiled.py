@@ -64,10 +64,6 @@ def cache_folder() -> Path | None:
     return Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else None  # type: ignore[attr-defined]
 
 
-def _caches() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(home) / "cosfly"
-
-
 if "NUMBA_CACHE_DIR" not in os.environ:
-    use_own_cache(_caches(), sources_digest(PACKAGE), time.time())
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    use_own_cache(Path(home) / "cosfly", sources_digest(PACKAGE), time.time())

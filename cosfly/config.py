@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.resources
 from collections.abc import Iterable
 from pathlib import Path
@@ -78,7 +79,7 @@ def read_yaml(path: Path) -> dict:
 
 def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
-    data = _copy(data)
+    data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not all(key.split(".")):
@@ -100,10 +101,6 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
                 raise ConfigError("not a group of settings", where=f"--set {key}", got=parent)
         node[last] = value
     return data
-
-
-def _copy(value: Any) -> Any:
-    return {key: _copy(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def build(model: type[C], data: dict, source: str | Path) -> C:

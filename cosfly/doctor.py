@@ -43,19 +43,16 @@ class Check:
 
 def examine(folder: Path, teacher: str | None = None) -> list[Check]:
     """Look at everything. `missing` in any check means that the main job cannot run here."""
-    checks = [_python(), _memory(), _disk(folder), _gl(), _gpu(), *(_package(name) for name in OPTIONAL_PACKAGES)]
-    if teacher is not None:
-        checks.append(_endpoint(teacher))
-    return checks
-
-
-def _python() -> Check:
-    return Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
-
-
-def _memory() -> Check:
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {total:.0f} GiB memory")
+    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return [
+        Check("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
+        Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB memory"),
+        _disk(folder),
+        _gl(),
+        _gpu(),
+        *map(_package, OPTIONAL_PACKAGES),
+        *([] if teacher is None else [_endpoint(teacher)]),
+    ]
 
 
 def _disk(folder: Path) -> Check:

@@ -19,7 +19,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 
 class CosflyError(Exception):
@@ -60,11 +62,8 @@ class CosflyError(Exception):
 
     def __reduce__(self) -> tuple:
         # Errors cross process borders; the default reduction would drop the keyword arguments.
-        return _rebuild, (type(self), self.what, self.where, self.got, self.expected, self.fix)
-
-
-def _rebuild(kind: type[CosflyError], what: str, where, got, expected, fix) -> CosflyError:
-    return kind(what, where=where, got=got, expected=expected, fix=fix)
+        details: dict[str, Any] = {"where": self.where, "got": self.got, "expected": self.expected, "fix": self.fix}
+        return partial(type(self), self.what, **details), ()
 
 
 class ConfigError(CosflyError):

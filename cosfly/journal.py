@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import threading
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from typing import Any
 
 from cosfly.store import dump_json, parse_json, sha256_bytes, storage_errors
 
-BLOCK = 65_536  # bytes looked at together, from the end
+TAIL = 65_536  # bytes at the end in which `last` looks
 
 
 class Journal:
@@ -44,7 +45,7 @@ class Journal:
     def last(self) -> dict | None:
         """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""
         with open(self.path, "rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - BLOCK))
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             tail = file.read()
         return _record_of(tail[tail.rfind(b"\n", 0, -1) + 1 :])
 
@@ -94,18 +95,9 @@ def _record_of(line: bytes) -> dict | None:
 
 def _cut_torn_line(path: Path) -> None:
     """Take off the line that a kill cut short: a reader skips it, so it must not come back to life when more is written."""
-    if not path.exists():
+    if not path.exists() or not path.stat().st_size:  # nothing can be mapped of an empty file
         return
     with open(path, "r+b") as file:
-        end = file.seek(0, os.SEEK_END)
-        keep, block = end, BLOCK
-        while keep > 0:
-            start = max(0, keep - block)
-            file.seek(start)
-            newline = file.read(keep - start).rfind(b"\n")
-            if newline >= 0:
-                keep = start + newline + 1
-                break
-            keep = start
-        if keep < end:
-            file.truncate(keep)
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            end = content.rfind(b"\n") + 1
+        file.truncate(end)

@@ -74,14 +74,10 @@ def write_bytes(path: Path, data: bytes) -> None:
         file.write(data)
 
 
-_COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-
-
 def dump_json(value: Any, *, indent: int | None = None) -> str:
     """Give JSON text; NaN and infinity are an error, never a value."""
-    if indent is None:
-        return _COMPACT.encode(value)
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=indent)
+    separators = (",", ":") if indent is None else None
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
 
 
 def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
