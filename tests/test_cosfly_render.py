@@ -31,6 +31,7 @@ from cosfly.render.contract import (
     SHARED_ID,
     Frame,
     PosedPerson,
+    has_own_ids,
     instance_ids,
 )
 from cosfly.render.gl import meshes as unit_meshes
@@ -119,31 +120,28 @@ def test_parts_carry_kind_and_id_of_their_box():
 
 
 def test_instance_ids_are_the_boxes_own_where_they_fit():
-    found = instance_ids(
-        make_box_map(np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3)), [3, 9, 1], [5, MAX_BOX_ID, 1])
-    )
-    assert (found.ids.tolist(), found.num_shared, found.are_box_ids) == ([5, MAX_BOX_ID, 1], 0, True)
+    boxes = make_box_map(np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3)), [3, 9, 1], [5, MAX_BOX_ID, 1])
+    assert (instance_ids(boxes).tolist(), has_own_ids(boxes)) == ([5, MAX_BOX_ID, 1], True)
 
 
 def test_instance_ids_never_wrap():
     n = 66_000
     kinds = np.full(n, KINDS["Vegetation"])
     kinds[-3:] = KINDS["Buildings"]  # last in the file, first to get an id
-    found = instance_ids(
-        make_box_map(np.zeros((n, 3)), np.ones((n, 3)), np.zeros((n, 3)), kinds, np.arange(n) + 10**12)
-    )
-    assert found.ids[-3:].tolist() == [1, 2, 3]
-    assert not found.are_box_ids
-    assert found.num_shared == n - MAX_BOX_ID == int((found.ids == SHARED_ID).sum())
-    own = found.ids[found.ids != SHARED_ID]
+    boxes = make_box_map(np.zeros((n, 3)), np.ones((n, 3)), np.zeros((n, 3)), kinds, np.arange(n) + 10**12)
+    ids = instance_ids(boxes)
+    assert ids[-3:].tolist() == [1, 2, 3]
+    assert not has_own_ids(boxes)
+    assert n - MAX_BOX_ID == int((ids == SHARED_ID).sum())
+    own = ids[ids != SHARED_ID]
     assert len(np.unique(own)) == len(own)
-    assert PERSON_ID not in found.ids
-    assert 0 not in found.ids
+    assert PERSON_ID not in ids
+    assert 0 not in ids
 
 
 def test_an_id_of_zero_is_replaced():
     found = instance_ids(make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 3], [0, 1]))
-    assert found.ids.tolist() == [1, 2]
+    assert found.tolist() == [1, 2]
 
 
 def test_ground_plane_is_below_every_slab():

@@ -24,14 +24,18 @@ class TargetView:
 
     uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin, xmax, ymax of
     the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same clipped to the image, NaN
-    where none of it is inside. in_view: some of the box is inside the image.
+    where none of it is inside.
     """
 
     uv: np.ndarray
     depth_m: float
     box_px: np.ndarray
     bbox_px: np.ndarray
-    in_view: bool
+
+    @property
+    def in_view(self) -> bool:
+        """Some of the box is inside the image."""
+        return not np.isnan(self.bbox_px).any()
 
 
 def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -> TargetView:
@@ -40,17 +44,15 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
     in_camera = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
     seen = _in_front(in_camera)
-    nothing = np.full(4, np.nan)
-    if len(seen) == 0:
-        return TargetView(uv[0], float(z[0]), nothing, nothing, False)
-    points = seen @ camera.intrinsic.T
-    points = points[:, :2] / points[:, 2:]
-    box = np.array([*points.min(axis=0), *points.max(axis=0)])
-    size = np.array([camera.width_px, camera.height_px] * 2, dtype=np.float64)
-    clipped = np.clip(box, 0.0, size)
-    if clipped[2] <= clipped[0] or clipped[3] <= clipped[1]:
-        return TargetView(uv[0], float(z[0]), box, nothing, False)
-    return TargetView(uv[0], float(z[0]), box, clipped, True)
+    box = clipped = np.full(4, np.nan)
+    if len(seen):
+        points = seen @ camera.intrinsic.T
+        points = points[:, :2] / points[:, 2:]
+        box = np.array([*points.min(axis=0), *points.max(axis=0)])
+        clipped = np.clip(box, 0.0, [camera.width_px, camera.height_px] * 2)
+        if (clipped[2:] <= clipped[:2]).any():
+            clipped = np.full(4, np.nan)
+    return TargetView(uv[0], float(z[0]), box, clipped)
 
 
 def _in_front(corners: np.ndarray) -> np.ndarray:
@@ -103,9 +105,8 @@ def rendered_visibility(
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
     columns, rows = np.arange(np.floor(x0), np.ceil(x1), stride), np.arange(np.floor(y0), np.ceil(y1), stride)
     pixels = np.stack(np.meshgrid(np.floor(columns), np.floor(rows)), axis=-1).reshape(-1, 2)
-    near = box_depths(
-        pixels + 0.5, np.asarray(target_m), np.array(PERSON_HALF_EXTENTS_M), camera_pose, camera.intrinsic
-    )
+    half_m = np.array(PERSON_HALF_EXTENTS_M)
+    near = box_depths(pixels + 0.5, np.asarray(target_m), half_m, camera_pose, camera.intrinsic)
     pixels, near = pixels[np.isfinite(near)].astype(np.int64), near[np.isfinite(near)]
     if len(pixels) == 0:
         return 0.0, num_person_px

@@ -106,28 +106,23 @@ class Renderer(Protocol):
 # --- the same for all -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class InstanceIds:
-    """Which 16-bit id each box got. `ids` (n,) uint16 in the map's order; `num_shared` boxes share SHARED_ID."""
-
-    ids: np.ndarray
-    num_shared: int
-    are_box_ids: bool
+def has_own_ids(box_map: BoxMap) -> bool:
+    """Tell whether the boxes' own ids can be their ids in `instance.png`: all of them lie in 1..MAX_BOX_ID."""
+    return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID)).all())
 
 
-def instance_ids(box_map: BoxMap) -> InstanceIds:
-    """Give every box its id for `instance.png`.
+def instance_ids(box_map: BoxMap) -> np.ndarray:
+    """Give every box its id for `instance.png`, (n,) uint16 in the map's order.
 
-    The boxes' own ids are used if all of them lie in 1..MAX_BOX_ID. Otherwise ids are counted from 1, first through the boxes
-    that are not vegetation, then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
+    The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not vegetation,
+    then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
     """
-    n = len(box_map)
-    if n == 0 or (box_map.ids.min() >= 1 and box_map.ids.max() <= MAX_BOX_ID):
-        return InstanceIds(box_map.ids.astype(np.uint16), 0, True)
+    if has_own_ids(box_map):
+        return box_map.ids.astype(np.uint16)
     order = np.argsort(box_map.kinds == KINDS["Vegetation"], kind="stable")
-    ids = np.empty(n, dtype=np.uint16)
-    ids[order] = np.minimum(np.arange(1, n + 1), SHARED_ID)
-    return InstanceIds(ids, max(0, n - MAX_BOX_ID), False)
+    ids = np.empty(len(box_map), dtype=np.uint16)
+    ids[order] = np.minimum(np.arange(1, len(box_map) + 1), SHARED_ID)
+    return ids
 
 
 def scene_origin(box_map: BoxMap) -> np.ndarray:

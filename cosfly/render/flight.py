@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from cosfly.geometry import world_from_camera
 from cosfly.products import frames
-from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, frame_name
+from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
@@ -52,16 +53,6 @@ class Writing:
     visible_threshold: float
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """One frame's annotation in numbers."""
-
-    view: TargetView
-    visibility: float
-    num_person_px: int
-    is_visible: bool
-
-
 def render_flight(
     renderer: Renderer, script: FlightScript, folder: Path, writing: Writing, num_threads: int = 2
 ) -> Flight:
@@ -75,7 +66,8 @@ def render_flight(
     poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
-    seen: list[_Seen] = []
+    annotations: list[FrameMeta] = []
+    visibility: list[float] = []
     digests: dict[str, str] = {}
     pending: list[Future] = []
     with ThreadPoolExecutor(num_threads) as pool:
@@ -83,14 +75,18 @@ def render_flight(
             pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
             person = script.gait.posed(i, target, script.clothes)
             frame = renderer.render(pose, script.camera.intrinsic, person)
-            seen.append(_look(frame, target, pose, script.camera, writing.visible_threshold))
-            meta = _annotation(script, i, seen[i])
-            pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, meta, writing))
+            view = view_target(target, pose, script.camera)
+            score, num_person_px = rendered_visibility(frame, target, view, pose, script.camera)
+            # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
+            is_visible = view.in_view and score > writing.visible_threshold and num_person_px > 0
+            visibility.append(score)
+            annotations.append(_annotation(script, i, view, score, num_person_px, is_visible))
+            pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, annotations[i], writing))
             while len(pending) >= FRAMES_IN_FLIGHT:
                 digests.update(pending.pop(0).result())
         for future in pending:
             digests.update(future.result())
-    flight = _flight(script, seen)
+    flight = _flight(script, [meta.target for meta in annotations], np.array(visibility))
     write_flight(folder, flight)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
     for name in ("trajectory.json", "perturbation_report.json"):
@@ -99,24 +95,17 @@ def render_flight(
     return flight
 
 
-def _look(frame: Frame, target_m: np.ndarray, pose: np.ndarray, camera: Camera, threshold: float) -> _Seen:
-    view = view_target(target_m, pose, camera)
-    score, num_person_px = rendered_visibility(frame, target_m, view, pose, camera)
-    # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
-    return _Seen(view, score, num_person_px, view.in_view and score > threshold and num_person_px > 0)
-
-
 # --- files of one frame -----------------------------------------------------------------------------------------------
 
 
 def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
     """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
-    makers: dict[str, tuple[str, Callable[[], bytes]]] = {
-        "rgb": ("rgb.png", lambda: frames.rgb_bytes(frame.rgb, writing.png_compression)),
-        "depth": ("depth.npy", lambda: frames.depth_bytes(frame.depth)),
-        "instance": ("instance.png", lambda: frames.instance_bytes(frame.kinds, frame.ids, writing.png_compression)),
+    makers: dict[FrameFile, Callable[[], bytes]] = {
+        "rgb": lambda: frames.rgb_bytes(frame.rgb, writing.png_compression),
+        "depth": lambda: frames.depth_bytes(frame.depth),
+        "instance": lambda: frames.instance_bytes(frame.kinds, frame.ids, writing.png_compression),
     }
-    contents = {makers[m][0]: makers[m][1]() for m in writing.files}
+    contents = {frames.FILE_NAMES[file]: makers[file]() for file in writing.files}
     contents["meta.json"] = meta.to_bytes()
     target = folder / name
     with storage_errors(target):
@@ -130,7 +119,9 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
+def _annotation(
+    script: FlightScript, i: int, view: TargetView, visibility: float, num_person_px: int, is_visible: bool
+) -> FrameMeta:
     perturbed = script.perturbed
     return FrameMeta(
         index=i,
@@ -140,18 +131,18 @@ def _annotation(script: FlightScript, i: int, seen: _Seen) -> FrameMeta:
         variant=script.variant,
         camera=frames.camera_meta(script.camera, NEAR_M, FAR_M),
         drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
-        target=frames.TargetMeta(
+        target=TargetMeta(
             world_location=frames.tree_position(perturbed.poses.targets_m[i]),
             half_extents_m=PERSON_HALF_EXTENTS_M,
             instance_id=PERSON_ID,
             semantic_id=KINDS["Pedestrians"],
-            image_uv=_list_or_none(seen.view.uv),
-            bbox_2d=_list_or_none(seen.view.bbox_px),
-            depth_m=seen.view.depth_m,
-            in_view=seen.view.in_view,
-            visible=seen.is_visible,
-            visibility=round(seen.visibility, 6),
-            num_pixels=seen.num_person_px,
+            image_uv=_list_or_none(view.uv),
+            bbox_2d=_list_or_none(view.bbox_px),
+            depth_m=view.depth_m,
+            in_view=view.in_view,
+            visible=is_visible,
+            visibility=round(visibility, 6),
+            num_pixels=num_person_px,
         ),
         perturbation=frames.PerturbationMeta(
             **perturbed.states[i],
@@ -169,20 +160,17 @@ def _list_or_none(values: np.ndarray) -> list[float] | None:
 
 def _report(perturbed: Perturbed) -> dict:
     """`perturbation_report.json`: how often each event happened."""
-    counts: dict[str, dict[str, int]] = {"position": {}, "rotation": {}}
-    for state in perturbed.states:
-        for event, outcome in state.items():
-            counts[event][outcome] = counts[event].get(outcome, 0) + 1
+    outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
     return {
         "schema": REPORT_SCHEMA,
         "schema_version": REPORT_VERSION,
         "num_frames": len(perturbed.states),
         "num_perturbed": int(perturbed.is_perturbed.sum()),
-        **{event: dict(sorted(outcomes.items())) for event, outcomes in counts.items()},
+        **{event: dict(sorted(counts.items())) for event, counts in outcomes.items()},
     }
 
 
-def _flight(script: FlightScript, seen: list[_Seen]) -> Flight:
+def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndarray) -> Flight:
     perturbed = script.perturbed
     return Flight(
         town=script.town,
@@ -193,12 +181,12 @@ def _flight(script: FlightScript, seen: list[_Seen]) -> Flight:
         positions_m=perturbed.poses.positions_m,
         rotations_deg=perturbed.poses.rotations_deg,
         targets_m=perturbed.poses.targets_m,
-        target_in_view=np.array([s.view.in_view for s in seen]),
-        target_visible=np.array([s.is_visible for s in seen]),
-        target_depth_m=np.array([s.view.depth_m for s in seen]),
-        target_uv=np.array([s.view.uv for s in seen]),
-        target_bbox=np.array([s.view.bbox_px for s in seen]),
-        visibility=np.array([s.visibility for s in seen]),
+        target_in_view=np.array([target.in_view for target in targets]),
+        target_visible=np.array([target.visible for target in targets]),
+        target_depth_m=np.array([target.depth_m for target in targets]),
+        target_uv=np.array([target.image_uv or [np.nan] * 2 for target in targets]),
+        target_bbox=np.array([target.bbox_2d or [np.nan] * 4 for target in targets]),
+        visibility=visibility,
         is_perturbed=perturbed.is_perturbed,
         drone_offsets_m=perturbed.drone_offsets_m,
         rotation_offsets_deg=perturbed.rotation_offsets_deg,

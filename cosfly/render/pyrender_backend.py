@@ -156,9 +156,8 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndar
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
-    tags = _tags(
-        kinds, np.append(contract.instance_ids(box_map).ids, NO_INSTANCE), np.append(contract.layers_of(box_map), 0)
-    )
+    ids = np.append(contract.instance_ids(box_map), np.uint16(NO_INSTANCE))
+    tags = _tags(kinds, ids, np.append(contract.layers_of(box_map), 0))
     is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])
     forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))

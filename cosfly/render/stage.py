@@ -23,7 +23,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.frames import Camera, FrameFile, Look
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.render.contract import PERSON_ID, SHARED_ID, InstanceIds, Renderer, instance_ids
+from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
@@ -178,9 +178,9 @@ def run(
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
         raise stage.nothing_kept(tally, expected="a flight that the planner kept")
-    instances = instance_ids(box_map)
-    if instances.num_shared:
-        log.warning("render: %d boxes share the instance id %d: ids have 16 bits", instances.num_shared, SHARED_ID)
+    ids_record = _ids_record(box_map)
+    if num_shared := ids_record["num_shared"]:
+        log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town = cfg.town or folder_name(box_map.name)
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track)) for number, trace in passed for track in cfg.tracks
@@ -188,7 +188,7 @@ def run(
     arguments = (cfg, boxes, simplified, traces, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, label="render")
     ids_file = out / town / "instance_ids.json"
-    write_json(ids_file, _ids_record(box_map, instances), indent=None)
+    write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)
     results = [record.result for record in finished.kept]
     outputs = [out / result["folder"] / name for result in results for name in ("trajectory.json", CHECKSUMS)]
@@ -200,28 +200,27 @@ def run(
         num_frames=sum(result["num_frames"] for result in results),
         num_traces=len(all_traces),
         num_traces_not_rendered=len(all_traces) - len(passed),
-        num_boxes_sharing_an_id=instances.num_shared,
+        num_boxes_sharing_an_id=num_shared,
     )
     return out
 
 
 def _check_ids(traces: list[DroneTrace], path: Path) -> None:
-    ids = [trace.path_id for trace in traces]
-    twice = sorted({i for i in ids if ids.count(i) > 1})
-    if twice:
+    if twice := sorted(i for i, n in Counter(trace.path_id for trace in traces).items() if n > 1):
         raise InputError("two flights have one id", where=path, got=twice[0], expected="unique ids")
 
 
-def _ids_record(box_map: BoxMap, instances: InstanceIds) -> dict:
+def _ids_record(box_map: BoxMap) -> dict:
     """Which box an id of `instance.png` stands for: rows of (instance id, box id)."""
+    ids = instance_ids(box_map)
     return {
         "schema": IDS_SCHEMA,
         "schema_version": IDS_VERSION,
         "person": PERSON_ID,
         "shared": SHARED_ID,
-        "num_shared": instances.num_shared,
-        "are_box_ids": instances.are_box_ids,
-        "boxes": [[int(a), int(b)] for a, b in zip(instances.ids, box_map.ids, strict=True) if a != SHARED_ID],
+        "num_shared": int((ids == SHARED_ID).sum()),
+        "are_box_ids": has_own_ids(box_map),
+        "boxes": [[int(a), int(b)] for a, b in zip(ids, box_map.ids, strict=True) if a != SHARED_ID],
     }
 
 

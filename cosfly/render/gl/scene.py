@@ -28,7 +28,7 @@ class Scene:
 
 def build_scene(box_map: BoxMap) -> Scene:
     """Turn a map into drawable parts, with a ground plane under everything."""
-    origin, all_ids = scene_origin(box_map), instance_ids(box_map).ids
+    origin, all_ids = scene_origin(box_map), instance_ids(box_map)
     builder = PartBuilder()
     has_paint = bool((box_map.kinds == KINDS["RoadLines"]).any())
     for kind in np.unique(box_map.kinds):
