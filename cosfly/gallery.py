@@ -63,8 +63,7 @@ def _spread(n: int, num: int) -> list[int]:
 
 
 def _frames_with(flight: Flight, *names: str) -> list[int]:
-    missing = set(flight.missing_frames(names))
-    frames = [i for i in range(len(flight)) if i not in missing]
+    frames = sorted(set(range(len(flight))) - set(flight.missing_frames(names)))
     if not frames:
         raise InputError("the flight has no frames to show", where=flight.folder, expected=", ".join(names))
     return frames
@@ -75,14 +74,14 @@ def _row(flight: Flight) -> np.ndarray:
     tiles = []
     for i in (frames[k] for k in _spread(len(frames), NUM_RGB_TILES)):
         picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
-        tiles.append(_labelled(_tile(picture), f"t = {flight.time_s[i]:.1f} s"))
+        tiles.append(_tile(picture, f"t = {flight.time_s[i]:.1f} s"))
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
     middle = flight.frame_folder(frames[len(frames) // 2])
     for view in ("depth", "segmentation"):
         if (middle / VIEW_FILES[view]).is_file():
-            tiles.append(_labelled(_tile(read_view(middle, view)), view))
+            tiles.append(_tile(read_view(middle, view), view))
         else:
-            tiles.append(_labelled(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
+            tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
     text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {flight.camera.fov_deg:.0f} deg   {visible}"
@@ -93,17 +92,12 @@ def _row(flight: Flight) -> np.ndarray:
 def _heading(num_flights: int, width_px: int) -> np.ndarray:
     strip = np.full((26, width_px, 3), 60, np.uint8)
     shown = "" if num_flights <= MOST_ROWS else f", the first {MOST_ROWS} shown"
-    text = f"{num_flights} flights{shown}"
-    draw_text(strip, text, 8, 18, 0.5, (255, 255, 255))
+    draw_text(strip, f"{num_flights} flights{shown}", 8, 18, 0.5, (255, 255, 255))
     return strip
 
 
-def _tile(picture: np.ndarray) -> np.ndarray:
-    return cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
-
-
-def _labelled(tile: np.ndarray, text: str) -> np.ndarray:
-    tile = tile.copy()
+def _tile(picture: np.ndarray, text: str) -> np.ndarray:
+    tile = cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
     draw_text(tile, text, 6, TILE_PX[1] - 8, 0.42, (255, 255, 255), halo=(0, 0, 0))
     return tile
 
@@ -125,9 +119,8 @@ def _preview(flight: Flight, i: int, width_px: int) -> Image.Image:
 
 def _gif(frames: list[Image.Image]) -> bytes:
     # One palette for all frames: colours do not flicker, and undithered areas compress better.
-    columns = [frames[i] for i in _spread(len(frames), 6)]
-    sample = Image.fromarray(np.vstack([np.asarray(f) for f in columns]))
-    palette = sample.quantize(128)
+    sample = np.vstack([np.asarray(frames[i]) for i in _spread(len(frames), 6)])
+    palette = Image.fromarray(sample).quantize(128)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     buffer = io.BytesIO()
     frames[0].save(

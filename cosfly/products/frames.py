@@ -93,12 +93,8 @@ class TreeAngles(_Group):
     roll: float
 
 
-class TreePose(TreePosition):
-    """The camera's pose in the tree's axes, m and degrees."""
-
-    pitch: float
-    yaw: float
-    roll: float
+class TreePose(TreeAngles, TreePosition):
+    """The camera's pose in the tree's axes, m and degrees: x, y, z, pitch, yaw, roll."""
 
 
 def tree_position(position_m: np.ndarray) -> TreePosition:

@@ -12,7 +12,6 @@ project sees the right-handed frame. Keys that we do not know are kept in `Fligh
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,16 +76,9 @@ class Flight:
         assert self.folder is not None
         return self.folder / frame_name(index)
 
-    def missing_frames(self, files: Iterable[str] = FRAME_FILES) -> list[int]:
+    def missing_frames(self, names: tuple[str, ...] = FRAME_FILES) -> list[int]:
         """Indices of the points that lack one of the files."""
-        names = tuple(files)
         return [i for i in range(len(self)) if not all((self.frame_folder(i) / name).is_file() for name in names)]
-
-
-COLUMNS = (
-    "time_s", "positions_m", "rotations_deg", "targets_m", "target_in_view", "target_visible", "target_depth_m", "target_uv",
-    "target_bbox", "visibility", "is_perturbed", "drone_offsets_m", "rotation_offsets_deg", "target_offsets_m",
-)  # fmt: skip
 
 
 def sample_id(flight_id: str, frame_index: int) -> str:
@@ -245,11 +237,9 @@ class _Reader:
 
     def time(self, i: int, point: dict) -> float:
         timing = _object(point, "timing")
-        name = "trace_timestamp"
-        if not self.strict and name not in timing:
-            name = "timestamp"
-            timing = timing if name in timing else point
-        return self.number(f"points[{i}].timing", timing, name)
+        if self.strict or "trace_timestamp" in timing:
+            return self.number(f"points[{i}].timing", timing, "trace_timestamp")
+        return self.number(f"points[{i}].timing", timing if "timestamp" in timing else point, "timestamp")
 
     def waypoints(self, points: list[dict], positions: np.ndarray) -> None:
         for i, point in enumerate(points):
@@ -305,8 +295,8 @@ def _numbers(groups: list[dict], key: str) -> np.ndarray:
     return np.array([_vector([group.get(key)], (key,))[0] for group in groups])
 
 
-def _flags(groups: list[dict], key: str, default_key: str | None = None) -> np.ndarray:
-    return np.array([bool(group.get(key, group.get(default_key, False) if default_key else False)) for group in groups])
+def _flags(groups: list[dict], key: str, default_key: str = "") -> np.ndarray:
+    return np.array([bool(group.get(key, group.get(default_key, False))) for group in groups])
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -337,26 +327,21 @@ def write_flight(folder: Path, flight: Flight) -> None:
         "is_original": flight.is_original,
     }
     positions = mirror_positions(flight.positions_m) + 0.0
-    rotations = mirror_rotations(flight.rotations_deg) + 0.0
-    mirrored = {
-        ("target", "world_location"): mirror_positions(flight.targets_m),
-        ("target", "image_uv"): flight.target_uv,
-        ("target", "bbox_2d"): flight.target_bbox,
-        ("perturbation", "drone_position"): mirror_positions(flight.drone_offsets_m),
-        ("perturbation", "drone_rotation"): mirror_rotations(flight.rotation_offsets_deg),
-        ("perturbation", "target_position"): mirror_positions(flight.target_offsets_m),
-    }
+    poses = np.hstack([positions, mirror_rotations(flight.rotations_deg) + 0.0]).tolist()
+    vectors: list[tuple[str, str, tuple[str, ...], np.ndarray]] = [
+        ("target", "world_location", XYZ, mirror_positions(flight.targets_m)),
+        ("target", "image_uv", (), flight.target_uv),
+        ("target", "bbox_2d", BBOX, flight.target_bbox),
+        ("perturbation", "drone_position", XYZ, mirror_positions(flight.drone_offsets_m)),
+        ("perturbation", "drone_rotation", ANGLES, mirror_rotations(flight.rotation_offsets_deg)),
+        ("perturbation", "target_position", XYZ, mirror_positions(flight.target_offsets_m)),
+    ]
     for i, point in enumerate(points):
         point["index"] = i
         point["is_perturbed"] = bool(flight.is_perturbed[i])
-        point["timing"] = {
-            "sim_timestamp": float(flight.time_s[i]),
-            **point.get("timing", {}),
-            "trace_timestamp": float(flight.time_s[i]),
-        }
-        pose = dict(zip(XYZ, positions[i].tolist(), strict=True))
-        pose.update(zip(ANGLES, rotations[i].tolist(), strict=True))
-        point["drone_pose"] = {**point.get("drone_pose", {}), **pose}
+        time_s = float(flight.time_s[i])
+        point["timing"] = {"sim_timestamp": time_s, **point.get("timing", {}), "trace_timestamp": time_s}
+        point["drone_pose"] = {**point.get("drone_pose", {}), **dict(zip(XYZ + ANGLES, poses[i], strict=True))}
         following = positions[i + 1].tolist() if i + 1 < len(points) else None
         point["nav_waypoint"] = {**point.get("nav_waypoint", {}), "t1_world": following}
         target = point.setdefault("target", {})
@@ -367,26 +352,16 @@ def write_flight(folder: Path, flight: Flight) -> None:
         if not np.isnan(flight.visibility[i]) or "visibility" in target:
             target["visibility"] = _number_or_none(flight.visibility[i])
         point.setdefault("perturbation", {})
-        for (group, key), values in mirrored.items():
-            _put_vector(point[group], key, values[i])
+        for group, key, names, values in vectors:
+            _put_vector(point[group], key, names, values[i])
     raw["points"] = points
     write_json(folder / "trajectory.json", raw)
 
 
-_VECTOR_NAMES = {
-    "world_location": XYZ, "image_uv": None, "bbox_2d": BBOX,
-    "drone_position": XYZ, "drone_rotation": ANGLES, "target_position": XYZ,
-}  # fmt: skip
-
-
-def _put_vector(group: dict, key: str, values: np.ndarray) -> None:
+def _put_vector(group: dict, key: str, names: tuple[str, ...], values: np.ndarray) -> None:
     """Set a vector in the form that the file uses already (object or list); ours is the object where it has names."""
-    names = _VECTOR_NAMES[key]
-    if np.isnan(values).any():
-        group[key] = None
-        return
-    numbers = (values + 0.0).tolist()
-    if isinstance(group.get(key), list) or names is None:
+    numbers = None if np.isnan(values).any() else (values + 0.0).tolist()
+    if numbers is None or isinstance(group.get(key), list) or not names:
         group[key] = numbers
     else:
         group[key] = dict(zip(names, numbers, strict=True))

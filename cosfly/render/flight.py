@@ -68,8 +68,8 @@ def render_flight(
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
     annotations: list[FrameMeta] = []
     visibility: list[float] = []
-    digests: dict[str, str] = {}
     pending: list[Future] = []
+    digests: dict[str, str] = {}
     with ThreadPoolExecutor(num_threads) as pool:
         for i in range(len(script.time_s)):
             pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
@@ -77,10 +77,8 @@ def render_flight(
             frame = renderer.render(pose, script.camera.intrinsic, person)
             view = view_target(target, pose, script.camera)
             score, num_person_px = rendered_visibility(frame, target, view, pose, script.camera)
-            # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
-            is_visible = view.in_view and score > writing.visible_threshold and num_person_px > 0
             visibility.append(score)
-            annotations.append(_annotation(script, i, view, score, num_person_px, is_visible))
+            annotations.append(_annotation(script, i, view, score, num_person_px, writing.visible_threshold))
             pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, annotations[i], writing))
             while len(pending) >= FRAMES_IN_FLIGHT:
                 digests.update(pending.pop(0).result())
@@ -120,7 +118,7 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
 
 
 def _annotation(
-    script: FlightScript, i: int, view: TargetView, visibility: float, num_person_px: int, is_visible: bool
+    script: FlightScript, i: int, view: TargetView, visibility: float, num_person_px: int, threshold: float
 ) -> FrameMeta:
     perturbed = script.perturbed
     return FrameMeta(
@@ -140,7 +138,8 @@ def _annotation(
             bbox_2d=_list_or_none(view.bbox_px),
             depth_m=view.depth_m,
             in_view=view.in_view,
-            visible=is_visible,
+            # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
+            visible=view.in_view and visibility > threshold and num_person_px > 0,
             visibility=round(visibility, 6),
             num_pixels=num_person_px,
         ),

@@ -60,9 +60,6 @@ class _Figure:
         turn, half = np.stack([x, np.cross(z, x), z], axis=1), (radius, radius, length / 2.0 + 0.6 * radius)
         self.parts.append((meshes.LIMB, (low + high) / 2.0, turn, half, color))
 
-    def bone(self, low: np.ndarray, high: np.ndarray, radius: float) -> None:
-        self.bones.append((low, high, radius))
-
 
 def make_body(person: PosedPerson) -> Body:
     """Build the figure of a posed person."""
@@ -94,7 +91,7 @@ def _leg(figure: _Figure, side: float, phase: float, swing: float, clothes: Clot
     toe = 0.5 * (angle - bend)
     center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
     figure.solid(meshes.ROUNDED, center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
-    figure.bone(ankle - [0, 0, 0.05], hip, 0.085)
+    figure.bones.append((ankle - [0, 0, 0.05], hip, 0.085))
     return ankle
 
 
@@ -106,7 +103,7 @@ def _arm(figure: _Figure, side: float, phase: float, swing: float, clothes: Clot
     figure.limb(elbow, shoulder, 0.058, clothes.shirt)
     figure.limb(wrist, elbow, 0.041, clothes.skin)
     figure.solid(meshes.SPHERE, (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
-    figure.bone(wrist, shoulder, 0.05)
+    figure.bones.append((wrist, shoulder, 0.05))
 
 
 def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
@@ -118,8 +115,8 @@ def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
     figure.solid(meshes.SPHERE, [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], clothes.skin)
     figure.solid(meshes.SPHERE, [0.008, 0.0, 1.70], [0.105, 0.088, 0.10], clothes.hair)
     figure.solid(meshes.SPHERE, [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], clothes.skin)
-    figure.bone(np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17)
-    figure.bone(np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.095)
+    figure.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
+    figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.095))
 
 
 def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.ndarray) -> Body:

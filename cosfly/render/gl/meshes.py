@@ -41,16 +41,12 @@ def prism(top_x: float, top_y: float) -> Mesh:
     corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=np.float64)
     corners[4:, 0] *= top_x
     corners[4:, 1] *= top_y
-    vertices: list[list[float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
-    for face in faces:
-        quad = corners[list(face)]
-        normal = np.cross(quad[1] - quad[0], quad[2] - quad[0])
-        first = len(vertices)
-        vertices += [[*point, *(normal / np.linalg.norm(normal))] for point in quad]
-        triangles += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
-    return Mesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
+    quads = corners[[(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]]
+    normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    vertices = np.concatenate([quads, np.repeat(normals[:, None], 4, axis=1)], axis=-1).reshape(-1, 6)
+    triangles = 4 * np.repeat(np.arange(6), 2)[:, None] + np.tile([(0, 1, 2), (0, 2, 3)], (6, 1))
+    return Mesh(vertices.astype(np.float32), triangles.astype(np.int32))
 
 
 def revolved(profile: list[tuple[float, float]], num_sides: int) -> Mesh:
@@ -83,14 +79,8 @@ def superquadric(exponent: float, num_sides: int, num_rings: int) -> Mesh:
 
     def surface(e: float) -> np.ndarray:
         ring = power(np.cos(latitude), e)
-        return np.stack(
-            [
-                ring * power(np.cos(longitude), e),
-                ring * power(np.sin(longitude), e),
-                np.broadcast_to(power(np.sin(latitude), e), (num_rings + 1, num_sides + 1)),
-            ],
-            axis=-1,
-        ).reshape(-1, 3)
+        x, y, z = ring * power(np.cos(longitude), e), ring * power(np.sin(longitude), e), power(np.sin(latitude), e)
+        return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
 
     normals = surface(2.0 - exponent)  # the superquadric's normal has the complementary exponent
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
