@@ -75,8 +75,8 @@ def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
         rgb = read_rgb(frame)
     except InputError:
         return None
-    size = (width_px, max(1, round(width_px * rgb.shape[0] / rgb.shape[1])))
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
+    small = cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA)
     return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")
 
 

@@ -7,6 +7,7 @@ or the person out of the picture, is not made, and the frame says so.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -77,9 +78,8 @@ class Perturbed:
     def nothing(cls, planned: Poses) -> Perturbed:
         """The poses as they were planned."""
         n = len(planned.positions_m)
-        poses = Poses(planned.positions_m.copy(), planned.rotations_deg.copy(), planned.targets_m.copy())
         states = [{"position": "none", "rotation": "none"} for _ in range(n)]
-        return cls(poses, np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
+        return cls(copy.deepcopy(planned), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
 
     @property
     def is_perturbed(self) -> np.ndarray:

@@ -5,7 +5,6 @@ Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as floa
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,6 @@ from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import Body, make_body
 from cosfly.render.gl.parts import PART
 from cosfly.render.gl.scene import Scene, build_scene
-
-log = logging.getLogger(__name__)
 
 SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
@@ -67,9 +64,8 @@ class GlRenderer:
 
     def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
         self.context = open_context()
-        self.device = ", ".join(
-            ["EGL", *(str(self.context.info[f"GL_{n}"]) for n in ("VENDOR", "RENDERER", "VERSION"))]
-        )
+        driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
+        self.device = ", ".join(("EGL", *driver))
         self.scene, self.width_px, self.height_px, self.look = build_scene(box_map), width_px, height_px, look
         with self.context:
             self._make_programs()
@@ -128,10 +124,8 @@ class GlRenderer:
                     ("in_center", "in_half", "in_quaternion", "in_color", "in_tag", "in_bias"),
                 ),
             ]  # fmt: skip
-            self._arrays[material, mesh] = (
-                self.context.vertex_array(program, content, index_buffer=triangles),
-                instances,
-            )
+            array = self.context.vertex_array(program, content, index_buffer=triangles)
+            self._arrays[material, mesh] = array, instances
         return self._arrays[material, mesh]
 
     # --- what holds for a whole flight ---
@@ -153,10 +147,8 @@ class GlRenderer:
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
-        away = (self.scene.parts.object_centers[casting] - middle) @ sun
-        depth_half = float(
-            (np.abs(away) + self.scene.parts.object_radii[casting]).max(initial=half)
-        )  # towers cast from afar
+        away = np.abs((self.scene.parts.object_centers[casting] - middle) @ sun)
+        depth_half = float((away + self.scene.parts.object_radii[casting]).max(initial=half))  # towers cast from afar
         clip_from_world = np.eye(4)
         clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
         clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
@@ -222,10 +214,8 @@ class GlRenderer:
             return self._read()
 
     def _set_camera(self, world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray) -> None:
-        lens = np.array([intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]])
-        offset = np.mod(self.scene.origin_m[:2], PATTERN_M)
         common = {
-            "lens": lens,
+            "lens": np.array([*np.diag(intrinsic)[:2], *intrinsic[:2, 2]]),
             "image_size": np.array([self.width_px, self.height_px]),
             "sun_direction": self.look.sun_direction(),
             "haze_m": self.look.haze_m,
@@ -234,7 +224,7 @@ class GlRenderer:
             "camera_from_world": world_from_camera.T,
             "world_from_camera": world_from_camera,
             "camera_position": eye,
-            "world_offset": offset,
+            "world_offset": np.mod(self.scene.origin_m[:2], PATTERN_M),
             "ground_z": self.scene.plane_z_m - self.scene.origin_m[2],
             "shadow_map": 0,
             "height_map": 1,
@@ -266,12 +256,12 @@ class GlRenderer:
         in_camera = (parts.object_centers - eye.astype(np.float32)) @ world_from_camera.astype(np.float32)
         x, y, z = in_camera.T
         radius = parts.object_radii
-        f = float(intrinsic[0, 0])
-        tan_x, tan_y = _largest_tangents(intrinsic, self.width_px, self.height_px)
+        middle, size = intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        tan_x, tan_y = np.maximum(middle, size - middle) / np.diag(intrinsic)[:2]  # the largest in the image
         inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
         inside &= np.abs(x) - z * tan_x < radius * np.sqrt(1.0 + tan_x**2)
         inside &= np.abs(y) - z * tan_y < radius * np.sqrt(1.0 + tan_y**2)
-        size_px = f * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)
+        size_px = float(intrinsic[0, 0]) * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)
         inside &= (size_px >= np.maximum(parts.min_px, SMALLEST_PX)) & (size_px < parts.max_px)
         rows = np.flatnonzero(inside)
         return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
@@ -292,10 +282,7 @@ class GlRenderer:
         if len(records) == 0:
             return
         array, instances = self._array(material, mesh)
-        if instances.size < records.nbytes:
-            instances.orphan(2 * records.nbytes)
-        else:
-            instances.orphan()
+        instances.orphan(2 * records.nbytes if instances.size < records.nbytes else -1)  # -1: as it was
         instances.write(records.tobytes())
         array.render(instances=len(records))
 
@@ -306,12 +293,8 @@ class GlRenderer:
         self._image.read_into(color, components=4, attachment=0)
         self._image.read_into(depth, components=1, attachment=1, dtype="f4")
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")
-        return Frame(
-            smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB)),
-            depth,
-            (tag & 0xFF).astype(np.uint8),
-            (tag >> 16).astype(np.uint16),
-        )
+        rgb = smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB))
+        return Frame(rgb, depth, (tag & 0xFF).astype(np.uint8), (tag >> 16).astype(np.uint16))
 
     def close(self) -> None:
         self.context.release()
@@ -342,11 +325,6 @@ def _attributes(program: Any, buffer: Any, layout: str, names: tuple[str, ...]) 
     used = [name in program for name in names]
     padded = [kind if use else f"{4 * int(kind[:-1])}x" for kind, use in zip(kinds, used, strict=True)]
     return (buffer, " ".join(padded) + suffix, *(name for name, use in zip(names, used, strict=True) if use))
-
-
-def _largest_tangents(intrinsic: np.ndarray, width_px: int, height_px: int) -> tuple[float, float]:
-    cx, cy = intrinsic[0, 2], intrinsic[1, 2]
-    return max(cx, width_px - cx) / intrinsic[0, 0], max(cy, height_px - cy) / intrinsic[1, 1]
 
 
 def _set(program: Any, name: str, value: Any) -> None:

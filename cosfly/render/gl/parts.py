@@ -85,7 +85,7 @@ class PartBuilder:
     _parts: list[Parts] = field(default_factory=list)
 
     def add(
-        self, boxes: Boxes, mesh: int, half: np.ndarray, material: int, color: np.ndarray, *,
+        self, boxes: Boxes, mesh: int, half: np.ndarray, material: int, color: np.ndarray | tuple[float, ...], *,
         offset: np.ndarray | None = None, turn: np.ndarray | None = None, min_px: float = 0.0, max_px: float = NEVER_PX,
         layer: int | None = None,
     ) -> None:  # fmt: skip

@@ -21,7 +21,7 @@ BUILDING_COLORS = np.array([
     [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58], [0.42, 0.40, 0.38],
     [0.70, 0.54, 0.36], [0.50, 0.45, 0.40], [0.62, 0.46, 0.36], [0.78, 0.75, 0.69], [0.38, 0.43, 0.47], [0.52, 0.28, 0.20],
 ])  # fmt: skip
-BARK_COLOR = np.array([0.16, 0.11, 0.075])
+BARK_COLOR = (0.16, 0.11, 0.075)
 CAR_COLORS = np.array([
     [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26], [0.23, 0.25, 0.27],
     [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
@@ -36,7 +36,7 @@ def _box(material: int, color: tuple[float, float, float], layer: int | None = N
 
     def build(builder: PartBuilder, boxes: Boxes) -> None:
         boxes = boxes.lengthwise()
-        builder.add(boxes, meshes.BOX, boxes.half, material, np.array(color), layer=layer)
+        builder.add(boxes, meshes.BOX, boxes.half, material, color, layer=layer)
 
     return build
 
@@ -45,7 +45,7 @@ def _sidewalks(builder: PartBuilder, boxes: Boxes) -> None:
     """Pavement; the shader draws a kerb along the open edges, which stand in the seed."""
     boxes = boxes.lengthwise()
     boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
-    builder.add(boxes, meshes.BOX, boxes.half, parts.SIDEWALK, np.array([0.36, 0.345, 0.32]), layer=LAYERS["Sidewalks"])
+    builder.add(boxes, meshes.BOX, boxes.half, parts.SIDEWALK, (0.36, 0.345, 0.32), layer=LAYERS["Sidewalks"])
 
 
 def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
@@ -119,8 +119,8 @@ def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
 def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> None:
     """Foliage from `crown_low` (n,), in units of the half height, to the top: blobs inside the inscribed ellipsoid."""
     h = boxes.half
-    crown_half = h * np.stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0], axis=1)
-    crown_center = h * np.stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0], axis=1)
+    crown_half = h * np.column_stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0])
+    crown_center = h * np.column_stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0])
     builder.add(boxes, meshes.BLOB_COARSE, crown_half, parts.LEAVES, leaf, offset=crown_center, max_px=FAR_PX)
     builder.add(boxes, meshes.BLOB_FINE, crown_half * 0.74, parts.LEAVES, leaf, offset=crown_center, min_px=FAR_PX)
     for number in range(7):
@@ -128,7 +128,7 @@ def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.
         angle = 2.0 * np.pi * (number / 6.0 + boxes.chance(30)) + 0.5 * boxes.chance(20 + number)
         lift = np.where(number == 6, 0.9, 0.62 * np.sin(2.6 * number + 6.28 * boxes.chance(31)))
         flat = np.sqrt(np.maximum(0.0, 1.0 - lift**2))
-        direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), lift], axis=1)
+        direction = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), lift])
         offset = crown_center + crown_half * direction * (1.0 - radius)[:, None]
         shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
         builder.add(boxes, meshes.BLOB, crown_half * radius[:, None], parts.LEAVES, shade, offset=offset, min_px=FAR_PX)
@@ -147,8 +147,8 @@ def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
 def _stems(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
     """A stem from each box's bottom to `top` (n,), in units of the half height."""
     h, radius = boxes.half, contract.stem_radius_m(boxes.half)
-    size = np.stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0], axis=1)
-    offset = np.stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0], axis=1)
+    size = np.column_stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0])
+    offset = np.column_stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0])
     builder.add(boxes, meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
 
 
@@ -158,11 +158,11 @@ _WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # 
 def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float) -> None:
     h = boxes.half
     thick = 0.16 * h[:, 1]
-    size = np.stack([radius, radius, thick], axis=1)
+    size = np.column_stack([radius, radius, thick])
     for front in (-along, along):
         for side in (-1.0, 1.0):
-            offset = np.stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]], axis=1)
-            builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, np.array([0.02, 0.02, 0.022]), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
+            offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
+            builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, (0.02, 0.02, 0.022), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
 
 
 def _cars(builder: PartBuilder, boxes: Boxes) -> None:
@@ -194,25 +194,21 @@ def _two_wheelers(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     h = boxes.half
     radius = np.minimum(0.4 * h[:, 0], 0.62 * h[:, 2])
-    size = np.stack([radius, radius, np.minimum(0.05, h[:, 1])], axis=1)
+    size = np.column_stack([radius, radius, np.minimum(0.05, h[:, 1])])
     for front in (-1.0, 1.0):
-        offset = np.stack([front * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]], axis=1)
-        builder.add(
-            boxes, meshes.CYLINDER, size, parts.RUBBER, np.array([0.03, 0.03, 0.03]), offset=offset, turn=_WHEEL_TURN
-        )
+        offset = np.column_stack([front * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]])
+        builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, (0.03, 0.03, 0.03), offset=offset, turn=_WHEEL_TURN)
     builder.add(
         boxes, meshes.ROUNDED, h * [0.5, 0.25, 0.22], parts.CAR_PAINT, boxes.pick(CAR_COLORS), offset=h * [0, 0, 0.1]
     )
-    builder.add(
-        boxes, meshes.BOX, h * [0.06, 0.95, 0.06], parts.METAL, np.array([0.1, 0.1, 0.1]), offset=h * [0.45, 0, 0.9]
-    )
+    builder.add(boxes, meshes.BOX, h * [0.06, 0.95, 0.06], parts.METAL, (0.1, 0.1, 0.1), offset=h * [0.45, 0, 0.9])
 
 
 def _pole(builder: PartBuilder, boxes: Boxes, most_m: float = 0.1) -> None:
     h = boxes.half
     radius = np.minimum(np.minimum(h[:, 0], h[:, 1]), most_m)
-    size = np.stack([radius, radius, 0.985 * h[:, 2]], axis=1)
-    builder.add(boxes, meshes.CYLINDER, size, parts.METAL, np.array([0.17, 0.18, 0.18]), offset=h * [0, 0, -0.015])
+    size = np.column_stack([radius, radius, 0.985 * h[:, 2]])
+    builder.add(boxes, meshes.CYLINDER, size, parts.METAL, (0.17, 0.18, 0.18), offset=h * [0, 0, -0.015])
 
 
 def _poles(builder: PartBuilder, boxes: Boxes) -> None:
@@ -220,31 +216,30 @@ def _poles(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     is_head = boxes.half[:, 2] < boxes.half[:, 0]  # maps that keep arm and head apart from the pole
     heads = boxes.select(is_head)
-    builder.add(heads, meshes.ROUNDED, heads.half, parts.LAMP, np.array([0.17, 0.17, 0.17]))
+    builder.add(heads, meshes.ROUNDED, heads.half, parts.LAMP, (0.17, 0.17, 0.17))
     boxes = boxes.select(~is_head)
     _pole(builder, boxes)
     lamps = boxes.select(boxes.half[:, 2] > 1.2)
     h = lamps.half
-    grey = np.array([0.2, 0.2, 0.2])
-    size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)], axis=1)
-    builder.add(lamps, meshes.BOX, size, parts.METAL, grey, offset=h * [0, 0, 0.96], min_px=FAR_PX)
+    size = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)])
+    builder.add(lamps, meshes.BOX, size, parts.METAL, (0.2, 0.2, 0.2), offset=h * [0, 0, 0.96], min_px=FAR_PX)
     head = np.stack(
         [np.minimum(0.9 * h[:, 0], 0.35), np.minimum(h[:, 1], 0.16), np.minimum(0.04 * h[:, 2], 0.1)], axis=1
     )
     for side in (-1.0, 1.0):
-        offset = np.stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]], axis=1)
-        builder.add(lamps, meshes.ROUNDED, head, parts.LAMP, np.array([0.75, 0.74, 0.68]), offset=offset)
+        offset = np.column_stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]])
+        builder.add(lamps, meshes.ROUNDED, head, parts.LAMP, (0.75, 0.74, 0.68), offset=offset)
 
 
 def _traffic_lights(builder: PartBuilder, boxes: Boxes) -> None:
     boxes = boxes.lengthwise()
     h = boxes.half
     _pole(builder, boxes)
-    head = np.stack([np.minimum(h[:, 0], 0.22), np.minimum(h[:, 1], 0.2), np.minimum(0.35 * h[:, 2], 0.55)], axis=1)
-    offset = np.stack([h[:, 0] - head[:, 0], 0 * h[:, 1], h[:, 2] - head[:, 2]], axis=1)
-    arm = np.stack([h[:, 0], np.minimum(h[:, 1], 0.05), np.minimum(0.05 * h[:, 2], 0.05)], axis=1)
-    builder.add(boxes, meshes.BOX, arm, parts.METAL, np.array([0.14, 0.14, 0.14]), offset=h * [0, 0, 0.9])
-    builder.add(boxes, meshes.BOX, head, parts.SIGNAL, np.array([0.03, 0.035, 0.03]), offset=offset)
+    head = np.column_stack([np.minimum(h[:, 0], 0.22), np.minimum(h[:, 1], 0.2), np.minimum(0.35 * h[:, 2], 0.55)])
+    offset = np.column_stack([h[:, 0] - head[:, 0], 0 * h[:, 1], h[:, 2] - head[:, 2]])
+    arm = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.05), np.minimum(0.05 * h[:, 2], 0.05)])
+    builder.add(boxes, meshes.BOX, arm, parts.METAL, (0.14, 0.14, 0.14), offset=h * [0, 0, 0.9])
+    builder.add(boxes, meshes.BOX, head, parts.SIGNAL, (0.03, 0.035, 0.03), offset=offset)
 
 
 def _signs(builder: PartBuilder, boxes: Boxes) -> None:
@@ -252,8 +247,8 @@ def _signs(builder: PartBuilder, boxes: Boxes) -> None:
     h = boxes.half
     _pole(builder, boxes, 0.04)
     colors = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
-    size = np.stack([h[:, 0], np.minimum(h[:, 1], 0.03), np.minimum(h[:, 0], 0.5 * h[:, 2])], axis=1)
-    offset = np.stack([0 * h[:, 0], 0 * h[:, 1], h[:, 2] - size[:, 2]], axis=1)
+    size = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.03), np.minimum(h[:, 0], 0.5 * h[:, 2])])
+    offset = np.column_stack([0 * h[:, 0], 0 * h[:, 1], h[:, 2] - size[:, 2]])
     builder.add(boxes, meshes.BOX, size, parts.METAL, boxes.pick(colors), offset=offset)
 
 
@@ -261,13 +256,9 @@ def _bystanders(builder: PartBuilder, boxes: Boxes) -> None:
     """People of the map stand still: trousers, coat, head."""
     h = boxes.half
     coats = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
-    builder.add(
-        boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, np.array([0.05, 0.06, 0.09]), offset=h * [0, 0, -0.54]
-    )
+    builder.add(boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54])
     builder.add(boxes, meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, boxes.pick(coats), offset=h * [0, 0, 0.28])
-    builder.add(
-        boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, np.array([0.5, 0.32, 0.22]), offset=h * [0, 0, 0.82]
-    )
+    builder.add(boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, (0.5, 0.32, 0.22), offset=h * [0, 0, 0.82])
 
 
 BUILDERS = {
