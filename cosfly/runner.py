@@ -188,7 +188,7 @@ def _no_interrupt() -> Iterator[None]:
 
 
 _work: Work | None = None  # this worker process's function
-_start_error: CosflyError | None = None
+_start_error: Exception | None = None
 
 
 def _start_worker(make_worker: Callable, worker_args: tuple, logs: Any, level: int) -> None:
@@ -200,8 +200,8 @@ def _start_worker(make_worker: Callable, worker_args: tuple, logs: Any, level: i
     root.setLevel(level)
     try:
         _work = make_worker(*worker_args)
-    except CosflyError as error:
-        _start_error = error  # raised by the first item: an error in an initializer would only break the pool
+    except Exception as error:
+        _start_error = error  # raised by the first item: in an initializer it would pass for a worker that was killed
 
 
 def _attempt_in_worker(item: Item) -> ItemRecord:

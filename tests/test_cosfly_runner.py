@@ -103,14 +103,17 @@ def test_a_fatal_error_stops_and_keeps_what_was_done(tmp_path, workers):
     assert all(r["status"] == "kept" for r in stage.journal.read())
 
 
-def make_broken_worker():
-    raise InputError("no such map", where="map.json")
+def make_broken_worker(error: Exception):
+    raise error
 
 
+@pytest.mark.parametrize("error", [InputError("no such map", where="map.json"), KeyError("no such map")])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_an_error_in_the_factory_is_the_stages_error(tmp_path, workers):
-    with pytest.raises(InputError, match="no such map"):
-        run_items(_stage(tmp_path / "s"), _items(("keep", 1), ("keep", 2)), make_broken_worker, workers=workers)
+def test_an_error_in_the_factory_is_the_stages_error(tmp_path, workers, error):
+    """A bug as well: it must not pass for a worker that was killed for want of memory."""
+    arguments = _stage(tmp_path / "s"), _items(("keep", 1), ("keep", 2)), make_broken_worker, (error,)
+    with pytest.raises(type(error), match="no such map"):
+        run_items(*arguments, workers=workers)
 
 
 def test_rng_depends_on_all_three_and_zero_is_a_seed():
