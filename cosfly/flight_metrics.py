@@ -45,36 +45,30 @@ def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
 
 def length_m(positions_m: np.ndarray) -> float:
     """Length of the polyline through (n, 3) points."""
-    return float(np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1).sum())
+    return float(_steps_m(positions_m).sum())
 
 
-def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
+def speed_max_mps(positions_m: np.ndarray) -> float:
     """Largest mean speed between neighbours; 0 for one point."""
-    steps = np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1)
-    return float(steps.max()) / dt_s if len(steps) else 0.0
+    return float(_steps_m(positions_m).max(initial=0.0)) / DT_S
 
 
 def flight_metrics(
-    positions_m: np.ndarray,
-    targets_m: np.ndarray,
-    visibility: np.ndarray,
-    clearances_m: np.ndarray,
-    ground_m: float,
-    dt_s: float = DT_S,
+    positions_m: np.ndarray, targets_m: np.ndarray, visibility: np.ndarray, clearances_m: np.ndarray, ground_m: float
 ) -> dict[str, float]:
     """All figures of one flight, JSON-able, rounded to what a reader can use.
 
     Args:
         positions_m, targets_m: (n, 3). visibility, clearances_m: (n,). ground_m: altitudes are counted from here.
     """
-    accel, jerk = accel_rms(positions_m, dt_s), jerk_rms(positions_m, dt_s)
+    accel, jerk = accel_rms(positions_m), jerk_rms(positions_m)
     altitudes = positions_m[:, 2] - ground_m
     distances = np.linalg.norm(positions_m - targets_m, axis=1)
     figures = {
         "num_points": len(positions_m),
         "length_m": length_m(positions_m),
-        "duration_s": (len(positions_m) - 1) * dt_s,
-        "speed_max_mps": speed_max_mps(positions_m, dt_s),
+        "duration_s": (len(positions_m) - 1) * DT_S,
+        "speed_max_mps": speed_max_mps(positions_m),
         "five_ray_mean": float(visibility.mean()),
         "five_ray_min": float(visibility.min()),
         "blocked_fraction": float((visibility == 0).mean()),
@@ -89,6 +83,10 @@ def flight_metrics(
         "clearance_min_m": float(clearances_m.min()),
     }
     return {name: round(value, 4) for name, value in figures.items()}
+
+
+def _steps_m(positions_m: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1)
 
 
 def _path(positions_m: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -51,9 +50,6 @@ class Report:
 
     def warn(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("warning", code, where, got, expected)
-
-    def extend(self, issues: Iterable[Issue]) -> None:
-        self.issues.extend(issues)
 
     @property
     def is_ok(self) -> bool:
