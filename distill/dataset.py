@@ -192,9 +192,8 @@ def run(
         return out
     excluded = Counter[str]()
     groups = set()
-    for sample in _samples(
-        cfg, captions, data
-    ):  # two passes: the splits must be known before the first line is written
+    # Two passes: the splits must be known before the first line is written.
+    for sample in _samples(cfg, captions, data):
         if isinstance(sample, str):
             excluded[sample] += 1
         else:
@@ -218,10 +217,8 @@ def _write_splits(
     cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, Split]
 ) -> dict[str, dict]:
     """Write the three files and give the counts of each: samples, by language, by decision, repaired."""
-    facts: dict[str, dict] = {}
-    counters: dict[str, dict[str, Counter[str]]] = {
-        split: {"language": Counter(), "decision": Counter(), "repair": Counter()} for split in SPLITS
-    }
+    names = ("language", "decision", "repair")
+    counters: dict[str, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
     with ExitStack() as stack:
         files = {split: stack.enter_context(atomic_file(split_path(out, split))) for split in SPLITS}
         for sample in _samples(cfg, captions, data):
@@ -233,9 +230,10 @@ def _write_splits(
             counter["language"][sample.language] += 1
             counter["decision"][sample.decision] += 1
             counter["repair"][sample.repair or "none"] += 1
-    for split in SPLITS:
-        facts[split] = {
-            "samples": counters[split]["language"].total(),
-            **{f"by_{name}": dict(sorted(counter.items())) for name, counter in counters[split].items()},
+    return {
+        split: {
+            "samples": found["language"].total(),
+            **{f"by_{name}": dict(sorted(counter.items())) for name, counter in found.items()},
         }
-    return facts
+        for split, found in counters.items()
+    }

@@ -255,11 +255,7 @@ def markdown_of(report: Mapping[str, Any]) -> str:
         "|---" * (len(languages) + 1) + "|",
     ]
     lines += [f"| {name} | {' | '.join(cells)} |" for name, cells in rows.items()]
-    lines += [
-        "",
-        f"- intervals: Wilson, {report['confidence']:.0%}",
-        *(f"- {note}" for note in report["notes"]),
-    ]
+    lines += ["", f"- intervals: Wilson, {report['confidence']:.0%}", *(f"- {note}" for note in report["notes"])]
     lines += ["", "| decision | accuracy | most frequent answers |", "|---|---|---|"]
     for action, share in report["all"]["by_decision"].items():
         answers = Counter(report["all"]["confusion"][action]).most_common(3)

@@ -89,14 +89,8 @@ def weight_files(folder: Path) -> dict[str, Path]:
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
         raise InputError("no weights", where=folder, expected="*.safetensors", fix="download the whole model folder")
-    names = [
-        "config.json",
-        "tokenizer.json",
-        "tokenizer_config.json",
-        "preprocessor_config.json",
-        "chat_template.jinja",
-    ]
-    files = [path for path in (folder / name for name in names) if path.is_file()]
+    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json")
+    files = [path for name in (*settings, "chat_template.jinja") if (path := folder / name).is_file()]
     return {f"model/{path.name}": path for path in (*files, *weights)}
 
 

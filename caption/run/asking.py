@@ -31,9 +31,8 @@ log = logging.getLogger(__name__)
 
 ANSWERS, JUDGEMENTS = "answers", "judgements"  # folders
 QUARANTINE, FAILURES = "quarantine.jsonl", "failures.jsonl"
-WAITING_WINDOWS = (
-    16  # begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked
-)
+# Begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked.
+WAITING_WINDOWS = 16
 
 
 @dataclass
@@ -63,15 +62,13 @@ class Asking:
 
     def __init__(self, stage: StageFolder, cfg: CaptionConfig, seed: int, *, retry_failed: bool = False) -> None:
         self.stage, self.cfg, self.seed = stage, cfg, seed
-        self.open: dict[str, _OpenFlight] = {}
+        self.asked = Asked(Tally())
         self.failures: list[Failed] = []  # flights that cannot be read
-        self.unanswered: list[Failed] = []
         self.quarantine = _read_quarantine(stage.path / QUARANTINE)
         self.only = frozenset(self.quarantine) if retry_failed else None
         in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.most_open = in_flight + WAITING_WINDOWS
-        self.failed_in_row = self.num_flights_left = 0
-        self.stopped: str | None = None
+        self.failed_in_row = 0
 
     async def run(self, allotted: list[Allotted]) -> Asked:
         """Ask about every window that has no answer yet.
@@ -79,7 +76,6 @@ class Asking:
         Raises:
             TeacherError: no window would get an answer. What was answered is kept.
         """
-        asked = Asked(Tally(input=len(allotted)))
         guesses = {flight.name: flight.guess_num_windows(self.cfg.window) for flight in allotted}
         self.books = AnswerBook(self.stage.path / ANSWERS), AnswerBook(self.stage.path / JUDGEMENTS)
         answers, judgements = self.books
@@ -94,29 +90,28 @@ class Asking:
                     open_teacher(self.cfg, answers, self.seed, budget, self.only) as teacher,
                     open_judge(self.cfg.judge, self.seed, judgements, budget) as self.judge,
                 ):
-                    await self._ask_all(allotted, teacher, asked.flights, guesses)
+                    await self._ask_all(allotted, teacher, guesses)
         finally:
             self._write_failures()
-        asked.flights.input -= self.num_flights_left
-        asked.unanswered, asked.num_flights_left, asked.stopped = self.unanswered, self.num_flights_left, self.stopped
+        self.asked.flights.input = len(allotted) - self.asked.num_flights_left
         if judgements.totals:
-            asked.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
-        return asked
+            self.asked.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
+        return self.asked
 
-    async def _ask_all(self, allotted: list[Allotted], teacher: Teacher, tally: Tally, guesses: dict[str, int]) -> None:
+    async def _ask_all(self, allotted: list[Allotted], teacher: Teacher, guesses: dict[str, int]) -> None:
         """Keep `concurrency` requests in flight, whatever flight they belong to."""
         running: set[asyncio.Task] = set()
         flights_to_retry = None if self.only is None else {flight_of(sample_id) for sample_id in self.only}
         try:
             for flight in allotted:
                 if flight.part(self.stage.path).exists():
-                    tally.kept += 1
+                    self.asked.flights.kept += 1
                     self.display.skip(guesses[flight.name])
                     continue
-                if self.stopped or (flights_to_retry is not None and flight.name not in flights_to_retry):
-                    self.num_flights_left += 1
+                if self.asked.stopped or (flights_to_retry is not None and flight.name not in flights_to_retry):
+                    self.asked.num_flights_left += 1
                     continue
-                running = await self._ask_flight(flight, teacher, tally, guesses[flight.name], running)
+                running = await self._ask_flight(flight, teacher, guesses[flight.name], running)
             while running:
                 running = await _some_done(running)
         finally:
@@ -125,9 +120,9 @@ class Asking:
             await asyncio.gather(*running, return_exceptions=True)
 
     async def _ask_flight(
-        self, allotted: Allotted, teacher: Teacher, tally: Tally, guessed: int, running: set[asyncio.Task]
+        self, allotted: Allotted, teacher: Teacher, guessed: int, running: set[asyncio.Task]
     ) -> set[asyncio.Task]:
-        flight = self.open[allotted.name] = _OpenFlight(allotted)
+        flight, tally = _OpenFlight(allotted), self.asked.flights
         num_windows = 0
         try:
             for window in allotted.windows(self.cfg):
@@ -136,7 +131,7 @@ class Asking:
                 running.add(asyncio.create_task(self._one(flight, window, teacher)))
                 if len(running) >= self.most_open:
                     running = await _some_done(running)
-                if self.stopped:
+                if self.asked.stopped:
                     flight.has_gap = True
                     break
         except InputError as error:
@@ -148,7 +143,7 @@ class Asking:
                 tally.kept += 1
             else:
                 tally.dropped["too_short"] += 1
-        self.display.correct_total(guessed, num_windows if not self.stopped else guessed)
+        self.display.correct_total(guessed, num_windows if not self.asked.stopped else guessed)
         flight.is_read = True
         self._close_if_done(flight)
         return running
@@ -158,7 +153,7 @@ class Asking:
         try:
             caption = await caption_window(window, teacher, self.cfg, self.judge)
         except BudgetSpent as error:
-            self.stopped = self.stopped or error.what
+            self.asked.stopped = self.asked.stopped or error.what
             self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=error.what))
         except NoAnswer as error:
             failure = Failed(id=sample_id, code=error.cause, message=str(error))
@@ -180,7 +175,7 @@ class Asking:
 
     def _leave_out(self, flight: _OpenFlight, failure: Failed) -> None:
         flight.has_gap = True
-        self.unanswered.append(failure)
+        self.asked.unanswered.append(failure)
 
     def _record_gap(self, flight: _OpenFlight, failure: Failed) -> None:
         self._leave_out(flight, failure)
@@ -191,7 +186,7 @@ class Asking:
             raise TeacherError(
                 f"{self.failed_in_row} windows in a row got no answer",
                 where=shown_url(self.cfg.teacher),
-                got=f"{common_causes(self.unanswered)}; the last: {failure.message}",
+                got=f"{common_causes(self.asked.unanswered)}; the last: {failure.message}",
                 fix="see to the server, then run the same command again: nothing answered is asked twice",
             )
 
@@ -200,7 +195,6 @@ class Asking:
         if not flight.is_read or flight.pending:
             return
         allotted = flight.allotted
-        del self.open[allotted.name]
         gap = allotted.gap(self.stage.path)
         if flight.captions:
             flight.captions.sort(key=lambda caption: caption.frame_index)
@@ -212,7 +206,7 @@ class Asking:
 
     def _write_failures(self) -> None:
         """Write what failed: flights and windows of this run, and the quarantine of all runs."""
-        windows = [failure for failure in self.unanswered if failure.code != "not_asked"]
+        windows = [failure for failure in self.asked.unanswered if failure.code != "not_asked"]
         write_failures(self.stage.path / FAILURES, self.failures + windows)
         write_failures(self.stage.path / QUARANTINE, self.quarantine.values())
 

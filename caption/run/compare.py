@@ -78,8 +78,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         InputError: no conflict was found. TeacherError: the endpoint cannot be used.
     """
     out.mkdir(parents=True, exist_ok=True)
-    found = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
-    num_windows, trials = found
+    num_windows, trials = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
     comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]

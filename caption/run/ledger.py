@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -114,48 +115,47 @@ class Ledger:
     """Counts captions one by one; memory does not grow with them."""
 
     def __init__(self) -> None:
-        self.num_windows = self.num_accepted = self.num_asks = 0
-        self.drops: Counter[str] = Counter()
+        self.windows = Tally()
+        self.num_asks = self.num_skipped = self.num_missed = 0
+        self.teacher: TeacherRecord | None = None
+        self.shelf = Shelf()
         self.first_verdicts: Counter[str] = Counter()
         self.final_verdicts: Counter[str] = Counter()
         self.labels: Counter[str] = Counter()
-        self.confusion: Counter[tuple[str, str]] = Counter()
+        self.judgements: Counter[str] = Counter()
+        self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
-        self.repair_asks: Counter[int] = Counter()
         self.evidence: Counter[str] = Counter()
         self.bilingual: Counter[str] = Counter()
         self.recovered: Counter[str] = Counter()
         self.structured: Counter[str] = Counter()
         self.tokens: Counter[str] = Counter()
+        self.repair_asks: Counter[int] = Counter()
+        self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
         self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or why there is none
         self.lengths: Counter[tuple[str, str, int]] = Counter()  # language, field, bin
-        self.shelf = Shelf()
-        self.judgements: Counter[str] = Counter()
-        self.keyframes: Counter[str] = Counter()
-        self.num_skipped = self.num_missed = 0
-        self.teacher: TeacherRecord | None = None
 
     def add(self, caption: Caption) -> None:
-        self.num_windows += 1
+        self.windows.input += 1
         self.num_asks += caption.attempts
         self.teacher = caption.teacher.model_copy(update={"structured": None})
         self.tokens.update(caption.usage.model_dump())
         self.labels[caption.label or "none"] += 1
         if caption.status == "accepted":
-            self.num_accepted += 1
+            self.windows.kept += 1
             self.final_verdicts[str(caption.verdict)] += 1
         else:
-            self.drops[str(caption.drop_reason)] += 1
+            self.windows.dropped[str(caption.drop_reason)] += 1
+        repair = caption.repair
         if caption.en is not None:
-            repair = caption.repair
             self.first_verdicts[str(repair.first_verdict if repair else caption.verdict)] += 1
             decision = repair.first_decision if repair else caption.en.flight_decision
             self.confusion[caption.label or "none", decision] += 1
-        if caption.repair:
-            became = caption.repair.rung or caption.repair.outcome
+        if repair:
+            became = repair.rung or repair.outcome
             self.repairs[became] += 1
-            self.repair_asks[caption.repair.asks] += 1
-            self.outcomes[caption.repair.strategy, became] += 1
+            self.repair_asks[repair.asks] += 1
+            self.outcomes[repair.strategy, became] += 1
         for language, coc in (("en", caption.en), ("zh", caption.zh)):
             if coc is not None and caption.status == "accepted":
                 for field in TEXT_FIELDS:
@@ -183,19 +183,15 @@ class Ledger:
 
     def tally(self, num_unanswered: int) -> Tally:
         """Give the windows' tally and check that nothing was lost."""
-        failed = {"no_answer": num_unanswered} if num_unanswered else {}
-        total = self.num_windows + num_unanswered
-        tally = Tally(input=total, kept=self.num_accepted, dropped=dict(self.drops), failed=failed)
+        assert self.repairs.total() == self.repair_asks.total()
+        failed = Counter({"no_answer": num_unanswered} if num_unanswered else {})
+        tally = self.windows.model_copy(update={"input": self.windows.input + num_unanswered, "failed": failed})
         tally.check()
-        rejected = sum(self.repairs.values())
-        assert rejected == sum(self.repair_asks.values())
         return tally
 
     def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
-        confusion: dict[str, dict[str, int]] = {}
         order = {token: i for i, token in enumerate((*ACTIONS, "none"))}
-        for label, decision in sorted(self.confusion, key=lambda pair: (order[pair[0]], order[pair[1]])):
-            confusion.setdefault(label, {})[decision] = self.confusion[label, decision]
+        confusion = _nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]]))
         return CaptionReport(
             teacher=self.teacher,
             flights=flights,
@@ -208,9 +204,9 @@ class Ledger:
             labels=_sorted(self.labels),
             confusion=confusion,
             repair=RepairCounts(
-                rejected=sum(self.repairs.values()),
+                rejected=self.repairs.total(),
                 rungs=_sorted(self.repairs),
-                outcomes_by_strategy=self._outcomes_by_strategy(),
+                outcomes_by_strategy=_nested(self.outcomes),
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),
             lengths=self._lengths(),
@@ -222,12 +218,6 @@ class Ledger:
             judge_tokens=judge_tokens,
         )
 
-    def _outcomes_by_strategy(self) -> dict[str, dict[str, int]]:
-        found: dict[str, dict[str, int]] = {}
-        for strategy, outcome in sorted(self.outcomes):
-            found.setdefault(strategy, {})[outcome] = self.outcomes[strategy, outcome]
-        return found
-
     def _lengths(self) -> dict[str, dict[str, Histogram]]:
         found: dict[str, dict[str, Histogram]] = {}
         for language, width in BIN_CHARACTERS.items():
@@ -238,7 +228,7 @@ class Ledger:
         return found
 
     def _keyframes(self) -> KeyframeCounts | None:
-        taken = sum(self.keyframes.values())
+        taken = self.keyframes.total()
         if not taken:
             return None
         return KeyframeCounts(
@@ -248,6 +238,15 @@ class Ledger:
             calls_saved=round(self.num_skipped * (self.num_asks / taken)),
             changes_missed=self.num_missed,
         )
+
+
+def _nested(
+    counts: Counter[tuple[str, str]], key: Callable[[tuple[str, str]], Any] | None = None
+) -> dict[str, dict[str, int]]:
+    found: dict[str, dict[str, int]] = {}
+    for one, two in sorted(counts, key=key):
+        found.setdefault(one, {})[two] = counts[one, two]
+    return found
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:

@@ -83,10 +83,7 @@ def _tiles(report: CaptionReport) -> str:
     ]
     keyframes = report.keyframes
     if keyframes:
-        values += [
-            ("calls saved by keyframes", keyframes.calls_saved),
-            ("changes missed", keyframes.changes_missed),
-        ]
+        values += [("calls saved by keyframes", keyframes.calls_saved), ("changes missed", keyframes.changes_missed)]
     return (
         '<div class="tiles">' + "".join(f'<div class="tile"><b>{n:,}</b>{name}</div>' for name, n in values) + "</div>"
     )

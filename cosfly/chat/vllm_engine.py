@@ -56,14 +56,8 @@ class VllmEngine:
             raise InputError(
                 "not a model folder", where=folder, expected="a folder with config.json", fix="check --teacher"
             )
-        self.folder, self.cfg, self.sampling, self.num_images, self.settings = (
-            folder,
-            cfg,
-            sampling,
-            num_images,
-            settings,
-        )
-        self.model, self.where = folder.name, f"vllm:{folder}"
+        self.folder, self.model, self.where = folder, folder.name, f"vllm:{folder}"
+        self.cfg, self.sampling, self.num_images, self.settings = cfg, sampling, num_images, settings
         self._thread = ThreadPoolExecutor(1, "vllm")  # vLLM is called from one thread only
         self._new: queue.SimpleQueue[tuple[Request, Future[Reply]] | None] = queue.SimpleQueue()
         self._open: dict[str, Future[Reply]] = {}
