@@ -89,7 +89,6 @@ class Trial:
     first: Coc
     last: Coc | None
     verdict: Verdict | None
-    rung: str | None
     asks: int
     tokens: int
 
@@ -109,11 +108,8 @@ async def try_strategy(window: Window, teacher: Teacher, cfg: CaptionConfig, str
         return None
     assert loop.english is not None
     first, asked, tokens = loop.english, loop.asks, loop.usage.total
-    reason = await loop.regenerate(question)
-    assert loop.repair is not None
-    last = loop.english if reason is None else None
-    rung = loop.repair.rung
-    return Trial(first, last, loop.verdict, rung, loop.asks - asked, loop.usage.total - tokens)
+    last = loop.english if await loop.regenerate(question) is None else None
+    return Trial(first, last, loop.verdict, loop.asks - asked, loop.usage.total - tokens)
 
 
 def _rungs(strategy: Strategy, max_asks: int) -> list[str]:

@@ -7,7 +7,6 @@ whose answer does not parse, or could not be made, counts as wrong and scores 0.
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -28,8 +27,6 @@ from cosfly.store import write_bytes, write_json
 from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts
 from distill.schema import Prediction, Sample, read_predictions, read_split
 from distill.student import require
-
-log = logging.getLogger(__name__)
 
 STAGE = "distill.evaluate"
 UNPARSED = "(unparsed)"  # column of the confusion table beside the decisions

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import logging
 import math
 from pathlib import Path
 from typing import Any, Literal
@@ -29,8 +28,6 @@ from distill.checkpoint import read_adapter_facts
 from distill.encoding import encode, load_image, messages_of, prompt_batch
 from distill.schema import PREDICTIONS, Prediction, Sample, Split, read_split, split_path
 from distill.student import Device, Student, load_student, require, weight_files
-
-log = logging.getLogger(__name__)
 
 STAGE = "distill.infer"
 DEFAULT_MAX_PIXELS = 640 * 352

@@ -45,12 +45,8 @@ class Sample(BaseModel):
         return f"{self.sample_id}/{self.language}"
 
     def group(self, split_by: Literal["trajectory", "town"]) -> str:
-        return group_of(self.town, self.trajectory, split_by)
-
-
-def group_of(town: str, trajectory: str, split_by: Literal["trajectory", "town"]) -> str:
-    """Name what may not be shared by two splits. `Town03` and `Town03_Opt` are one town: the same map in two builds."""
-    return town.removesuffix("_Opt") if split_by == "town" else trajectory
+        """Name what may not be shared by two splits. `Town03` and `Town03_Opt` are one town: the same map in two builds."""
+        return self.town.removesuffix("_Opt") if split_by == "town" else self.trajectory
 
 
 def split_path(dataset: Path, split: str) -> Path:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,8 +18,6 @@ from cosfly.chance import rng_for
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.products.captions import ACTIONS, FIELDS
 from cosfly.store import atomic_folder, read_json
-
-log = logging.getLogger(__name__)
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"

@@ -6,6 +6,7 @@ one that was not; the checkpoint needs no generator state. One process, one devi
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import re
@@ -190,20 +191,15 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     return student
 
 
-def seeded(student: Student, seed: int, item_id: str) -> Any:
-    """Give a context in which torch's generators start from (seed, item) and after which they are as before."""
-    import contextlib
-
+@contextlib.contextmanager
+def seeded(student: Student, seed: int, item_id: str) -> Iterator[None]:
+    """Let torch's generators start from (seed, item), and be as before after it."""
     import torch
 
-    @contextlib.contextmanager
-    def context() -> Iterator[None]:
-        devices = [torch.cuda.current_device()] if student.device == "cuda" else []
-        with torch.random.fork_rng(devices=devices):
-            torch.manual_seed(int(rng_for(seed, STAGE, item_id).integers(2**31)))
-            yield
-
-    return context()
+    devices = [torch.cuda.current_device()] if student.device == "cuda" else []
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(int(rng_for(seed, STAGE, item_id).integers(2**31)))
+        yield
 
 
 def answer_loss(student: Student, rows: Sequence[Encoded]) -> tuple[Any, float]:

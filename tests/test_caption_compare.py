@@ -44,9 +44,9 @@ def test_text_distance():
 
 def test_a_comparison_by_hand():
     trials = [
-        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", "hint", 1, 100),
-        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", "hint", 2, 200),
-        Trial(coc("a b c"), None, "HARD_CONFLICT", None, 3, 300),
+        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", 1, 100),
+        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", 2, 200),
+        Trial(coc("a b c"), None, "HARD_CONFLICT", 3, 300),
     ]
     found = compare("hint", trials)
     assert (found.num_conflicts, found.repaired, found.consistent) == (3, 2, 1)

@@ -17,7 +17,7 @@ from specimens_distill import make_caption, make_captions
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
 from distill.dataset import PrepareConfig, assign_splits, check_no_leak, make_sample, run
-from distill.schema import SPLITS, Sample, group_of, read_split
+from distill.schema import SPLITS, Sample, read_split
 from specimens import make_playback_tree
 
 
@@ -75,7 +75,8 @@ def test_too_few_groups_are_refused_unless_told():
 
 
 def test_two_builds_of_a_town_are_one_group():
-    assert group_of("Town03_Opt", "t", "town") == group_of("Town03", "t", "town") == "Town03"
+    builds = [sample_of().model_copy(update={"town": town}) for town in ("Town03_Opt", "Town03")]
+    assert [sample.group("town") for sample in builds] == ["Town03", "Town03"]
 
 
 def test_leak_check_passes_clean_splits_and_counts():

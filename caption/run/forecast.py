@@ -99,37 +99,30 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     windows = _trial_windows([flight for flight in left if guesses[flight.name]], guesses, cfg)
     if not windows:
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
-    rehearsal = asyncio.run(_rehearse(cfg, out, seed, windows))
-    return forecast_from(rehearsal, num_windows, sum(guesses.values()) - num_windows, cfg)
+    captions, seconds, image_tokens = asyncio.run(_rehearse(cfg, out, seed, windows))
+    return _scaled(captions, seconds, image_tokens, num_windows, sum(guesses.values()) - num_windows, cfg)
 
 
-@dataclass(frozen=True)
-class Rehearsal:
-    """What the trial windows took, each in its own place of every list."""
-
-    captions: list[Caption]
-    seconds: list[float]
-    image_tokens: int | None  # of one question with all its pictures
-
-
-def forecast_from(rehearsal: Rehearsal, num_windows: int, num_finished: int, cfg: CaptionConfig) -> Forecast:
-    """Scale a rehearsal to all windows."""
-    captions = rehearsal.captions
+def _scaled(
+    captions: list[Caption],
+    seconds: list[float],
+    image_tokens: int | None,
+    num_windows: int,
+    num_finished: int,
+    cfg: CaptionConfig,
+) -> Forecast:
+    """Scale what the trial windows took to all windows."""
     prompt = estimate([caption.usage.prompt_tokens for caption in captions]).scaled(num_windows)
     completion = estimate([caption.usage.completion_tokens for caption in captions]).scaled(num_windows)
     # Every ask but the mirror's carries the pictures; a mirror is at least one ask of an answered window.
     asks_with_pictures = [caption.attempts - (caption.zh is not None) for caption in captions]
-    pictures = (
-        None
-        if rehearsal.image_tokens is None
-        else estimate(asks_with_pictures).scaled(rehearsal.image_tokens * num_windows)
-    )
+    pictures = None if image_tokens is None else estimate(asks_with_pictures).scaled(image_tokens * num_windows)
     which = ("low", "expected", "high")
     cost = Estimate(*(cfg.budget.cost(getattr(prompt, name), getattr(completion, name)) for name in which))
-    per_window = estimate(rehearsal.seconds).scaled(num_windows)
+    per_window = estimate(seconds).scaled(num_windows)
     in_flight = cfg.endpoint.concurrency
     # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's windows.
-    seconds = Estimate(
+    time_s = Estimate(
         per_window.low / in_flight, per_window.expected / in_flight, per_window.high / min(len(captions), in_flight)
     )
     return Forecast(
@@ -142,7 +135,7 @@ def forecast_from(rehearsal: Rehearsal, num_windows: int, num_finished: int, cfg
         image_tokens=pictures,
         completion_tokens=completion,
         cost=cost,
-        seconds=seconds,
+        seconds=time_s,
         concurrency=in_flight,
     )
 
@@ -175,7 +168,10 @@ def _trial_windows(flights: list[Allotted], guesses: dict[str, int], cfg: Captio
     return list(windows.values())
 
 
-async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, windows: list[Window]) -> Rehearsal:
+async def _rehearse(
+    cfg: CaptionConfig, out: Path, seed: int, windows: list[Window]
+) -> tuple[list[Caption], list[float], int | None]:
+    """Give the trial captions, the seconds of each, and the tokens of all pictures of one question."""
     with AnswerBook(out / ANSWERS) as book:
         async with AskingTeacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
             image_tokens = await _image_tokens(windows[0], teacher, cfg)
@@ -184,7 +180,7 @@ async def _rehearse(cfg: CaptionConfig, out: Path, seed: int, windows: list[Wind
         seconds = [book.latency_s(flight_of(caption.sample_id), caption.sample_id) for caption in captions]
     if not captions:
         raise TeacherError("no trial window got an answer", where=teacher.engine.where, got=str(results[0]))
-    return Rehearsal(captions, seconds, image_tokens)
+    return captions, seconds, image_tokens
 
 
 async def _answered(window: Window, teacher: AskingTeacher, cfg: CaptionConfig) -> Caption | str:

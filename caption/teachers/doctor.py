@@ -47,7 +47,6 @@ class Finding:
 class Probe:
     """What one request gave: `value` is the decoded body of a 200, else None and `detail` tells why."""
 
-    status: int
     value: dict[str, Any] | None
     detail: str
     seconds: float
@@ -112,22 +111,17 @@ class _Examination:
         self.findings.append(Finding(name, state, detail))
 
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Probe:
-        body: dict[str, Any] = {
-            "model": self.client.model,
-            "messages": messages,
-            "temperature": 0.0,
-            "max_tokens": max_tokens,
-        }
-        body |= self.cfg.endpoint.extra_body
+        body: dict[str, Any] = {"model": self.client.model, "messages": messages}
+        body |= {"temperature": 0.0, "max_tokens": max_tokens, **self.cfg.endpoint.extra_body}
         if schema is not None:
             body["response_format"] = response_format(schema)
-        probe = Probe(0, None, "", 0.0)
+        probe = Probe(None, "", 0.0)
         for attempt in range(TRIES):
             start_s = time.monotonic()
             try:
                 response = await self.client.send(body)
             except (TimeoutError, httpx.HTTPError) as error:
-                probe = Probe(0, None, self.client.clean(f"{type(error).__name__} {error}"), time.monotonic() - start_s)
+                probe = Probe(None, self.client.clean(f"{type(error).__name__} {error}"), time.monotonic() - start_s)
             else:
                 probe = _read(response, self.client, time.monotonic() - start_s)
                 if response.status_code not in RETRIED_STATUS:
@@ -144,19 +138,15 @@ class _Examination:
             self._add("answers", "unusable", probe.detail or "no message in the answer")
             return False
         self._add("answers", "ok", f"in {probe.seconds:.1f} s: {probe.text.strip()[:40]!r}")
-        counted = probe.prompt_tokens is not None
-        detail = (
-            "reported"
-            if counted
-            else "not reported: --max-cost and --max-tokens cannot be kept, --plan knows no tokens"
-        )
-        self._add("token usage", "ok" if counted else "warning", detail)
+        if probe.prompt_tokens is not None:
+            self._add("token usage", "ok", "reported")
+        else:
+            detail = "not reported: --max-cost and --max-tokens cannot be kept, --plan knows no tokens"
+            self._add("token usage", "warning", detail)
         thoughts = probe.message.get("reasoning_content") or probe.message.get("reasoning") or ""
         if thoughts or "<think" in probe.text:
-            detail = (
-                f"on: {len(thoughts) or len(probe.text)} characters before the answer; switch it off: {NO_THINKING}"
-            )
-            self._add("thinking", "warning", detail)
+            length = len(thoughts) or len(probe.text)
+            self._add("thinking", "warning", f"on: {length} characters before the answer; switch it off: {NO_THINKING}")
         else:
             self._add("thinking", "ok", "off")
         return True
@@ -167,7 +157,7 @@ class _Examination:
         detail = repr(probe.finish_reason) if probe.value is not None else probe.detail
         text = f"an answer cut at 8 tokens says {detail}"
         self._add(
-            "finish reason", state, text if state == "ok" else f"{text}, not 'length': cut answers count as broken"
+            "finish reason", state, text + ("" if state == "ok" else ", not 'length': cut answers count as broken")
         )
 
     async def _schema(self) -> None:
@@ -315,11 +305,11 @@ def _picture(width: int, height: int, number: int) -> dict:
 
 def _read(response: httpx.Response, client: ChatClient, seconds: float) -> Probe:
     if response.status_code != 200:
-        return Probe(response.status_code, None, f"HTTP {response.status_code} {client.detail(response)}", seconds)
+        return Probe(None, f"HTTP {response.status_code} {client.detail(response)}", seconds)
     try:
         value = parse_json(response.content)
     except ValueError:
-        return Probe(200, None, "the body is not JSON", seconds)
+        return Probe(None, "the body is not JSON", seconds)
     if not isinstance(value, dict):
-        return Probe(200, None, "the body is not a JSON object", seconds)
-    return Probe(200, value, "", seconds)
+        return Probe(None, "the body is not a JSON object", seconds)
+    return Probe(value, "", seconds)

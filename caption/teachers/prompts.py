@@ -13,7 +13,7 @@ from pathlib import Path
 from string import Template
 
 from caption.schema import ImageConfig, ObservedWindow
-from caption.teachers.images import EncodedImage, FrameEncoder, available_views
+from caption.teachers.images import FrameEncoder, available_views
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from cosfly.frame_views import View
@@ -174,17 +174,13 @@ def question_messages(question: Question, encoder: FrameEncoder) -> tuple[list[d
         for number, folder in enumerate(question.window.frame_folders):
             content.append({"type": "text", "text": f"t{number}:"})
             for image in encoder.encode(folder, question.views):
-                content.append(_image_part(image))
+                content.append({"type": "image_url", "image_url": {"url": image.url}})
                 digests.append(image.digest)
     content.append({"type": "text", "text": question.prompts["en"].user})
     system = system_prompt("en") if question.decision is None else anchored_prompt(question.decision)
     if question.rejected is not None:
         system += "\n" + read_prompt("hint_en").substitute(rejected=question.rejected)
     return [{"role": "system", "content": system}, {"role": "user", "content": content}], digests
-
-
-def _image_part(image: EncodedImage) -> dict:
-    return {"type": "image_url", "image_url": {"url": image.url}}
 
 
 def mirror_messages(english: Coc) -> list[dict]:

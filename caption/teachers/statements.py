@@ -41,23 +41,20 @@ def describe(f: Facts) -> list[tuple[Both, ...]]:
 
 
 def _walk(f: Facts) -> tuple[Both, ...] | None:
-    speed = f.target_speed_mps
-    if speed is None:
+    if f.target_speed_mps is None:
         return None
-    if speed < 0.2:
-        return ((f"the target stands almost still ({speed:.2f} m/s)", f"目标几乎静止（{speed:.2f} 米/秒）"),)
+    speed = f"{f.target_speed_mps:.2f}"
+    if f.target_speed_mps < 0.2:
+        return ((f"the target stands almost still ({speed} m/s)", f"目标几乎静止（{speed} 米/秒）"),)
     if f.target_turn_deg is not None and abs(f.target_turn_deg) >= 15.0:
         en, zh = ("left", "左") if f.target_turn_deg > 0 else ("right", "右")
         return (
-            (f"the target walks at {speed:.2f} m/s and bends to the {en}", f"目标以 {speed:.2f} 米/秒行走并向{zh}转弯"),
-            (
-                f"the target moves at {speed:.2f} m/s, bending to the {en}",
-                f"目标以 {speed:.2f} 米/秒移动，并向{zh}转弯",
-            ),
+            (f"the target walks at {speed} m/s and bends to the {en}", f"目标以 {speed} 米/秒行走并向{zh}转弯"),
+            (f"the target moves at {speed} m/s, bending to the {en}", f"目标以 {speed} 米/秒移动，并向{zh}转弯"),
         )
     return (
-        (f"the target walks at {speed:.2f} m/s", f"目标以 {speed:.2f} 米/秒行走"),
-        (f"the target moves at {speed:.2f} m/s", f"目标以 {speed:.2f} 米/秒移动"),
+        (f"the target walks at {speed} m/s", f"目标以 {speed} 米/秒行走"),
+        (f"the target moves at {speed} m/s", f"目标以 {speed} 米/秒移动"),
     )
 
 
@@ -71,12 +68,8 @@ def _box(f: Facts) -> tuple[Both, ...] | None:
             (f"its bounding box is about {w1} x {h1} px", f"边界框大小约 {w1} × {h1} 像素"),
         )
     en, zh = ("grows", "增大") if h1 > h0 else ("shrinks", "缩小")
-    return (
-        (
-            f"the bounding box {en} from {w0} x {h0} px to {w1} x {h1} px",
-            f"边界框从 {w0} × {h0} 像素{zh}到 {w1} × {h1} 像素",
-        ),
-    )
+    english = f"the bounding box {en} from {w0} x {h0} px to {w1} x {h1} px"
+    return ((english, f"边界框从 {w0} × {h0} 像素{zh}到 {w1} × {h1} 像素"),)
 
 
 def _position(f: Facts) -> tuple[Both, ...] | None:
@@ -106,12 +99,8 @@ def _distance(f: Facts) -> tuple[Both, ...] | None:
             (f"the horizontal distance is about {last:.1f} m", f"水平距离约为 {last:.1f} 米"),
         )
     en, zh = ("increases", "增加") if last > first else ("decreases", "减小")
-    return (
-        (
-            f"the horizontal distance {en} from {first:.1f} m to {last:.1f} m",
-            f"水平距离从 {first:.1f} 米{zh}到 {last:.1f} 米",
-        ),
-    )
+    old, new = f"{first:.1f}", f"{last:.1f}"
+    return ((f"the horizontal distance {en} from {old} m to {new} m", f"水平距离从 {old} 米{zh}到 {new} 米"),)
 
 
 def _speed(f: Facts) -> tuple[Both, ...]:
@@ -124,12 +113,8 @@ def _speed(f: Facts) -> tuple[Both, ...]:
             (f"the drone flies at {last:.2f} m/s", f"无人机以 {last:.2f} 米/秒飞行"),
         )
     en, zh = ("increases", "增加") if last > first else ("decreases", "减小")
-    return (
-        (
-            f"the drone speed {en} from {first:.2f} m/s to {last:.2f} m/s",
-            f"无人机速度从 {first:.2f} 米/秒{zh}到 {last:.2f} 米/秒",
-        ),
-    )
+    old, new = f"{first:.2f}", f"{last:.2f}"
+    return ((f"the drone speed {en} from {old} m/s to {new} m/s", f"无人机速度从 {old} 米/秒{zh}到 {new} 米/秒"),)
 
 
 def _altitude(f: Facts) -> tuple[Both, ...]:
@@ -140,12 +125,8 @@ def _altitude(f: Facts) -> tuple[Both, ...]:
             (f"the altitude holds near {last:.1f} m", f"高度维持在约 {last:.1f} 米"),
         )
     en, zh = ("climbs", "爬升") if last > first else ("descends", "下降")
-    return (
-        (
-            f"the drone {en} in altitude from {first:.1f} m to {last:.1f} m",
-            f"无人机高度从 {first:.1f} 米{zh}到 {last:.1f} 米",
-        ),
-    )
+    old, new = f"{first:.1f}", f"{last:.1f}"
+    return ((f"the drone {en} in altitude from {old} m to {new} m", f"无人机高度从 {old} 米{zh}到 {new} 米"),)
 
 
 def _yaw(f: Facts) -> tuple[Both, ...]:

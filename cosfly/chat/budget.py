@@ -57,10 +57,6 @@ class Budget:
         self._is_measured = False
 
     @property
-    def is_limited(self) -> bool:
-        return self.cfg.max_cost is not None or self.cfg.max_tokens is not None
-
-    @property
     def totals(self) -> Counter[str]:
         """Answers, prompt_tokens and completion_tokens of every answer kept."""
         return sum(self._counts, Counter())
@@ -101,7 +97,7 @@ class Budget:
         Raises:
             TeacherError: a limit is set and the server does not say what it used, so the limit could not be kept.
         """
-        if usage is None and self.is_limited:
+        if usage is None and (self.cfg.max_cost is not None or self.cfg.max_tokens is not None):
             raise TeacherError(
                 "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept",
                 where=where,

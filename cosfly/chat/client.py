@@ -86,7 +86,6 @@ class ChatClient:
         self.cfg = cfg
         self.throttle = Throttle(cfg.concurrency)
         self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
-        self.num_retries = 0
         self._is_schema_refused = not cfg.json_schema
         self._key = os.environ.get(KEY_VARIABLE, "")
         self._jitter = random.Random()  # times of retries only: no product depends on it
@@ -180,7 +179,6 @@ class ChatClient:
             pause_s = self._wait_s(attempt) if wait_s is None else wait_s
             if time.monotonic() + pause_s >= deadline_s:
                 raise NoAnswer("total_timeout", f"no answer within {self.cfg.total_timeout_s:g} s; the last: {detail}")
-            self.num_retries += 1
             await asyncio.sleep(pause_s)
         raise NoAnswer(cause, detail)
 

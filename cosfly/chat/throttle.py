@@ -23,7 +23,6 @@ class Throttle:
         self.ceiling = ceiling
         self.limit = float(min(FIRST_LIMIT, ceiling))
         self.num_active = 0
-        self.num_busy = 0
         self._clock = clock
         self._held_until_s = 0.0
         self._last_decrease_s = float("-inf")
@@ -56,7 +55,6 @@ class Throttle:
             given_s: when the request got its slot. Requests sent before the last decrease say nothing new.
         """
         now_s = self._clock()
-        self.num_busy += 1
         self._is_ramping = False
         if given_s >= self._last_decrease_s:
             self.limit = max(1.0, self.limit / 2.0)
