@@ -176,8 +176,11 @@ class _Reader:
         self.path, self.strict = path, strict
         self.issues: list[str] = []
 
+    def error(self, message: str, where: str, got: object, expected: str) -> InputError:
+        return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
+
     def issue(self, where: str, got: object, expected: str) -> None:
-        error = InputError("breaks the layout", where=f"{self.path}: {where}", got=str(got), expected=expected)
+        error = self.error("breaks the layout", where, got, expected)
         if self.strict:
             raise error
         self.issues.append(str(error))
@@ -195,9 +198,7 @@ class _Reader:
     def points(self, raw: dict) -> list[dict]:
         points = raw.get("points", None if self.strict else raw.get("waypoints"))
         if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
-            raise InputError(
-                "no points", where=f"{self.path}: points", got=type(points).__name__, expected="a list of objects"
-            )
+            raise self.error("no points", "points", type(points).__name__, "a list of objects")
         for i, point in enumerate(points):
             self.equal(f"points[{i}].index", point.get("index"), i)
         return points
@@ -207,10 +208,8 @@ class _Reader:
         time_s = np.array([self.time(i, point) for i, point in enumerate(points)])
         steps = np.diff(time_s)
         if (steps <= 0).any():
-            where = f"{self.path}: points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-            raise InputError(
-                "time does not increase", where=where, got=str(float(steps.min())), expected="strictly increasing times"
-            )
+            where = f"points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
+            raise self.error("time does not increase", where, float(steps.min()), "strictly increasing times")
         if len(steps) and np.abs(steps - DT_S).max() > 1e-3:
             got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
             self.issue("points[].timing.trace_timestamp", got, f"steps of {DT_S} s")
@@ -218,21 +217,17 @@ class _Reader:
 
     def poses(self, points: list[dict]) -> np.ndarray:
         """Poses as the file holds them, (n, 6): x, y, z, pitch, yaw, roll in CARLA's axes."""
-        poses = [
-            [self.number(f"points[{i}].drone_pose", point.get("drone_pose"), name) for name in XYZ + ANGLES]
-            for i, point in enumerate(points)
-        ]
-        self.waypoints(points, np.array(poses)[:, :3])
-        return np.array(poses)
+        groups = [(f"points[{i}].drone_pose", point.get("drone_pose")) for i, point in enumerate(points)]
+        poses = np.array([[self.number(where, group, name) for name in XYZ + ANGLES] for where, group in groups])
+        self.waypoints(points, poses[:, :3])
+        return poses
 
     def number(self, where: str, group: Any, name: str) -> float:
         value = group.get(name) if isinstance(group, dict) else None
         if value is None and name in ("pitch", "roll") and not self.strict:
             return 0.0
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(
-                "not a number", where=f"{self.path}: {where}.{name}", got=repr(value), expected="a finite number"
-            )
+            raise self.error("not a number", f"{where}.{name}", repr(value), "a finite number")
         return float(value)
 
     def time(self, i: int, point: dict) -> float:
@@ -264,12 +259,8 @@ class _Reader:
         except (TypeError, ValueError):
             matrix = np.empty(0)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or width < 1 or height < 1:
-            raise InputError(
-                "not a camera",
-                where=f"{self.path}: camera.intrinsic",
-                got=repr(group.get("intrinsic"))[:60],
-                expected="a 3x3 matrix with a positive focal length",
-            )
+            got, expected = repr(group.get("intrinsic"))[:60], "a 3x3 matrix with a positive focal length"
+            raise self.error("not a camera", "camera.intrinsic", got, expected)
         return Camera(int(width), int(height), matrix)
 
 

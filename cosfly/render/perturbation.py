@@ -123,14 +123,10 @@ def perturb(
 
 def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
     """An offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
-    offset = np.zeros(3)
-    cube = rng.uniform(-1.0, 1.0, num_axes)
+    in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
     direction, share = rng.normal(size=num_axes), rng.random()
-    if cfg.sampling == "cubic":
-        offset[:num_axes] = radius_m * cube
-    else:
-        offset[:num_axes] = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
-    return offset
+    in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
+    return np.append(in_cube if cfg.sampling == "cubic" else in_ball, np.zeros(3 - num_axes))
 
 
 def _shift(

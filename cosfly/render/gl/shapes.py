@@ -67,11 +67,10 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
             local[:, axis] = side * (boxes.half[:, axis] + EDGE_GAP_M)
             local[:, 1 - axis] = share * boxes.half[:, 1 - axis]
             local[:, 2] = height_share * boxes.half[:, 2]
-            probes = boxes.centers + np.einsum("nij,nj->ni", boxes.turns, local)
-            for row, probe in enumerate(probes):
+            for row, probe in enumerate(boxes.centers + np.einsum("nij,nj->ni", boxes.turns, local)):
                 inside = np.abs(np.einsum("nji,nj->ni", boxes.turns, probe - boxes.centers)) <= reach
                 is_open[row] |= not inside.all(axis=1).any()
-        bits += np.where(is_open, 2.0**bit, 0.0)
+        bits += 2.0**bit * is_open
     return bits
 
 
