@@ -29,12 +29,8 @@ SURFACE_REACH_M = 1.0  # kerbs, lawns and carriageways differ by less; a flyover
 MAX_CELLS = 400_000_000  # 10 km x 10 km at 0.5 m; more is a stray box, or a resolution too fine for the memory
 
 WATER = KINDS["Water"]
-_CORNER_SIGNS = np.array(
-    [[x, y, z] for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))], dtype=np.float64
-)
-_EDGES = np.array(
-    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)], dtype=np.int64
-)
+_CORNER_SIGNS = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 
 @dataclass(frozen=True)
@@ -65,14 +61,6 @@ class OccupancyGrid:
         return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + origin
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How two grids over the same cells compare: equal cells / all cells, and intersection / union of the occupied ones."""
-
-    cell_agreement: float
-    iou: float
-
-
 # --- boxes to cells ---------------------------------------------------------------------------------------------------
 
 
@@ -90,13 +78,9 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
     low, high = box_map.bounds()
     num_x, num_y = (max(1.0, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
     if num_x * num_y > MAX_CELLS:
-        raise InputError(
-            "the map is too wide for a grid",
-            where=box_map.name,
-            got=f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m",
-            expected=f"at most {MAX_CELLS} cells",
-            fix="remove the box that lies far out, or take a coarser resolution_m",
-        )
+        got, expected = f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m", f"at most {MAX_CELLS} cells"
+        fix = "remove the box that lies far out, or take a coarser resolution_m"
+        raise InputError("the map is too wide for a grid", where=box_map.name, got=got, expected=expected, fix=fix)
     return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
 
 
@@ -107,11 +91,9 @@ def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.n
     count. Surfaces (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
     """
     ground_z_m = box_map.header.ground_z_m
-    is_in_interval = (box_map.maxs[:, 2] > ground_z_m + TOUCH_M) & (
-        box_map.mins[:, 2] < ground_z_m + height_m - TOUCH_M
-    )
-    is_ground = np.isin(box_map.kinds, np.array(sorted(GROUND_KINDS), dtype=np.uint8))
-    return (is_in_interval & ~is_ground) | (box_map.kinds == WATER)
+    reaches_down = box_map.mins[:, 2] < ground_z_m + height_m - TOUCH_M
+    is_in_interval = reaches_down & (box_map.maxs[:, 2] > ground_z_m + TOUCH_M)
+    return (is_in_interval & ~box_map.is_any_of(GROUND_KINDS)) | (box_map.kinds == WATER)
 
 
 def occupancy(
@@ -151,7 +133,7 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
         (ny, nx) bool, cells that such a box overlaps; None if the map holds no such box, so that it does not say.
     """
     is_level = np.abs(box_map.maxs[:, 2] - box_map.header.ground_z_m) <= SURFACE_REACH_M
-    boxes = box_map.select(is_level & np.isin(box_map.kinds, np.array(sorted(kinds), dtype=np.uint8)))
+    boxes = box_map.select(is_level & box_map.is_any_of(kinds))
     if len(boxes) == 0:
         return None
     grid = replace(like, occupied=np.zeros_like(like.occupied))
@@ -243,9 +225,11 @@ def _fill_row(mask, row, start, stop):  # pragma: no cover (compiled)
         mask[row, column] = True
 
 
-def compare(one: OccupancyGrid, other: OccupancyGrid) -> Agreement:
-    """Compare two grids over the same cells; two grids without an occupied cell have an IoU of 1.
+def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
+    """Compare two grids over the same cells.
 
+    Returns:
+        equal cells / all cells, and intersection / union of the occupied ones (IoU), 1 where there is none.
     Raises:
         ValueError: the grids do not cover the same cells.
     """
@@ -254,7 +238,7 @@ def compare(one: OccupancyGrid, other: OccupancyGrid) -> Agreement:
         raise ValueError("the grids do not cover the same cells; make one `like` the other")
     union = int(np.count_nonzero(one.occupied | other.occupied))
     intersection = int(np.count_nonzero(one.occupied & other.occupied))
-    return Agreement(1.0 - (union - intersection) / one.occupied.size, intersection / union if union else 1.0)
+    return 1.0 - (union - intersection) / one.occupied.size, intersection / union if union else 1.0
 
 
 # --- cells to walkable ground -----------------------------------------------------------------------------------------

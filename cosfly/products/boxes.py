@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,14 +18,15 @@ from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.store import check_schema, dump_json, read_json, validation_errors, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
-COMPUTED = (
+COMPUTED = {
     "schema",
     "schema_version",
     "axes",
     "bounds",
     "num_boxes",
     "counts",
-)  # written from the boxes, never carried
+}  # written from the boxes, never carried
+ARRAYS = ("centers", "half_extents", "rotations_deg", "kinds", "ids")  # of a BoxMap, one row a box
 
 UNKNOWN_LICENCE, OUR_LICENCE = "unknown", "apache-2.0"  # the latter: of maps that cosfly invents
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -122,14 +124,16 @@ class BoxMap:
 
     def select(self, index: np.ndarray) -> BoxMap:
         """Give the boxes at an index or mask, header unchanged."""
-        return replace(
-            self,
-            centers=self.centers[index],
-            half_extents=self.half_extents[index],
-            rotations_deg=self.rotations_deg[index],
-            kinds=self.kinds[index],
-            ids=self.ids[index],
-        )
+        return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
+
+    def joined(self, other: BoxMap) -> BoxMap:
+        """Give these boxes and then the other's, under this header."""
+        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
+        return replace(self, **both)
+
+    def is_any_of(self, kinds: Collection[int]) -> np.ndarray:
+        """Tell which boxes are of one of some kinds, (n,) bool."""
+        return np.isin(self.kinds, np.array(sorted(kinds), dtype=np.uint8))
 
     def counts(self) -> dict[str, int]:
         """Boxes by kind name, largest first."""
@@ -142,17 +146,11 @@ def make_box_map(
     centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: MapHeader | None = None
 ) -> BoxMap:
     """Make a BoxMap from anything array-like; ids default to 1..n."""
-    centers = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
-    return BoxMap(
-        centers,
-        np.asarray(half_extents, dtype=np.float64).reshape(-1, 3),
-        np.asarray(rotations_deg, dtype=np.float64).reshape(-1, 3),
-        np.asarray(kinds, dtype=np.uint8).reshape(-1),
-        np.arange(1, len(centers) + 1, dtype=np.uint64)
-        if ids is None
-        else np.asarray(ids, dtype=np.uint64).reshape(-1),
-        header or MapHeader(),
-    )
+    vectors = (np.asarray(rows, dtype=np.float64).reshape(-1, 3) for rows in (centers, half_extents, rotations_deg))
+    centers, half_extents, rotations_deg = vectors
+    ids = np.asarray(np.arange(1, len(centers) + 1) if ids is None else ids, dtype=np.uint64).reshape(-1)
+    kinds = np.asarray(kinds, dtype=np.uint8).reshape(-1)
+    return BoxMap(centers, half_extents, rotations_deg, kinds, ids, header or MapHeader())
 
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
@@ -229,21 +227,18 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     lines = []
     for i in range(len(box_map)):
         kind = KIND_NAMES[int(box_map.kinds[i])]
-        lines.append(
-            dump_json(
-                {
-                    "type": kind,
-                    "semantic_id": int(box_map.kinds[i]),
-                    "color": KIND_COLORS[kind],
-                    "id": int(box_map.ids[i]),
-                    "center": rounded(box_map.centers[i]),
-                    "extent": rounded(box_map.half_extents[i]),
-                    "rotation": rounded(box_map.rotations_deg[i]),
-                    "min": rounded(mins[i]),
-                    "max": rounded(maxs[i]),
-                }
-            )
-        )
+        box = {
+            "type": kind,
+            "semantic_id": int(box_map.kinds[i]),
+            "color": KIND_COLORS[kind],
+            "id": int(box_map.ids[i]),
+            "center": rounded(box_map.centers[i]),
+            "extent": rounded(box_map.half_extents[i]),
+            "rotation": rounded(box_map.rotations_deg[i]),
+            "min": rounded(mins[i]),
+            "max": rounded(maxs[i]),
+        }
+        lines.append(dump_json(box))
     text = dump_json(header, indent=1)[:-2] + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
     write_bytes(path, text.encode())
 
@@ -259,7 +254,8 @@ def read_boxes(path: Path) -> BoxMap:
     records: Any = value
     if not isinstance(value, list):
         records = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path).pop("boxes", None)
-        header = _read_header(value, path)
+        with validation_errors(path):
+            header = MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
         if not isinstance(records, list):
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:
@@ -267,13 +263,7 @@ def read_boxes(path: Path) -> BoxMap:
     with validation_errors(path):
         boxes = _Boxes.model_validate({"boxes": records}).boxes
     centers, extents, rotations = ([getattr(box, name) for box in boxes] for name in ("center", "extent", "rotation"))
-    box_map = make_box_map(
-        centers, extents, rotations, [KINDS[box.type] for box in boxes], [box.id for box in boxes], header
-    )
+    kinds, ids = [KINDS[box.type] for box in boxes], [box.id for box in boxes]
+    box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
     check_boxes(box_map, path)
     return box_map
-
-
-def _read_header(value: dict, path: Path) -> MapHeader:
-    with validation_errors(path):
-        return MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})

@@ -48,10 +48,6 @@ def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
     except (TypeError, ValueError):
         matrix = np.empty((0, 0))
     if matrix.ndim != 2 or matrix.shape[1] != width or not np.isfinite(matrix).all():
-        raise InputError(
-            "not a list of vectors",
-            where=f"{where}.{name}",
-            got=repr(record.get(name))[:60],
-            expected=f"{width} finite numbers each",
-        )
+        got, expected = repr(record.get(name))[:60], f"{width} finite numbers each"
+        raise InputError("not a list of vectors", where=f"{where}.{name}", got=got, expected=expected)
     return matrix

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from cosfly.errors import InputError
 from cosfly.store import read_json, validation_errors
@@ -14,25 +14,19 @@ from cosfly.store import read_json, validation_errors
 class RoiPolygon(BaseModel):
     """One outer ring with holes, world x and y in metres."""
 
-    model_config = ConfigDict(extra="allow")
-    points_world: list[tuple[float, float]]
-    holes: list[list[tuple[float, float]]] = []
-
-
-class Roi(BaseModel):
-    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings."""
-
-    model_config = ConfigDict(extra="allow")
-    description: str = ""
-    closed: bool = True
     points_world: list[tuple[float, float]] = []
     holes: list[list[tuple[float, float]]] = []
+
+
+class Roi(RoiPolygon):
+    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings."""
+
+    closed: bool = True
     polygons: list[RoiPolygon] = []
 
     def rings(self) -> list[RoiPolygon]:
         """All polygons in one form."""
-        own = [RoiPolygon(points_world=self.points_world, holes=self.holes)] if self.points_world else []
-        return own + self.polygons
+        return [self, *self.polygons] if self.points_world else self.polygons
 
 
 def read_roi(path: Path) -> Roi:
@@ -45,22 +39,13 @@ def read_roi(path: Path) -> Roi:
     with validation_errors(path):
         roi = Roi.model_validate(value)
     if not roi.closed:
-        raise InputError(
-            "the polygon is not closed",
-            where=f"{path}: closed",
-            got="false",
-            expected="true",
-            fix="close it in the editor",
-        )
+        where, fix = f"{path}: closed", "close it in the editor"
+        raise InputError("the polygon is not closed", where=where, got="false", expected="true", fix=fix)
     if not roi.rings():
         raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
     for number, polygon in enumerate(roi.rings()):
         for ring in (polygon.points_world, *polygon.holes):
             if len(ring) < 3 or not np.isfinite(np.array(ring, dtype=np.float64)).all():
-                raise InputError(
-                    "not a ring",
-                    where=f"{path}: polygon {number}",
-                    got=f"{len(ring)} points",
-                    expected="at least three finite points",
-                )
+                where, got = f"{path}: polygon {number}", f"{len(ring)} points"
+                raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
     return roi

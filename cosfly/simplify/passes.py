@@ -14,7 +14,7 @@ The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -28,7 +28,7 @@ from cosfly.simplify.merge import MergeRule, merge
 
 VEGETATION, WATER = KINDS["Vegetation"], KINDS["Water"]
 # Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0, and a renderer needs them.
-SURFACE_KINDS = np.array(sorted(GROUND_KINDS | {WATER, KINDS["Bridge"]}), dtype=np.uint8)
+SURFACE_KINDS = GROUND_KINDS | {WATER, KINDS["Bridge"]}
 
 
 class MergeGaps(Config):
@@ -127,12 +127,6 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
     return Simplified(replace(result, header=box_map.header.model_copy(update=told)), passes)
 
 
-def _concatenate(one: BoxMap, other: BoxMap) -> BoxMap:
-    names = ("centers", "half_extents", "rotations_deg", "kinds", "ids")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names}
-    return replace(one, **joined)
-
-
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
     gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.model_dump().items() if gap is not None}
     return {
@@ -207,7 +201,7 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
         np.full(count, VEGETATION, dtype=np.uint8),
         _free_ids(used_ids, count),
     )
-    return _concatenate(canopies, trunks)
+    return canopies.joined(trunks)
 
 
 def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
@@ -253,7 +247,7 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
         box_map.kinds[pieces],
         ids,
     )
-    return _concatenate(box_map.select(~is_tall), cut)
+    return box_map.select(~is_tall).joined(cut)
 
 
 def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
@@ -273,7 +267,7 @@ def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
             (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
     """
     ground_z_m = box_map.header.ground_z_m
-    is_surface = np.isin(box_map.kinds, SURFACE_KINDS)
+    is_surface = box_map.is_any_of(SURFACE_KINDS)
     lows, tops = box_map.mins[:, 2], box_map.maxs[:, 2]
     if not clip:
         return box_map.select((tops >= ground_z_m) | is_surface)

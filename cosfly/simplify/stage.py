@@ -25,12 +25,8 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     """
     grid = empty_grid(raw)
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
-    agreement = compare(before, after)
-    facts: dict = {
-        "cells": list(grid.size),
-        "cell_agreement": round(agreement.cell_agreement, 4),
-        "iou": round(agreement.iou, 4),
-    }
+    cell_agreement, iou = compare(before, after)
+    facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
     for name, occupied in (("raw", before), ("simplified", after)):
         _, sizes = connected_parts(~inflate(occupied, SAFETY_RADIUS_M).occupied, 8)
         cell_m2 = grid.resolution_m**2
@@ -75,9 +71,8 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     raw = read_boxes(maps)
     result = simplify(raw, cfg)
     if len(result.box_map) == 0:
-        raise InputError(
-            "every box lies below the ground", where=maps, expected="boxes above it", fix="check the map's ground_z_m"
-        )
+        fix = "check the map's ground_z_m"
+        raise InputError("every box lies below the ground", where=maps, expected="boxes above it", fix=fix)
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
@@ -92,7 +87,7 @@ def _picture(raw: BoxMap, simplified: BoxMap, facts: dict, size_px: int) -> byte
     view = TopView.around(np.stack(raw.bounds()), size_px)
     halves = []
     for title, box_map in (("raw", raw), ("simplified", simplified)):
-        shown = box_map.select(np.isin(box_map.kinds, SURFACE_KINDS) | blocks_walking(box_map))
+        shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: what stands below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
