@@ -11,7 +11,7 @@ from caption.schema import CaptionConfig
 from cosfly.config import Config
 from cosfly.inspection.flight import InspectConfig
 from cosfly.maps.stage import MapsConfig
-from cosfly.pedestrians.stage import PedestriansConfig
+from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.stage import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig

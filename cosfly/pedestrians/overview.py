@@ -7,7 +7,7 @@ import colorsys
 import cv2
 import numpy as np
 
-from cosfly.grid import OccupancyGrid
+from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.products.walks import Walk
 from cosfly.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 
@@ -20,36 +20,21 @@ ROI_LINE, PAPER = (226, 120, 20), (252, 251, 247)
 LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", UNUSED), ("walkable", USED))
 
 
-def draw_overview(
-    grid: OccupancyGrid,
-    inflated: OccupancyGrid,
-    parts: np.ndarray,
-    is_in_roi: np.ndarray | None,
-    paths: list[Walk],
-) -> bytes:
-    """Draw the ground and the walks; a ring is a start, a dot a goal, and north is up.
-
-    Args:
-        grid, inflated: occupied cells before and after inflation. parts: (ny, nx), 0 where nobody walks.
-        is_in_roi: (ny, nx) bool, or None for the whole map.
-    Returns:
-        a PNG file.
-    """
-    picture, view = _ground_picture(grid, inflated, parts)
+def draw_overview(ground: WalkableGround, paths: list[Walk]) -> bytes:
+    """Draw the ground and the walks; a ring is a start, a dot a goal, and north is up; PNG bytes."""
+    picture, view = _ground_picture(ground)
     thickness = max(1, round(LONGER_SIDE_PX / 600))
-    if is_in_roi is not None:
-        low_m = np.array([grid.x_min_m, grid.y_min_m])
-        outlines, _ = cv2.findContours(is_in_roi.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    if ground.is_in_roi is not None:
+        outlines, _ = cv2.findContours(ground.is_in_roi.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         for outline in outlines:
-            places = view.pixels(low_m + (outline[:, 0] + 0.5) * grid.resolution_m)
-            draw_line(picture, places, ROI_LINE, thickness, closed=True)
+            draw_line(picture, view.pixels(ground.grid.centers_of(outline[:, 0])), ROI_LINE, thickness, closed=True)
     for number, path in enumerate(paths):
         color, line = path_color(number), view.pixels(path.polyline_m)
         draw_line(picture, line, color, thickness)
         draw_dot(picture, line[0], 7, PAPER)
         draw_dot(picture, line[0], 7, color, thickness)
         draw_dot(picture, line[-1], 6, color)
-    legend = _legend(picture.shape[1], view.pixels_per_m, is_in_roi is not None, len(paths))
+    legend = _legend(picture.shape[1], view.pixels_per_m, ground.is_in_roi is not None, len(paths))
     return png_bytes(np.vstack([picture, legend]))
 
 
@@ -59,13 +44,14 @@ def path_color(number: int) -> tuple[int, int, int]:
     return round(red * 255), round(green * 255), round(blue * 255)
 
 
-def _ground_picture(grid: OccupancyGrid, inflated: OccupancyGrid, parts: np.ndarray) -> tuple[np.ndarray, TopView]:
+def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
     """Paint the cells, north up; gives the picture and where it lies."""
+    grid = ground.grid
     num_x, num_y = grid.size
     scale = LONGER_SIDE_PX / max(num_x, num_y)
     classes = np.full((num_y, num_x), 2, dtype=np.uint8)
-    classes[parts > 0] = 3
-    classes[inflated.occupied] = 1
+    classes[ground.walkable] = 3
+    classes[ground.inflated.occupied] = 1
     classes[grid.occupied] = 0
     cells = np.array([OBSTACLE, MARGIN, UNUSED, USED], dtype=np.uint8)[classes[::-1]]
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))

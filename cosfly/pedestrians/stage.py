@@ -16,20 +16,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from cosfly.chance import rng_for
-from cosfly.config import Config
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.overview import draw_overview
-from cosfly.pedestrians.walkable import Clock, WalkableGround, find_ground, sample_goal, sample_start
-from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.roi import Roi, read_roi
+from cosfly.pedestrians.walkable import (
+    Clock,
+    PedestriansConfig,
+    WalkableGround,
+    sample_goal,
+    sample_start,
+    walkable_ground,
+)  # fmt: skip
+from cosfly.pedestrians.walking import arrival_times, menger_curvature, resample, speed_profile
+from cosfly.products.boxes import read_boxes
+from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, write_paths
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
@@ -40,66 +45,7 @@ REPORT_SCHEMA, REPORT_VERSION = "cosfly.pedestrians_report", "1.0"
 RETRY_REASONS = ("no_goal", "detour")
 
 
-class PedestriansConfig(Config):
-    """Settings of the pedestrian stage; the defaults are the paper's (tab:ped_params, eq:speed)."""
-
-    num_paths: int = Field(20, ge=1, le=100_000, description="walks to make")
-    resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
-    human_height_m: float = Field(2.0, gt=0, description="boxes that reach between the ground and this height block, m")
-    safety_radius_m: float = Field(0.5, ge=0, le=50, description="how far walkers stay off obstacles, m; 0 is off")
-    min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
-    max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
-    min_component_cells: int = Field(4000, ge=1, description="connected free areas of fewer cells are not used")
-    num_retries: int = Field(5, ge=0, description="new ends tried for a walk whose first ends do not serve")
-    max_detour: float = Field(
-        3.0, ge=0, description="ends whose route is this many times longer than straight do not serve; 0 is off"
-    )
-    ground: Literal["anywhere", "surfaces", "paved"] = Field(
-        "surfaces",
-        description="where people walk: anywhere in the map's bounds, on any ground box, or on streets and squares",
-    )
-    cruise_speed_mps: float = Field(1.2, gt=0, description="speed on straight ground, m/s")
-    curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
-    speed_jitter: float = Field(0.15, ge=0, lt=1, description="beta of eq:speed: random share of speed; 0 is off")
-    min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
-    max_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="speeds are cut to this, m/s")
-
-    @model_validator(mode="after")
-    def _ranges_are_ordered(self) -> PedestriansConfig:
-        if self.min_distance_m >= self.max_distance_m:
-            raise ValueError(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
-        if self.min_speed_mps > self.max_speed_mps:
-            raise ValueError(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
-        if 0 < self.max_detour < 1:
-            raise ValueError(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
-        return self
-
-
 # --- one walk ---------------------------------------------------------------------------------------------------------
-
-
-def walkable_ground(
-    box_map: BoxMap,
-    cfg: PedestriansConfig,
-    roi: Roi | None = None,
-    *,
-    where: str | Path = "map",
-    roi_where: str | Path = "region of interest",
-    clock: Clock | None = None,
-) -> WalkableGround:
-    """Find the ground that the settings allow walks on; see walkable.find_ground."""
-    return find_ground(
-        box_map,
-        roi,
-        resolution_m=cfg.resolution_m,
-        human_height_m=cfg.human_height_m,
-        safety_radius_m=cfg.safety_radius_m,
-        surfaces=cfg.ground,
-        min_component_cells=cfg.min_component_cells,
-        where=where,
-        roi_where=roi_where,
-        clock=clock,
-    )
 
 
 @dataclass(frozen=True)
@@ -260,9 +206,7 @@ def run(
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
         write_json(out / "pedestrians_report.json", summary)
-        write_bytes(
-            out / "paths.png", draw_overview(ground.grid, ground.inflated, ground.parts, ground.is_in_roi, paths)
-        )
+        write_bytes(out / "paths.png", draw_overview(ground, paths))
     seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
     outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
     stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)

@@ -1,6 +1,6 @@
 """Where people can walk on a map, and which cells serve as the ends of a walk (sec:step3).
 
-Grid, projection, inflation and connectivity of the pedestrian stage; the arithmetic on cells is in grid.py.
+The settings of the pedestrian stage; its grid, projection, inflation and connectivity. The arithmetic on cells is in grid.py.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from cosfly.config import Config
 from cosfly.errors import NoPathError
 from cosfly.grid import (
-    HUMAN_HEIGHT_M,
-    RESOLUTION_M,
     OccupancyGrid,
     blocks_walking,
     connected_parts,
@@ -29,6 +29,7 @@ from cosfly.grid import (
     roi_mask,
     surface,
 )
+from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.roi import Roi
@@ -36,6 +37,41 @@ from cosfly.products.roi import Roi
 log = logging.getLogger(__name__)
 
 PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
+
+
+class PedestriansConfig(Config):
+    """Settings of the pedestrian stage; the defaults are the paper's (tab:ped_params, eq:speed)."""
+
+    num_paths: int = Field(20, ge=1, le=100_000, description="walks to make")
+    resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
+    human_height_m: float = Field(2.0, gt=0, description="boxes that reach between the ground and this height block, m")
+    safety_radius_m: float = Field(0.5, ge=0, le=50, description="how far walkers stay off obstacles, m; 0 is off")
+    min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
+    max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
+    min_component_cells: int = Field(4000, ge=1, description="connected free areas of fewer cells are not used")
+    num_retries: int = Field(5, ge=0, description="new ends tried for a walk whose first ends do not serve")
+    max_detour: float = Field(
+        3.0, ge=0, description="ends whose route is this many times longer than straight do not serve; 0 is off"
+    )
+    ground: Literal["anywhere", "surfaces", "paved"] = Field(
+        "surfaces",
+        description="where people walk: anywhere in the map's bounds, on any ground box, or on streets and squares",
+    )
+    cruise_speed_mps: float = Field(1.2, gt=0, description="speed on straight ground, m/s")
+    curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
+    speed_jitter: float = Field(0.15, ge=0, lt=1, description="beta of eq:speed: random share of speed; 0 is off")
+    min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
+    max_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="speeds are cut to this, m/s")
+
+    @model_validator(mode="after")
+    def _ranges_are_ordered(self) -> PedestriansConfig:
+        if self.min_distance_m >= self.max_distance_m:
+            raise ValueError(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
+        if self.min_speed_mps > self.max_speed_mps:
+            raise ValueError(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
+        if 0 < self.max_detour < 1:
+            raise ValueError(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
+        return self
 
 
 @dataclass(frozen=True)
@@ -80,41 +116,35 @@ class Clock:
         self.seconds[step] = self.seconds.get(step, 0.0) + seconds
 
 
-def find_ground(
+def walkable_ground(
     box_map: BoxMap,
+    cfg: PedestriansConfig,
     roi: Roi | None = None,
     *,
-    resolution_m: float = RESOLUTION_M,
-    human_height_m: float = HUMAN_HEIGHT_M,
-    safety_radius_m: float = 0.5,
-    surfaces: Literal["anywhere", "surfaces", "paved"] = "surfaces",
-    min_component_cells: int = 4000,
     where: str | Path = "map",
     roi_where: str | Path = "region of interest",
     clock: Clock | None = None,
 ) -> WalkableGround:
-    """Find the ground that walks may use.
+    """Find the ground that the settings allow walks on.
 
     Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never cuts a
     corner cannot pass between two cells that touch by a corner only, so an 8-connected component may hold several parts; both
     ends of a walk are to be drawn from one part, and then a route always exists.
 
     Args:
-        surfaces: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only. What lies outside a
-            city model's data has no obstacles either: without ground boxes below, nobody could tell it from a square.
         where, roi_where: the files to name in an error.
     Raises:
         NoPathError: no cell is walkable, or no component is large enough.
     """
     clock = clock or Clock()
     with clock("grid"):
-        empty = empty_grid(box_map, resolution_m)
+        empty = empty_grid(box_map, cfg.resolution_m)
     with clock("project"):
-        grid = occupancy(box_map, height_m=human_height_m, like=empty)
-        has_surface = _surface(box_map, surfaces, grid)
+        grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
+        has_surface = _surface(box_map, cfg.ground, grid)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
     with clock("inflate"):
-        inflated = inflate(grid, safety_radius_m)
+        inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
         num_free = _count(free)
         for mask in (has_surface, is_in_roi):
@@ -122,7 +152,7 @@ def find_ground(
                 free &= mask
     counts: dict[str, Any] = {
         "boxes": len(box_map),
-        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=human_height_m)),
+        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=cfg.human_height_m)),
         "grid": list(grid.size),
         "cells": free.size,
         "cells_occupied": _count(grid.occupied),
@@ -135,7 +165,7 @@ def find_ground(
     _check_walkable(counts, where, roi_where)
     with clock("connectivity"):
         place = where if roi is None else roi_where
-        parts = _parts_of_large_components(free, min_component_cells, counts, place)
+        parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
     return WalkableGround(grid, inflated, parts, box_map.header.ground_z_m, is_in_roi, counts)
 
 
@@ -143,15 +173,21 @@ def _count(mask: np.ndarray) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _surface(box_map: BoxMap, surfaces: str, grid: OccupancyGrid) -> np.ndarray | None:
-    """Tell where there is ground as the settings want it; None for everywhere, also if the map has no ground at all."""
-    if surfaces == "anywhere":
+def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid) -> np.ndarray | None:
+    """Tell where there is ground as the settings want it; None for everywhere, also if the map has no ground at all.
+
+    What lies outside a city model's data has no obstacles either: without ground boxes below, nobody could tell it from a square.
+
+    Args:
+        ground: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only (`paved`).
+    """
+    if ground == "anywhere":
         return None
     found = surface(box_map, GROUND_KINDS, like=grid)
     if found is None:
         log.warning("%s has no ground boxes: people walk wherever nothing stands", box_map.name)
         return None
-    if surfaces == "surfaces":
+    if ground == "surfaces":
         return found
     paved = surface(box_map, PAVED_KINDS, like=grid)
     return np.zeros_like(found) if paved is None else paved

@@ -1,6 +1,6 @@
 """How a person walks along a route: slower round corners, with a little unrest, sampled at equal times (sec:step3).
 
-Pure arithmetic on polylines; which route is walked is pedestrians.py's affair.
+Pure arithmetic on polylines; which route is walked is stage.py's affair.
 """
 
 from __future__ import annotations
