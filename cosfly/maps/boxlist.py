@@ -22,15 +22,7 @@ class BoxList:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def add(
-        self,
-        kind: str,
-        center_xy: Pair,
-        size_xy: Pair,
-        low_m: float,
-        high_m: float,
-        yaw_deg: float = 0.0,
-    ) -> None:
+    def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
         """Add a box by its footprint (full sizes before turning, m) and its height interval."""
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
             raise ValueError(f"an empty box: {kind}, {size_xy}, {low_m} to {high_m} m")

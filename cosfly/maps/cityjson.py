@@ -27,15 +27,9 @@ SLAB_M = 0.3
 STEEP = 0.02  # a surface whose projection is less than this share of its area is a wall: it has no footprint
 # The map is made flat. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads cover lawns.
 SURFACE_TOPS_M = {
-    "Sidewalks": 0.0,
-    "Bridge": -0.02,
-    "Walls": 0.0,
-    "Roads": -0.03,
-    "RailTrack": -0.03,
-    "Ground": -0.05,
-    "Terrain": -0.1,
-    "Water": -0.07,
-}
+    "Sidewalks": 0.0, "Bridge": -0.02, "Walls": 0.0, "Roads": -0.03, "RailTrack": -0.03, "Ground": -0.05,
+    "Terrain": -0.1, "Water": -0.07,
+}  # fmt: skip
 
 
 class CityJsonConfig(Config):
@@ -77,9 +71,8 @@ class CityJsonConfig(Config):
 
     def inputs(self) -> dict[str, Path]:
         if self.path is None:
-            raise ConfigError(
-                "no file is given", where="maps.cityjson.path", expected="a path", fix="--set maps.cityjson.path=..."
-            )
+            fix = "--set maps.cityjson.path=..."
+            raise ConfigError("no file is given", where="maps.cityjson.path", expected="a path", fix=fix)
         return {"city_model": self.path}
 
 
@@ -138,27 +131,19 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
 def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], np.ndarray]:
     """Move the middle of the map to the origin and the usual height of roads to z = 0; gives the offset too."""
-    corners = np.concatenate([ring for item in objects for surface in item.surfaces for ring in surface])
+    corners = np.concatenate([item.corners() for item in objects])
     low, high = corners.min(axis=0), corners.max(axis=0)
     if max(high[:2] - low[:2]) > 20_000:
         raise InputError(
             "the map is too wide", where=f"{path}: vertices", got=f"{high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m",
             expected="at most 20 km", fix="cut a part out, or mend the stray vertex",
         )  # fmt: skip
-    roads = [
-        ring[:, 2]
-        for item in objects
-        if item.rule.kind in ("Roads", "Sidewalks")
-        for surface in item.surfaces
-        for ring in surface
-    ]
-    heights = np.concatenate(roads) if roads else corners[:, 2]
-    ground = float(np.median(heights)) if roads else float(np.percentile(heights, 5))
-    offset = np.array([*np.round((low + high)[:2] / 2), round(ground, 3)])
-    moved = [
-        item._replace(surfaces=[[ring - offset for ring in surface] for surface in item.surfaces]) for item in objects
-    ]
-    return moved, offset
+    roads = [item.corners() for item in objects if item.rule.kind in ("Roads", "Sidewalks")]
+    ground = np.median(np.concatenate(roads)[:, 2]) if roads else np.percentile(corners[:, 2], 5)
+    offset = np.array([*np.round((low + high)[:2] / 2), round(float(ground), 3)])
+    return [
+        item._replace(surfaces=[[r - offset for r in rings] for rings in item.surfaces]) for item in objects
+    ], offset
 
 
 def _facets(item: CityObject) -> list[Facet]:
@@ -183,16 +168,12 @@ def _facets(item: CityObject) -> list[Facet]:
 
 def _add_solid(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint) -> Any:
     """Add a building as upright boxes from the ground (or below it) to its top; gives the union of their outlines."""
-    low, high = item.heights()
-    low, high = min(low, 0.0), max(high, low + 0.1)
-    outlines = []
+    z = item.corners()[:, 2]
+    low, high = min(float(z.min()), 0.0), max(float(z.max()), float(z.min()) + 0.1)
+    shares, outlines = (0.25, 0.4, 0.5, 0.6, 0.75), []
     for polygon in polygons_of(footprint):
-        for rectangle in cover(
-            polygon.simplify(0.05),
-            min_fill=cfg.solid_fill,
-            min_size_m=cfg.solid_piece_m,
-            shares=(0.25, 0.4, 0.5, 0.6, 0.75),
-        ):
+        outline = polygon.simplify(0.05)
+        for rectangle in cover(outline, min_fill=cfg.solid_fill, min_size_m=cfg.solid_piece_m, shares=shares):
             boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
             outlines.append(rectangle_polygon(rectangle))
     return united(outlines)
@@ -200,8 +181,7 @@ def _add_solid(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint)
 
 def _add_wall(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint) -> None:
     """Add a wall piece by piece along its course, as high as the middle of its heights says."""
-    z = np.concatenate([ring[:, 2] for surface in item.surfaces for ring in surface])
-    high = float(np.clip(np.percentile(z, 75), 0.3, cfg.wall_max_m))
+    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, cfg.wall_max_m))
     for polygon in polygons_of(footprint):
         for rectangle in cover(polygon.simplify(0.02), min_fill=cfg.wall_fill, min_size_m=cfg.wall_piece_m):
             boxes.add(item.rule.kind, rectangle.center, rectangle.size, -SLAB_M, high, rectangle.yaw_deg)
@@ -244,7 +224,7 @@ def canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tupl
         heights (nx, ny) m, 0 where there is nothing; the indices (2,) of the first cell, whose low corner is at index * cell_m.
     """
     bounds = np.array([facet.polygon.bounds for facet in facets])
-    corners = np.concatenate([ring for surface in item.surfaces for ring in surface])
+    corners = item.corners()
     low = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
     high = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
     heights = np.zeros(high - low + 1)

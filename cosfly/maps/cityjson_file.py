@@ -62,9 +62,9 @@ class CityObject(NamedTuple):
     rule: Rule
     surfaces: list[list[np.ndarray]]
 
-    def heights(self) -> tuple[float, float]:
-        z = np.concatenate([ring[:, 2] for surface in self.surfaces for ring in surface])
-        return float(z.min()), float(z.max())
+    def corners(self) -> np.ndarray:
+        """All vertices, (n, 3) m."""
+        return np.concatenate([ring for surface in self.surfaces for ring in surface])
 
 
 class CityModel(NamedTuple):
@@ -88,9 +88,8 @@ def read_model(path: Path) -> CityModel:
     for object_id, value in model["CityObjects"].items():
         where = f"{path}: CityObjects.{object_id}"
         if not isinstance(value, dict) or not isinstance(value.get("type"), str):
-            raise InputError(
-                "not a city object", where=f"{where}.type", got=type(value).__name__, expected="an object with a type"
-            )
+            got, expected = type(value).__name__, "an object with a type"
+            raise InputError("not a city object", where=f"{where}.type", got=got, expected=expected)
         attributes = value.get("attributes")
         rule = rule_of(value["type"], attributes if isinstance(attributes, dict) else {})
         if rule is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from shapely.geometry.base import BaseGeometry
 
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
 MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
+
+Share = tuple[float, float]
 
 
 class Rectangle(NamedTuple):
@@ -43,13 +46,8 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
     return Rectangle(center, (float(sizes[best, 0]), float(sizes[best, 1])), float(np.degrees(angles[best])))
 
 
-def rectangle_polygon(rectangle: Rectangle) -> Polygon:
-    """Give a rectangle as a polygon."""
-    return _rectangle_at(rectangle, (-0.5, 0.5), (-0.5, 0.5))
-
-
-def _rectangle_at(rectangle: Rectangle, along: tuple[float, float], across: tuple[float, float]) -> Polygon:
-    """A part of a rectangle, in shares of its sizes from the middle; may reach out of it."""
+def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:
+    """Give a rectangle, or a part of it in shares of its sizes from the middle, as a polygon; may reach out of it."""
     yaw = np.radians(rectangle.yaw_deg)
     x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
     y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]
@@ -63,7 +61,7 @@ def cover(
     min_fill: float,
     min_size_m: float,
     max_size_m: float = np.inf,
-    shares: tuple[float, ...] = (0.5,),
+    shares: Sequence[float] = (0.5,),
 ) -> list[Rectangle]:
     """Cover a polygon, holes left out, with oriented rectangles.
 
@@ -95,16 +93,15 @@ def cover(
     return done
 
 
-def _cut(piece: Polygon, rectangle: Rectangle, shares: tuple[float, ...]) -> list[Polygon]:
+def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
     longer = 0 if rectangle.size[0] >= rectangle.size[1] else 1
     best: tuple[float, list[Polygon]] | None = None
     for axis in (longer, 1 - longer) if len(shares) > 1 else (longer,):
         for share in shares:
             parts: list[Polygon] = []
             for low, high in ((-0.6, share - 0.5), (share - 0.5, 0.6)):
-                window = _rectangle_at(
-                    rectangle, *(((low, high), (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), (low, high)))
-                )
+                along, across = ((low, high), (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), (low, high))
+                window = rectangle_polygon(rectangle, along, across)
                 parts += polygons_of(shapely.intersection(piece, window))
             if len(shares) == 1:
                 return parts

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
@@ -90,9 +90,8 @@ class SimWorldConfig(Config):
 
     def inputs(self) -> dict[str, Path]:
         if self.world is None:
-            raise ConfigError(
-                "no file is given", where="maps.simworld.world", expected="a path", fix="--set maps.simworld.world=..."
-            )
+            fix = "--set maps.simworld.world=..."
+            raise ConfigError("no file is given", where="maps.simworld.world", expected="a path", fix=fix)
         for number, path in enumerate(self.size_tables()):
             if not path.is_file():
                 raise InputError(
@@ -106,35 +105,31 @@ class SimWorldConfig(Config):
         return self.sizes or [self.world.parent / "Bbox.json"]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-
-class _Vector(_Strict):
+class _Vector(BaseModel):
     x: FiniteFloat
     y: FiniteFloat
     z: FiniteFloat
 
 
-class _Orientation(_Strict):
+class _Orientation(BaseModel):
     pitch: FiniteFloat
     yaw: FiniteFloat
     roll: FiniteFloat
 
 
-class _Properties(_Strict):
+class _Properties(BaseModel):
     location: _Vector
     orientation: _Orientation
     scale: _Vector
 
 
-class _Node(_Strict):
+class _Node(BaseModel):
     id: str
     instance_name: str
     properties: _Properties
 
 
-class _Size(_Strict):
+class _Size(BaseModel):
     bbox: _Vector
 
 
@@ -209,13 +204,8 @@ def asset_of(name: str) -> Asset | None:
 def _group(value: object, name: str, kind: type, path: Path):
     group = value.get(name) if isinstance(value, dict) else None
     if not isinstance(group, kind) or not group:
-        expected = "a list" if kind is list else "an object"
-        raise InputError(
-            f"holds no {name}",
-            where=f"{path}: {name}",
-            got=type(group).__name__,
-            expected=f"{expected} that is not empty",
-        )
+        expected = f"{'a list' if kind is list else 'an object'} that is not empty"
+        raise InputError(f"holds no {name}", where=f"{path}: {name}", got=type(group).__name__, expected=expected)
     return group
 
 
@@ -228,16 +218,11 @@ def _read_nodes(path: Path) -> list[_Node]:
             node = _Node.model_validate(value)
         scale, turn = node.properties.scale, node.properties.orientation
         if min(scale.x, scale.y, scale.z) <= 0:
-            raise InputError(
-                "a scale is not positive", where=f"{where}: properties.scale", got=str([scale.x, scale.y, scale.z])
-            )
+            got = str([scale.x, scale.y, scale.z])
+            raise InputError("a scale is not positive", where=f"{where}: properties.scale", got=got)
         if turn.pitch or turn.roll:
-            raise InputError(
-                "a tilted object",
-                where=f"{where}: properties.orientation",
-                got=f"pitch {turn.pitch}, roll {turn.roll}",
-                expected="0 and 0",
-            )
+            where, got = f"{where}: properties.orientation", f"pitch {turn.pitch}, roll {turn.roll}"
+            raise InputError("a tilted object", where=where, got=got, expected="0 and 0")
         nodes.append(node)
     return nodes
 
@@ -263,14 +248,10 @@ def _read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
 def _unknown(cfg: SimWorldConfig, node: _Node, what: str) -> int:
     """Count an asset that cannot be placed, or stop because of it."""
     if cfg.unknown == "error":
-        fix = (
-            "add a size table that has it to maps.simworld.sizes"
-            if what == "size"
-            else "add it to ASSETS in cosfly/maps/simworld.py"
-        )
+        to_size, to_kinds = "a size table that has it to maps.simworld.sizes", "it to ASSETS in cosfly/maps/simworld.py"
         raise InputError(
             f"an asset without a {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
-            fix=f"{fix}, or leave such assets out with --set maps.simworld.unknown=drop",
+            fix=f"add {to_size if what == 'size' else to_kinds}, or leave such assets out with --set maps.simworld.unknown=drop",
         )  # fmt: skip
     log.warning("%s: %s has no %s and is left out", node.id, node.instance_name, what)
     return 1
@@ -377,12 +358,8 @@ def _add_junction(boxes: BoxList, place: np.ndarray, arms: list[np.ndarray], ker
     for a in (-1, 1):
         for b in (-1, 1):
             _slab(boxes, "Sidewalks", place + middle * (a * x + b * y), (width, width), yaw)
-    for side, size in (
-        (x, (width, 2 * kerb)),
-        (-x, (width, 2 * kerb)),
-        (y, (2 * kerb, width)),
-        (-y, (2 * kerb, width)),
-    ):
+    along, across = (width, 2 * kerb), (2 * kerb, width)
+    for side, size in ((x, along), (-x, along), (y, across), (-y, across)):
         is_road = any(arm @ side > 0.7 for arm in arms)
         _slab(boxes, "Roads" if is_road else "Sidewalks", place + middle * side, size, yaw)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.config import Config
+from cosfly.maps import cityjson, simworld, synthetic
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
@@ -19,25 +19,17 @@ from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes
 from cosfly.topview import TopView, draw_map, png_bytes
 
-log = logging.getLogger(__name__)
-
-SOURCES = {
-    "synthetic": "cosfly.maps.synthetic:load",
-    "simworld": "cosfly.maps.simworld:load",
-    "cityjson": "cosfly.maps.cityjson:load",
-}
+SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
+    "synthetic": synthetic.load, "simworld": simworld.load, "cityjson": cityjson.load,
+}  # fmt: skip
 
 
 class MapsConfig(Config):
     """Where the map comes from."""
 
-    source: Literal["synthetic", "simworld", "cityjson"] = Field(
-        "synthetic", description="which of the sources to read"
-    )
+    source: Literal["synthetic", "simworld", "cityjson"] = Field("synthetic", description="which source to read")
     synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
-    simworld: SimWorldConfig = Field(
-        default_factory=SimWorldConfig, description="a SimWorld world file with its asset sizes"
-    )
+    simworld: SimWorldConfig = Field(default_factory=SimWorldConfig, description="a SimWorld world with asset sizes")
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
 
@@ -54,8 +46,7 @@ class MapsConfig(Config):
 
 def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
     """Read or build the map that the settings name."""
-    module, _, function = SOURCES[cfg.source].partition(":")
-    return getattr(importlib.import_module(module), function)(getattr(cfg, cfg.source), seed)
+    return SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:

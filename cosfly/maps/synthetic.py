@@ -220,9 +220,8 @@ def _crossings(boxes: BoxList, strips: list[Strip]) -> None:
                 for low in (2.54, 2.86, 3.18):
                     boxes.add("TrafficLight", (x - side * 0.3, y), (0.3, 0.3), low, low + 0.28)
     for strip in strips:  # a sewer under every street
-        boxes.add_span(
-            "Static", (strips[0].low_m, strip.middle_m - 0.6), (strips[-1].high_m, strip.middle_m + 0.6), -4.2, -3.0
-        )
+        middle = strip.middle_m
+        boxes.add_span("Static", (strips[0].low_m, middle - 0.6), (strips[-1].high_m, middle + 0.6), -4.2, -3.0)
 
 
 def _verge(boxes: BoxList, cfg: SyntheticConfig, strips: list[Strip], rng: np.random.Generator) -> None:
@@ -236,9 +235,8 @@ def _verge(boxes: BoxList, cfg: SyntheticConfig, strips: list[Strip], rng: np.ra
                 boxes.add("Fences", point(axis, at + 6.0, line), point(axis, 12.0, 0.1), -0.1, 1.3)
             for at in np.arange(-half + 8.0, half - 6.0, 11.0):
                 if rng.random() < 0.75:
-                    place = point(
-                        axis, at + rng.uniform(-2, 2), side * (half - 0.45 * cfg.verge_m + rng.uniform(-0.8, 0.8))
-                    )
+                    along = at + rng.uniform(-2, 2)
+                    place = point(axis, along, side * (half - 0.45 * cfg.verge_m + rng.uniform(-0.8, 0.8)))
                     tree(boxes, place, rng.uniform(3.5, 5.5), rng.uniform(6.0, 12.0), rng)
 
 
@@ -246,8 +244,7 @@ def _block_kinds(num_blocks: int, rng: np.random.Generator) -> list[str]:
     """One kind for each block: a park first, then a square, then the built kinds in turn; shuffled."""
     built = ("courtyard", "houses", "towers")
     count = num_blocks * num_blocks
-    kinds = (["park"] * max(1, count // 9) if count > 1 else []) + (
-        ["square"] * max(1, count // 9) if count > 3 else []
-    )
+    share = max(1, count // 9)
+    kinds = ["park"] * (share if count > 1 else 0) + ["square"] * (share if count > 3 else 0)
     kinds += [built[i % 3] for i in range(count - len(kinds))]
     return [kinds[i] for i in rng.permutation(count)]

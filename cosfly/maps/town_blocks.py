@@ -94,16 +94,8 @@ def _square(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
     boxes.add("Buildings", center, hall, -1.5, 9.0)
     boxes.add("Buildings", center, (6.0, 6.0), 9.0, 17.0)  # a clock tower on the roof
     boxes.add("Water", (middle[0], middle[1] - 4.0), (5.0, 5.0), -0.6, 0.45)
-    ring(
-        boxes,
-        "Static",
-        middle - np.array((3.0, 7.0)),
-        middle + np.array((3.0, -1.0)),
-        middle - np.array((2.5, 6.5)),
-        middle + np.array((2.5, -1.5)),
-        0.6,
-        -0.4,
-    )
+    outer, inner = middle + np.array([(-3.0, -7.0), (3.0, -1.0)]), middle + np.array([(-2.5, -6.5), (2.5, -1.5)])
+    ring(boxes, "Static", outer[0], outer[1], inner[0], inner[1], 0.6, -0.4)
     for x in np.linspace(low[0] + 4.0, high[0] - 4.0, 6):
         tree(boxes, (x, low[1] + 3.5), rng.uniform(3.0, 3.8), rng.uniform(5.5, 7.5), rng)
     for side in (-1, 1):
@@ -123,25 +115,17 @@ def _courtyard(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random
         for sy in (-1, 1):
             corner = np.array([low[0] if sx < 0 else high[0], low[1] if sy < 0 else high[1]])
             height = rng.uniform(10.0, 19.0)
-            _between(boxes, corner, (middle[0] + sx * gap, corner[1] - sy * depth), -2.0, height)
+            back = corner[1] - sy * depth
+            _between(boxes, corner, (middle[0] + sx * gap, back), -2.0, height)
             lower = height - rng.choice([0.0, 3.0, 6.0])
-            _between(
-                boxes, (corner[0], corner[1] - sy * depth), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower
-            )
+            _between(boxes, (corner[0], back), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower)
             _between(boxes, corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0), height, height + 2.6)
-            _between(
-                boxes, corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0)), -5.0, -2.2
-            )  # a cellar
+            cellar = corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0))
+            _between(boxes, *cellar, -5.0, -2.2)
     yard = np.array([low + depth + 4.0, high - depth - 4.0])
     for _ in range(4):
-        tree(
-            boxes,
-            rng.uniform(yard[0], yard[1]),
-            rng.uniform(3.5, 5.0),
-            rng.uniform(6.0, 9.0),
-            rng,
-            in_parts=rng.random() < 0.5,
-        )
+        place = rng.uniform(yard[0], yard[1])
+        tree(boxes, place, rng.uniform(3.5, 5.0), rng.uniform(6.0, 9.0), rng, in_parts=rng.random() < 0.5)
     bench(boxes, 0, middle[0], middle[1], rng)
 
 
@@ -168,14 +152,8 @@ def _houses(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
             tree(boxes, garden, rng.uniform(2.8, 4.2), rng.uniform(4.0, 7.0), rng, in_parts=rng.random() < 0.3)
             if column:
                 edge = low[0] + column * pitch
-                _between(
-                    boxes,
-                    (edge - 0.12, center[1] + side * 1.0),
-                    (edge + 0.12, middle[1] - side * 3.5),
-                    -0.2,
-                    1.7,
-                    "Walls",
-                )
+                front, back = (edge - 0.12, center[1] + side * 1.0), (edge + 0.12, middle[1] - side * 3.5)
+                _between(boxes, front, back, -0.2, 1.7, "Walls")
     for column in range(columns):
         a = low[0] + column * pitch + 3.5
         boxes.add_span("Fences", (a, middle[1] - 0.06), (a + pitch - 5.5, middle[1] + 0.06), -0.1, 1.2)
@@ -195,9 +173,8 @@ def _towers(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
         boxes.add("Buildings", center, podium, -1.0, 5.0)
         boxes.add("Buildings", center, podium * rng.uniform(0.6, 0.72), 5.0, rng.uniform(20.0, 35.0), yaw)
         boxes.add("Buildings", center + podium * 0.1, (5.0, 5.0), 1.0, 18.0, yaw)  # the lift shaft, inside
-    boxes.add(
-        "Buildings", low + size * (0.73, 0.22), size * (0.34, 0.2), -1.0, rng.uniform(8.0, 12.0), rng.uniform(-9.0, 9.0)
-    )
+    slab, height = size * (0.34, 0.2), rng.uniform(8.0, 12.0)
+    boxes.add("Buildings", low + size * (0.73, 0.22), slab, -1.0, height, rng.uniform(-9.0, 9.0))
     for place in ((0.2, 0.62), (0.32, 0.72), (0.2, 0.84), (0.34, 0.9)):
         tree(boxes, low + size * place, rng.uniform(3.2, 4.4), rng.uniform(6.0, 9.0), rng, in_parts=rng.random() < 0.5)
 
