@@ -82,7 +82,8 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     todo = stages(cfg, out, resume=resume)
     _save_run(cfg, out)
     results = []
-    with compiled_ahead(cfg.plan.planner) as wait_for_compiled:
+    to_plan = not (out / "plan/manifest.json").exists()
+    with compiled_ahead(cfg.plan.planner, needed=to_plan) as wait_for_compiled:
         for number, stage in enumerate(todo, 1):
             was_complete = (out / stage.name / "manifest.json").exists()
             log.info("[%d/%d] %s%s", number, len(todo), stage.name, ": already complete" if was_complete else "")

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -83,6 +84,24 @@ def test_the_spare_process_ends_with_the_one_that_started_it(tmp_path):
         spare.stdin.close()
         assert spare.wait(60) == 1
     assert not (tmp_path / "muco.compiled").exists()
+
+
+def test_a_spare_process_that_takes_too_long_is_ended(tmp_path, monkeypatch):
+    started, popen = [], subprocess.Popen
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(ahead, "WAIT_MAX_S", 0.0)
+    monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[0])
+    with ahead.compiled_ahead("muco") as wait:
+        wait()
+        assert started[0].wait(60) == -signal.SIGKILL
+
+
+def test_nothing_is_compiled_ahead_where_nothing_is_to_be_planned(tmp_path, monkeypatch):
+    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(ahead.subprocess, "Popen", None)
+    with ahead.compiled_ahead("muco", needed=False) as wait:
+        wait()
 
 
 def test_a_run_goes_on_without_a_spare_process(tmp_path, monkeypatch):

@@ -20,10 +20,14 @@ NICENESS = 10
 
 
 @contextlib.contextmanager
-def compiled_ahead(planner: str) -> Iterator[Callable[[], None]]:
-    """Compile meanwhile; gives the function that waits for the end of it. Does nothing where it was done before or cannot be done."""
+def compiled_ahead(planner: str, *, needed: bool = True) -> Iterator[Callable[[], None]]:
+    """Compile meanwhile; gives the function that waits for the end of it. Does nothing where it was done before or cannot be done.
+
+    Args:
+        needed: whether anything is still to be planned.
+    """
     folder = cache_folder()
-    if folder is None or (folder / _mark(planner)).exists():
+    if not needed or folder is None or (folder / _mark(planner)).exists():
         yield lambda: None
         return
     command = [sys.executable, "-m", "cosfly.planners.ahead", planner]
@@ -34,8 +38,10 @@ def compiled_ahead(planner: str) -> Iterator[Callable[[], None]]:
         return
 
     def wait() -> None:
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        try:
             process.wait(WAIT_MAX_S)
+        except subprocess.TimeoutExpired:
+            process.kill()  # or both would compile the same
 
     try:
         yield wait
