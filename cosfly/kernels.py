@@ -47,10 +47,6 @@ class BoxIndex(NamedTuple):
     starts: np.ndarray
     members: np.ndarray
 
-    @property
-    def num_boxes(self) -> int:
-        return len(self.rows)
-
 
 # --- building ---------------------------------------------------------------------------------------------------------
 
@@ -87,7 +83,7 @@ def index_boxes(
 
 def obstacle_index(box_map: BoxMap) -> BoxIndex:
     """Index the boxes of a map that a drone can hit or that can hide a person (NO_OBSTACLE_KINDS left out)."""
-    solid = box_map.select(~np.isin(box_map.kinds, sorted(NO_OBSTACLE_KINDS)))
+    solid = box_map.select(~box_map.is_any_of(NO_OBSTACLE_KINDS))
     return index_boxes(solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg)))
 
 
@@ -120,7 +116,12 @@ def _fill_cells(first, last, shape):
 @njit(cache=True, inline="always")
 def in_box_frame(rows, box, x, y, z):
     """Give the coordinates of a world point in a box's frame."""
-    dx, dy, dz = x - rows[box, CENTER_X], y - rows[box, CENTER_Y], z - rows[box, CENTER_Z]
+    return turned(rows, box, x - rows[box, CENTER_X], y - rows[box, CENTER_Y], z - rows[box, CENTER_Z])
+
+
+@njit(cache=True, inline="always")
+def turned(rows, box, dx, dy, dz):
+    """Turn a world vector into a box's frame."""
     return (
         rows[box, XU] * dx + rows[box, YU] * dy + rows[box, ZU] * dz,
         rows[box, XV] * dx + rows[box, YV] * dy + rows[box, ZV] * dz,
@@ -138,6 +139,15 @@ def distance_to_box(rows, box, x, y, z):
         return deepest
     px, py, pz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
     return np.sqrt(px * px + py * py + pz * pz)
+
+
+@njit(cache=True, inline="always")
+def squared_gap(rows, box, x, y, z):
+    """Squared distance of a point to the axis-aligned bounds of a box, m^2: the box itself is no nearer."""
+    dx = max(rows[box, LOW_X] - x, 0.0, x - rows[box, HIGH_X])
+    dy = max(rows[box, LOW_Y] - y, 0.0, y - rows[box, HIGH_Y])
+    dz = max(rows[box, LOW_Z] - z, 0.0, z - rows[box, HIGH_Z])
+    return dx * dx + dy * dy + dz * dz
 
 
 @njit(cache=True)
@@ -175,21 +185,27 @@ def clip(origin, direction, half, enter, leave):
     return max(enter, min(near, far)), min(leave, max(near, far))
 
 
+@njit(cache=True, inline="always")
+def touches(rows, box, a, b, c, u, v, w, inflate_m):
+    """Tell whether a segment in a box's frame touches the box grown by `inflate_m` (slab method, Kay and Kajiya 1986)."""
+    enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
+    enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
+    enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
+    return enter <= leave
+
+
 @njit(cache=True)
 def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
-    """Tell whether a segment touches a box grown by `inflate_m` on every side (slab method, Kay and Kajiya 1986)."""
+    """Tell whether a segment touches a box grown by `inflate_m` on every side."""
     if min(ax, bx) > rows[box, HIGH_X] + inflate_m or max(ax, bx) < rows[box, LOW_X] - inflate_m:
         return False
     if min(ay, by) > rows[box, HIGH_Y] + inflate_m or max(ay, by) < rows[box, LOW_Y] - inflate_m:
         return False
     if min(az, bz) > rows[box, HIGH_Z] + inflate_m or max(az, bz) < rows[box, LOW_Z] - inflate_m:
         return False
-    u, v, w = in_box_frame(rows, box, ax, ay, az)
-    u1, v1, w1 = in_box_frame(rows, box, bx, by, bz)
-    enter, leave = clip(u, u1 - u, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
-    enter, leave = clip(v, v1 - v, rows[box, HALF_Y] + inflate_m, enter, leave)
-    enter, leave = clip(w, w1 - w, rows[box, HALF_Z] + inflate_m, enter, leave)
-    return enter <= leave
+    a, b, c = in_box_frame(rows, box, ax, ay, az)
+    u, v, w = in_box_frame(rows, box, bx, by, bz)
+    return touches(rows, box, a, b, c, u, v, w, inflate_m)
 
 
 # --- many boxes, one query --------------------------------------------------------------------------------------------
@@ -222,10 +238,7 @@ def nearest_box(index, x, y, z, reach_m):
                 cell = ix * num_y + iy
                 for place in range(index.starts[cell], index.starts[cell + 1]):
                     box = index.members[place]
-                    dx = max(index.rows[box, LOW_X] - x, 0.0, x - index.rows[box, HIGH_X])
-                    dy = max(index.rows[box, LOW_Y] - y, 0.0, y - index.rows[box, HIGH_Y])
-                    dz = max(index.rows[box, LOW_Z] - z, 0.0, z - index.rows[box, HIGH_Z])
-                    gap = dx * dx + dy * dy + dz * dz
+                    gap = squared_gap(index.rows, box, x, y, z)
                     if gap > 0.0 and (best <= 0.0 or gap >= best * best):
                         continue
                     distance = distance_to_box(index.rows, box, x, y, z)
@@ -277,12 +290,8 @@ def free_rays(index, boxes, num_boxes, x, y, z, target):
     """Give the fraction of the five rays from a point to a target that none of `boxes[:num_boxes]` touches."""
     free = 0
     for ray in range(5):
-        tx, ty, tz = (
-            target[0] + RAY_OFFSETS_M[ray, 0],
-            target[1] + RAY_OFFSETS_M[ray, 1],
-            target[2] + RAY_OFFSETS_M[ray, 2],
-        )
-        blocked = False
+        tx, ty = target[0] + RAY_OFFSETS_M[ray, 0], target[1] + RAY_OFFSETS_M[ray, 1]
+        tz, blocked = target[2] + RAY_OFFSETS_M[ray, 2], False
         for k in range(num_boxes):
             if segment_hits_box(index.rows, boxes[k], tx, ty, tz, x, y, z, 0.0):
                 blocked = True

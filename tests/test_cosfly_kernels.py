@@ -29,7 +29,7 @@ def slow_distances(index, points):
 
 def slow_hits(index, start, end, inflate_m=0.0):
     """(k,) bool: clip the segment by the six planes of each grown box."""
-    hits = np.zeros(index.num_boxes, dtype=bool)
+    hits = np.zeros(len(index.rows), dtype=bool)
     for box, (center, half_extent, rotation) in enumerate(zip(*parts(index), strict=True)):
         a = rotation.T @ (start - center)
         d = rotation.T @ (end - center) - a
@@ -213,7 +213,7 @@ def test_a_stray_box_far_away_does_not_fill_the_memory():
 def test_ground_and_water_are_no_obstacles():
     kinds = [KINDS[name] for name in ("Roads", "Water", "Terrain", "Buildings", "Vegetation")]
     box_map = make_box_map(np.zeros((5, 3)), np.ones((5, 3)), np.zeros((5, 3)), kinds)
-    assert kernels.obstacle_index(box_map).num_boxes == 2
+    assert kernels.obstacle_index(box_map).rows.shape[0] == 2
 
 
 @settings(max_examples=40)

@@ -87,7 +87,7 @@ def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
     scenario = Scenario("w", targets, 0.0)
     headings = behind.smoothed_headings(targets, 4.0)
     problem = muco.make_problem(scenario, headings, cfg)
-    first, _ = muco.start_trajectory(scenario, headings, problem, obstacles, cfg)
+    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, cfg)
     points, solver = muco.optimize(first, problem, obstacles, cfg.muco)
     monkeypatch.setattr(step, "remember_boxes", lambda *_: None)
     monkeypatch.setattr(muco, "descend", step.descend.py_func)  # the loop in Python, so that it calls what is set above

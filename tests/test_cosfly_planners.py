@@ -117,7 +117,7 @@ def shaken(world, seed=3):
 @pytest.mark.parametrize("world", ["empty", "canyon", "corner", "tower_behind"])
 def test_terms_agree_with_their_definitions(world):
     points, problem, obstacles = shaken(world)
-    state = loss.make_state(len(points), obstacles.num_boxes)
+    state = loss.make_state(len(points), len(obstacles.rows))
     total = loss.evaluate(points, problem, obstacles, np.zeros(len(points), dtype=bool), state)
     expected = plain_terms(points, problem, obstacles)
     np.testing.assert_allclose(state.terms, list(expected.values()), rtol=1e-9, atol=1e-9)
@@ -129,9 +129,9 @@ def test_terms_agree_with_their_definitions(world):
 def test_gradient_is_the_derivative_of_the_loss():
     points, problem, obstacles = shaken("corner")
     problem = problem._replace(weights=problem.weights * np.array([1, 1, 1, 1, 0, 1, 1]))  # visibility is a staircase
-    state, unmasked = loss.make_state(len(points), obstacles.num_boxes), np.zeros(len(points), dtype=bool)
+    state, unmasked = loss.make_state(len(points), len(obstacles.rows)), np.zeros(len(points), dtype=bool)
     loss.evaluate(points, problem, obstacles, unmasked, state)
-    gradient, scratch = state.gradient.copy(), loss.make_state(len(points), obstacles.num_boxes)
+    gradient, scratch = state.gradient.copy(), loss.make_state(len(points), len(obstacles.rows))
     for i, axis in np.ndindex(len(points), 3):
         if i % 17:
             continue
@@ -146,11 +146,11 @@ def test_gradient_is_the_derivative_of_the_loss():
 def test_difference_gradient_tends_to_the_analytic_one():
     points, problem, obstacles = shaken("canyon")
     narrow = problem._replace(difference_m=1e-5, altitudes=np.array([0.0, 20.0, 100.0]))
-    state, unmasked = loss.make_state(len(points), obstacles.num_boxes), np.zeros(len(points), dtype=bool)
+    state, unmasked = loss.make_state(len(points), len(obstacles.rows)), np.zeros(len(points), dtype=bool)
     loss.evaluate(points, narrow, obstacles, unmasked, state)
     differences, before = np.empty_like(points), points.copy()
     loss.difference_gradient(
-        points, narrow, obstacles, unmasked, loss.make_state(len(points), obstacles.num_boxes), differences
+        points, narrow, obstacles, unmasked, loss.make_state(len(points), len(obstacles.rows)), differences
     )
     np.testing.assert_array_equal(points, before)
     np.testing.assert_allclose(differences, state.gradient, rtol=1e-3, atol=1e-3)
@@ -183,7 +183,7 @@ def test_masked_waypoints_have_no_visibility_or_view_gradient():
     only = problem._replace(
         weights=problem.weights * np.array([0, 0, 0, 0, 1, 1, 0]), pitch_weight=0.0, altitude_weights=np.zeros(3)
     )
-    state = loss.make_state(len(points), obstacles.num_boxes)
+    state = loss.make_state(len(points), len(obstacles.rows))
     free = loss.evaluate(points, only, obstacles, np.zeros(len(points), dtype=bool), state)
     assert state.gradient.any()
     assert state.visibility_gradient.any()
@@ -238,7 +238,7 @@ def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
     assert_safe(first, obstacles)
     points, solver = muco.optimize(first, problem, obstacles, CFG.muco)
     assert_safe(points, obstacles)
@@ -254,7 +254,7 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
 def test_the_papers_step_overshoots_and_the_difference_gradient_ends_near_the_analytic_one():
     scenario, obstacles = scenario_of("corner")
     problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
     _, plain = muco.optimize(first, problem, obstacles, MucoConfig(step="paper", iterations_max=60))
     assert (np.diff(plain["loss_history"]) > 0).any()
     _, analytic = muco.optimize(first, problem, obstacles, MucoConfig())
@@ -267,9 +267,9 @@ def test_the_papers_step_overshoots_and_the_difference_gradient_ends_near_the_an
 def test_the_end_is_within_five_percent_of_a_general_solver(world):
     scenario, obstacles = scenario_of(world)
     problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
     _, solver = muco.optimize(first, problem, obstacles, CFG.muco)
-    state, unmasked = loss.make_state(len(first), obstacles.num_boxes), np.zeros(len(first), dtype=bool)
+    state, unmasked = loss.make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
 
     def loss_and_gradient(interior):
         points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])
@@ -287,7 +287,7 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
 def test_a_small_learning_rate_lets_the_papers_step_fall():
     scenario, obstacles = scenario_of("empty")
     problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario, problem.headings_rad, problem, obstacles, CFG)
+    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
     _, slow = muco.optimize(
         first, problem, obstacles, MucoConfig(step="paper", learning_rate=0.001, iterations_max=200)
     )
@@ -301,15 +301,15 @@ def test_the_safety_checker_notices_a_flight_through_a_tower():
     with pytest.raises(AssertionError):
         assert_safe(through, obstacles)
     scenario, _ = scenario_of("tower_behind")
-    assert not step.is_feasible(through, problem_of(scenario), obstacles)
+    assert not step.is_feasible(through, problem_of(scenario), obstacles, nothing_nearby(len(through)))
 
 
 def test_a_thin_wall_between_two_waypoints_is_a_collision():
     wall = kernels.obstacle_index(town_of(((0, 0, 20), (0.01, 50, 40))))
     points = np.array([[-2.45, 0, 20.0], [2.45, 0, 20.0]])
     problem = problem_of(scenario_of("empty")[0])._replace(floor_m=2.0)
-    assert not step.is_feasible(points, problem, wall)
-    assert step.is_feasible(points - np.array([5.0, 0, 0]), problem, wall)
+    assert not step.is_feasible(points, problem, wall, nothing_nearby(len(points)))
+    assert step.is_feasible(points - np.array([5.0, 0, 0]), problem, wall, nothing_nearby(len(points)))
 
 
 @pytest.mark.parametrize(

@@ -215,7 +215,7 @@ def test_the_band_moves_all_but_anchors_and_stops_when_straight():
 
 def test_candidates_keep_distance_altitude_and_sight():
     obstacles = kernels.obstacle_index(town_of(((10, 0, 15), (1, 20, 15))))
-    blockers, target = np.empty(obstacles.num_boxes, dtype=np.int64), np.array([0.0, 0, 1])
+    blockers, target = np.empty(len(obstacles.rows), dtype=np.int64), np.array([0.0, 0, 1])
 
     def valid(x, z, floor):
         return smooth.candidate_is_valid(x, 0.0, z, target, floor, obstacles, limits(), blockers)

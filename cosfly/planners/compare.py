@@ -105,10 +105,8 @@ def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> 
         "clearance_larger": [a["clearance_min_m"] > b["clearance_min_m"] for a, b in pairs],
         "both_collision_free": [a["collision_fraction"] == b["collision_fraction"] == 0 for a, b in pairs],
     }
-    return {
-        name: {"count": sum(won), "of": len(pairs), "rate": round(sum(won) / len(pairs), 4)}
-        for name, won in wins.items()
-    }
+    num = len(pairs)
+    return {name: {"count": sum(won), "of": num, "rate": round(sum(won) / num, 4)} for name, won in wins.items()}
 
 
 def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
@@ -216,11 +214,8 @@ def run(
         for name in cfg.planners
     }
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
-    summary = {
-        "planners": {name: PLANNERS[name] for name in flights},
-        **summarize(flights),
-        "left_out": _left_out(finished.records),
-    }
+    named = {name: PLANNERS[name] for name in flights}
+    summary = {"planners": named, **summarize(flights), "left_out": _left_out(finished.records)}
     write_json(product, {"schema": SCHEMA, "schema_version": VERSION, **header, **summary})
     outputs = [product]
     for name, traces in flights.items():
@@ -283,12 +278,9 @@ def text_tables(product: Path) -> list[TextTable]:
     ]
     differences = ["difference"] if len(others) == 1 else [f"less {title_of(other)}" for other in others]
     columns = ["figure", *titles, *(column for title in differences for column in (title, "%"))]
+    figures = _figure_rows(record, read_manifest(product.parent).facts["timings"])
     tables = [
-        TextTable(
-            "Means over the walks that all fly",
-            columns,
-            _figure_rows(record, read_manifest(product.parent).facts["timings"]),
-        ),
+        TextTable("Means over the walks that all fly", columns, figures),
         TextTable("Axis scores, higher is better", ["axis", *titles], axes),
     ]
     for other, rates in record["win_rates"].items():
@@ -296,8 +288,8 @@ def text_tables(product: Path) -> list[TextTable]:
             [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
             for name, row in rates.items()
         ]
-        against = f"{title_of(first)} against {title_of(other)}, walk by walk"
-        tables.append(TextTable(against, ["criterion", "count", "rate"], rows))
+        title = f"{title_of(first)} against {title_of(other)}, walk by walk"
+        tables.append(TextTable(title, ["criterion", "count", "rate"], rows))
     return tables
 
 

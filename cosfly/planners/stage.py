@@ -6,6 +6,7 @@ Compiled code is imported by the functions that need it: `cosfly --help` goes wi
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,12 +48,8 @@ def make_scenario(walk: Walk, obstacles: BoxIndex) -> Scenario:
         raise NoPathError("a walk of one point cannot be followed", where=walk.path_id, expected="two points or more")
     uneven = np.abs(np.diff(walk.time_s) - DT_S) > 1e-3
     if uneven.any():
-        raise NoPathError(
-            "uneven time stamps",
-            where=f"{walk.path_id}: t[{int(np.argmax(uneven)) + 1}]",
-            got=f"a step of {np.diff(walk.time_s)[uneven][0]:g} s",
-            expected=f"{DT_S:g} s",
-        )
+        where, got = f"{walk.path_id}: t[{int(np.argmax(uneven)) + 1}]", f"{np.diff(walk.time_s)[uneven][0]:g} s"
+        raise NoPathError("uneven time stamps", where=where, got=f"a step of {got}", expected=f"{DT_S:g} s")
     if np.abs(targets).max() > COORDINATE_MAX_M:
         raise NoPathError(
             "a coordinate is too large", where=walk.path_id, got=f"{np.abs(targets).max():g} m",
@@ -82,10 +79,8 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
     positions = np.round(made.positions_m, 4)  # measured as it is written
     targets = np.round(scenario.targets_m, 4)
     clearances, _ = signed_distances(obstacles, positions, CLEARANCE_CAP_M)
-    if (
-        clearances.min() < cfg.relaxed_safety_m - CHECK_TOLERANCE_M
-        or segments_hit(obstacles, positions[:-1], positions[1:]).any()
-    ):
+    is_too_near = clearances.min() < cfg.relaxed_safety_m - CHECK_TOLERANCE_M
+    if is_too_near or segments_hit(obstacles, positions[:-1], positions[1:]).any():
         raise NoPathError(
             f"planner {cfg.planner} found no flight that is free of collisions", where=walk.path_id,
             got=f"a least clearance of {clearances.min():.2f} m", expected=f"{cfg.relaxed_safety_m:g} m and no segment in a box",
@@ -143,11 +138,8 @@ def warm_up(cfg: PlanConfig) -> None:
 
     walk = np.arange(8.0)
     positions = np.column_stack([0.5 * walk, np.zeros(8), np.zeros(8)])
-    in_the_way = (
-        np.array([[-10.0, 0.0, 15.0]]),
-        np.array([[1.0, 3.0, 15.0]]),
-    )  # hides the walk from behind: search runs too
-    obstacles = index_boxes(*in_the_way, np.eye(3)[None])
+    # One box that hides the walk from behind: the search for a start runs too.
+    obstacles = index_boxes(np.array([[-10.0, 0.0, 15.0]]), np.array([[1.0, 3.0, 15.0]]), np.eye(3)[None])
     plan_flight(Walk("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0)
 
 
@@ -205,8 +197,6 @@ def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[Kept | Dropp
 def check_ids(walks: list[Walk], paths: Path) -> None:
     if not walks:
         raise InputError("there are no paths", where=f"{paths}: paths", fix="run the pedestrians stage again")
-    known: set[str] = set()
-    for walk in walks:
-        if walk.path_id in known:
-            raise InputError("a path id occurs more than once", where=f"{paths}: paths", got=walk.path_id)
-        known.add(walk.path_id)
+    (path_id, count), *_ = Counter(walk.path_id for walk in walks).most_common(1)
+    if count > 1:
+        raise InputError("a path id occurs more than once", where=f"{paths}: paths", got=path_id)

@@ -81,7 +81,7 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
         facts.append((len(p), seen, clearance_m, hits, smooth, metrics.length_m(p), accel, jerk))
     table, all_ms = np.array(facts, dtype=float), np.array(times)
     return [
-        scene.name, planner, scene.obstacles.num_boxes, f"{len(facts)} + {failed}", round(table[:, 0].mean()), float(all_ms.mean()),
+        scene.name, planner, len(scene.obstacles.rows), f"{len(facts)} + {failed}", round(table[:, 0].mean()), float(all_ms.mean()),
         float(np.percentile(all_ms, 95)), float(all_ms.max()), f"{table[:, 1].mean():.3f}", f"{table[:, 1].min():.3f}",
         f"{table[:, 2].min():.2f}", int(table[:, 3].sum()), f"{int(table[:, 4].sum())} of {len(facts)}", float(table[:, 5].mean()),
         f"{table[:, 6].mean():.2f} / {table[:, 7].mean():.2f}",
@@ -137,10 +137,10 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     for scenario in scene.scenarios:
         headings = behind.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
         problem = muco.make_problem(scenario, headings, cfg)
-        first, _ = muco.start_trajectory(scenario, headings, problem, scene.obstacles, cfg)
+        first, _ = muco.start_trajectory(scenario.path_id, problem, scene.obstacles, cfg)
         ms, (_, solver) = scenes.cpu_ms(lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule))
         _, ruled = muco.optimize(first, problem, scene.obstacles, cfg.muco)
-        state, unmasked = make_state(len(first), scene.obstacles.num_boxes), np.zeros(len(first), dtype=bool)
+        state, unmasked = make_state(len(first), len(scene.obstacles.rows)), np.zeros(len(first), dtype=bool)
 
         def loss_and_gradient(interior, first=first, problem=problem, state=state, unmasked=unmasked):
             points = np.vstack([first[:1], interior.reshape(-1, 3), first[-1:]])

@@ -17,16 +17,8 @@ from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among
 from cosfly.planners.muco.window import window_rays
 
 TERM_NAMES = (
-    "tracking",
-    "smoothness",
-    "jerk",
-    "safety",
-    "visibility",
-    "view_angle",
-    "path_length",
-    "altitude",
-    "pitch",
-)
+    "tracking", "smoothness", "jerk", "safety", "visibility", "view_angle", "path_length", "altitude", "pitch",
+)  # fmt: skip
 TRACKING, SMOOTHNESS, JERK, SAFETY, VISIBILITY, VIEW_ANGLE, PATH_LENGTH, ALTITUDE, PITCH = range(9)
 LEAST, PREFERRED, GREATEST = range(3)  # altitudes
 BELOW, ABOVE, SWING = range(3)  # altitude weights; the swing is the oscillation
@@ -150,6 +142,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
     targets, headings, weights = problem.targets, problem.headings_rad, problem.weights
     influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
     low, high = problem.altitudes[LEAST], problem.altitudes[PREFERRED]
+    below, above = problem.altitude_weights[BELOW], problem.altitude_weights[ABOVE]
     for i in range(begin, end):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         dx, dy, dz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
@@ -187,13 +180,9 @@ def point_terms(points, begin, end, problem, index, masked, state):
             _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
 
         if z < low:
-            _add_square(
-                terms, gradient, band, ALTITUDE, i, problem.altitude_weights[BELOW], low - z, 0.0, 0.0, -1.0, True
-            )
+            _add_square(terms, gradient, band, ALTITUDE, i, below, low - z, 0.0, 0.0, -1.0, True)
         if z > high:
-            _add_square(
-                terms, gradient, band, ALTITUDE, i, problem.altitude_weights[ABOVE], z - high, 0.0, 0.0, 1.0, True
-            )
+            _add_square(terms, gradient, band, ALTITUDE, i, above, z - high, 0.0, 0.0, 1.0, True)
 
 
 @njit(cache=True)
@@ -242,9 +231,7 @@ def chain_curvature(problem, state):
     """Set the curvature to that of smoothness, jerk and altitude oscillation: the same wherever the waypoints are."""
     band, num_points, weights = state.band, len(problem.targets), problem.weights
     band.fill(0.0)
-    for coefficients, weight in (
-        (SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK]),
-    ):  # fmt: skip
+    for coefficients, weight in ((SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK])):
         for first in range(num_points - len(coefficients) + 1):
             for k in range(len(coefficients)):
                 for m in range(k + 1):

@@ -29,7 +29,7 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     """
     headings = smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
     problem = make_problem(scenario, headings, cfg)
-    start, kind = start_trajectory(scenario, headings, problem, obstacles, cfg)
+    start, kind = start_trajectory(scenario.path_id, problem, obstacles, cfg)
     points, solver = optimize(start, problem, obstacles, cfg.muco)
     del solver["loss_history"]  # for tests and plots; a product does not need it
     return Plan(points, {"start": kind, **solver})
@@ -63,41 +63,27 @@ def make_problem(scenario: Scenario, headings_rad: np.ndarray, cfg: PlanConfig) 
 # --- start ------------------------------------------------------------------------------------------------------------
 
 
-def start_trajectory(
-    scenario: Scenario, headings_rad: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
-) -> tuple[np.ndarray, str]:
+def start_trajectory(path_id: str, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str]:
     """Give a feasible trajectory to start from and its kind: `behind`, or `search` where behind is blocked or blind.
 
     Raises:
         NoPathError: neither is feasible.
     """
     targets = problem.targets
-    plain = behind(targets, headings_rad, cfg.behind_distance_m, float(problem.altitudes[PREFERRED]))
+    plain = behind(targets, problem.headings_rad, cfg.behind_distance_m, float(problem.altitudes[PREFERRED]))
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
     if plain_is_free and visibility(obstacles, plain, targets).mean() >= cfg.muco.start_visibility:
         return plain, "behind"
-    for climbing, clearance_m in (
-        (False, cfg.safety_distance_m),
-        (True, cfg.safety_distance_m),
-        (True, cfg.relaxed_safety_m),
-    ):
-        found = search_start(
-            targets,
-            headings_rad,
-            obstacles,
-            distance_m=cfg.behind_distance_m,
-            altitudes_m=tuple(problem.altitudes),
-            climbing=climbing,
-            clearance_m=clearance_m,
-            speed_max_mps=cfg.speed_max_mps,
-        )
-        if found is not None and is_feasible(found, problem, obstacles):
+    safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
+    for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
+        found = search_start(problem, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
+        if found is not None and is_feasible(found, problem, obstacles, nothing_nearby(len(found))):
             return _rounded_off(found, problem, obstacles), "search"
     if plain_is_free:
         return plain, "behind"
     raise NoPathError(
         "no free drone trajectory round this walk",
-        where=scenario.path_id,
+        where=path_id,
         expected=f"places from {cfg.altitude_min_m:g} to {cfg.altitude_max_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
         fix="is the walk roofed over? raise altitude_max_m or leave the path out",
     )
@@ -133,8 +119,8 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
         low_visibility=cfg.low_visibility,
         low_visibility_frames=cfg.low_visibility_frames,
     )
-    state = make_state(len(points), obstacles.num_boxes)
-    spare = make_state(len(points), obstacles.num_boxes)._replace(nearby=state.nearby)
+    state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
+    spare = spare._replace(nearby=state.nearby)
     # A flight of two points has nothing to move; only its loss is wanted.
     history = history if len(points) > 2 else history[:1]
     points, state, masked, num_iterations, num_tried, reason = descend(

@@ -11,18 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.compiled import njit
-from cosfly.kernels import (
-    HIGH_X,
-    HIGH_Y,
-    HIGH_Z,
-    LOW_X,
-    LOW_Y,
-    LOW_Z,
-    collect_hits,
-    distance_to_box,
-    nearest_box,
-    segment_hits_box,
-)
+from cosfly.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box, squared_gap
 
 MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often
 MOVED_M = 0.9  # looked up anew beyond this, so that the trial steps of the next iteration stay within MARGIN_M
@@ -101,10 +90,7 @@ def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
     best, best_box = reach_m, -1
     for k in range(count):
         box = boxes[i, k]
-        dx = max(rows[box, LOW_X] - x, 0.0, x - rows[box, HIGH_X])
-        dy = max(rows[box, LOW_Y] - y, 0.0, y - rows[box, HIGH_Y])
-        dz = max(rows[box, LOW_Z] - z, 0.0, z - rows[box, HIGH_Z])
-        gap = dx * dx + dy * dy + dz * dz
+        gap = squared_gap(rows, box, x, y, z)
         if gap > 0.0 and (best <= 0.0 or gap >= best * best):
             continue
         distance = distance_to_box(rows, box, x, y, z)

@@ -11,7 +11,9 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.geometry import DT_S
-from cosfly.kernels import BoxIndex, collect_hits, free_rays, nearest_box
+from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.muco.loss import GREATEST, PREFERRED, Problem
 
 # Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
 # the others climb over what blocks the way and are tried only where the first two do not suffice.
@@ -29,44 +31,29 @@ MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
 
 
 def search_start(
-    targets_m: np.ndarray,
-    headings_rad: np.ndarray,
-    index: BoxIndex,
-    *,
-    distance_m: float,
-    altitudes_m: tuple[float, float, float],
-    climbing: bool,
-    clearance_m: float,
-    speed_max_mps: float,
+    problem: Problem, index: BoxIndex, cfg: PlanConfig, *, climbing: bool, clearance_m: float
 ) -> np.ndarray | None:
     """Find a free trajectory that sees the target well, by dynamic programming over key frames.
 
     Args:
-        targets_m: (n, 3). headings_rad: (n,). distance_m: horizontal distance of the normal ring. altitudes_m: least, preferred
-            and greatest z in the world. climbing: also try places higher than those.
+        climbing: also try places higher than the normal and the steep ring.
     Returns:
         (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is none.
     """
+    targets_m, preferred_m = problem.targets, problem.altitudes[PREFERRED]
     keys = np.unique(np.append(np.arange(0, len(targets_m), FRAMES_BETWEEN_KEYS), len(targets_m) - 1))
-    rings = _rings(distance_m, altitudes_m, climbing)
+    rings = _rings(cfg.behind_distance_m, preferred_m, problem.altitudes[GREATEST], climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    angles = headings_rad[keys, None, None] + np.pi + azimuths[None, None, :]
-    shape = (len(keys), len(rings), NUM_AZIMUTHS)
+    angles = problem.headings_rad[keys, None, None] + np.pi + azimuths[None, None, :]
     offsets = rings[None, :, 0, None]
-    places = np.stack(
-        [
-            targets_m[keys, 0, None, None] + offsets * np.cos(angles),
-            targets_m[keys, 1, None, None] + offsets * np.sin(angles),
-            np.broadcast_to(rings[None, :, 1, None], shape),
-        ],
-        axis=-1,
-    ).reshape(len(keys), -1, 3)
-    turned = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
-    climbs = np.maximum(rings[:, 1] - altitudes_m[1], 0.0) / 20.0
-    extra = (
-        TURN_COST * turned[None] ** 2 + CLIMB_COST * climbs[:, None] + STEEP_COST * (np.arange(len(rings)) > 0)[:, None]
-    )
-    chosen = _search(places, targets_m[keys], keys * DT_S, extra, index, clearance_m, speed_max_mps)
+    x = targets_m[keys, 0, None, None] + offsets * np.cos(angles)
+    y = targets_m[keys, 1, None, None] + offsets * np.sin(angles)
+    z = np.broadcast_to(rings[None, :, 1, None], x.shape)
+    places = np.stack([x, y, z], axis=-1).reshape(len(keys), -1, 3)
+    turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
+    climbs = np.maximum(rings[:, 1] - preferred_m, 0.0)[:, None] / 20.0
+    extra = TURN_COST * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(len(rings)) > 0)[:, None]
+    chosen = _search(places, targets_m[keys], keys * DT_S, extra, index, clearance_m, cfg.speed_max_mps)
     if chosen[0] < 0:
         return None
     path = places[np.arange(len(keys)), chosen]
@@ -74,9 +61,8 @@ def search_start(
     return np.stack([np.interp(frames, keys, path[:, axis]) for axis in range(3)], axis=1)
 
 
-def _rings(distance_m: float, altitudes_m: tuple[float, float, float], climbing: bool) -> np.ndarray:
+def _rings(distance_m: float, preferred: float, greatest: float, climbing: bool) -> np.ndarray:
     """Give (r, 2): horizontal distance and z of the rings, the normal one first."""
-    _, preferred, greatest = altitudes_m
     rings = [(distance_m, preferred), (STEEP_RADIUS * distance_m, min(preferred + STEEP_CLIMB_M, greatest))]
     climbs = np.geomspace(8.0, max(greatest - preferred, 8.0), NUM_CLIMBS if climbing else 0)
     rings += [(distance_m + 0.2 * climb, min(preferred + climb, greatest)) for climb in climbs]
@@ -100,12 +86,9 @@ def _search(places, targets, times, extra, index, clearance_m, speed_max_mps):
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
             own[c] = np.inf
             if gap >= clearance_m:
-                count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], 0.8, blockers)
-                own[c] = (
-                    extra[c // num_azimuths, c % num_azimuths]
-                    + 1.0
-                    - free_rays(index, blockers, count, p[0], p[1], p[2], x)
-                )
+                count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
+                seen = free_rays(index, blockers, count, p[0], p[1], p[2], x)
+                own[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
         if key == 0:
             for c in range(num_places):
                 cost[0, c] = own[c]

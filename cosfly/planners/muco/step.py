@@ -14,7 +14,7 @@ import numpy as np
 from cosfly.compiled import boolean, int64, njit
 from cosfly.kernels import collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, difference_gradient, evaluate, remember_boxes
-from cosfly.planners.muco.nearby import known, nearest_among, nearest_of, nothing_nearby
+from cosfly.planners.muco.nearby import known, nearest_among, nearest_of
 
 TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
 REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere
@@ -304,17 +304,12 @@ def project(points, problem, index, begin, end, nearby):
     for i in range(begin, end):
         points[i, 2] = min(max(points[i, 2], low), high)
         if i > 0:
-            dx, dy, dz = (
-                points[i, 0] - points[i - 1, 0],
-                points[i, 1] - points[i - 1, 1],
-                points[i, 2] - points[i - 1, 2],
-            )
+            u, v, w = points[i - 1, 0], points[i - 1, 1], points[i - 1, 2]
+            dx, dy, dz = points[i, 0] - u, points[i, 1] - v, points[i, 2] - w
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
             if length > step_max:
                 share = step_max / length
-                points[i, 0] = points[i - 1, 0] + share * dx
-                points[i, 1] = points[i - 1, 1] + share * dy
-                points[i, 2] = points[i - 1, 2] + share * dz
+                points[i, 0], points[i, 1], points[i, 2] = u + share * dx, v + share * dy, w + share * dz
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         count = known(anchors, num_around, i, x, y, z)
         if count > 0:
@@ -322,17 +317,12 @@ def project(points, problem, index, begin, end, nearby):
             count = count if box >= 0 else 0  # nothing too near
         if count != 0:
             push_out(points[i], problem, index, nearby, i)
-    return _is_feasible(points, problem, index, nearby)
+    return is_feasible(points, problem, index, nearby)
 
 
 @njit(cache=True)
-def is_feasible(points, problem, index):
+def is_feasible(points, problem, index, nearby):
     """Tell whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between waypoints."""
-    return _is_feasible(points, problem, index, nothing_nearby(len(points)))
-
-
-@njit(cache=True)
-def _is_feasible(points, problem, index, nearby):
     one, before = np.empty(1, dtype=np.int64), 0.0
     low, high, step_max = problem.altitudes[LEAST], problem.altitudes[GREATEST], problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows

@@ -29,11 +29,7 @@ def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
             )
         for ray in range(5):
             feet[ray, 0], feet[ray, 1], feet[ray, 2] = in_box_frame(
-                rows,
-                box,
-                tx + RAY_OFFSETS_M[ray, 0],
-                ty + RAY_OFFSETS_M[ray, 1],
-                tz + RAY_OFFSETS_M[ray, 2],
+                rows, box, tx + RAY_OFFSETS_M[ray, 0], ty + RAY_OFFSETS_M[ray, 1], tz + RAY_OFFSETS_M[ray, 2]
             )
         for place in range(7):
             for ray in range(5):

@@ -21,17 +21,9 @@ from cosfly.kernels import (
     ORIGIN_Y,
     RAY_OFFSETS_M,
     RAY_SPREAD_M,
-    XU,
-    XV,
-    XW,
-    YU,
-    YV,
-    YW,
-    ZU,
-    ZV,
-    ZW,
-    clip,
     in_box_frame,
+    touches,
+    turned,
 )
 
 NUM_SECTORS = 128  # of the horizon round a target
@@ -160,30 +152,15 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
     u, v, w = in_box_frame(rows, box, x, y, z)
     hip_u, hip_v, hip_w = in_box_frame(rows, box, tx, ty, tz)
     # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked, deep inside all are.
-    if not _touches(rows, box, hip_u, hip_v, hip_w, u, v, w, RAY_SPREAD_M):
+    if not touches(rows, box, hip_u, hip_v, hip_w, u, v, w, RAY_SPREAD_M):
         return blocked
-    if _touches(rows, box, hip_u, hip_v, hip_w, u, v, w, -RAY_SPREAD_M):
+    least = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z])
+    if least >= RAY_SPREAD_M and touches(rows, box, hip_u, hip_v, hip_w, u, v, w, -RAY_SPREAD_M):
         return ALL_BLOCKED
     for ray in range(5):
         if (blocked >> ray) & 1:
             continue
-        a, b, c = RAY_OFFSETS_M[ray, 0], RAY_OFFSETS_M[ray, 1], RAY_OFFSETS_M[ray, 2]
-        foot_u = hip_u + rows[box, XU] * a + rows[box, YU] * b + rows[box, ZU] * c
-        foot_v = hip_v + rows[box, XV] * a + rows[box, YV] * b + rows[box, ZV] * c
-        foot_w = hip_w + rows[box, XW] * a + rows[box, YW] * b + rows[box, ZW] * c
-        enter, leave = clip(foot_u, u - foot_u, rows[box, HALF_X], 0.0, 1.0)
-        enter, leave = clip(foot_v, v - foot_v, rows[box, HALF_Y], enter, leave)
-        enter, leave = clip(foot_w, w - foot_w, rows[box, HALF_Z], enter, leave)
-        if enter <= leave:
+        a, b, c = turned(rows, box, RAY_OFFSETS_M[ray, 0], RAY_OFFSETS_M[ray, 1], RAY_OFFSETS_M[ray, 2])
+        if touches(rows, box, hip_u + a, hip_v + b, hip_w + c, u, v, w, 0.0):
             blocked |= 1 << ray
     return blocked
-
-
-@njit(cache=True, inline="always")
-def _touches(rows, box, a, b, c, u, v, w, inflate_m):
-    """Tell whether a segment in a box's frame touches the box grown (or shrunk) on every side; a box shrunk away never is."""
-    enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
-    enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
-    enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
-    least = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z]) + inflate_m
-    return enter <= leave and least >= 0.0

@@ -118,12 +118,8 @@ def search_flight(
     places = voxels.low + np.stack(np.unravel_index(cells, tuple(voxels.shape)), axis=1) * voxels.size
     every = np.arange(len(targets))
     raw = np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1)
-    return raw, {
-        "num_layers": len(frames),
-        "num_cells": len(voxels.clearances),
-        "states_seen": int(num_seen),
-        "cost": float(cost),
-    }
+    sizes = {"num_layers": len(frames), "num_cells": len(voxels.clearances), "states_seen": int(num_seen)}
+    return raw, {**sizes, "cost": float(cost)}
 
 
 def frames_per_layer(cfg: PlanConfig) -> int:
@@ -258,15 +254,7 @@ def _expand(
         ix, iy, iz = cell // (num_y * num_z), (cell // num_z) % num_y, cell % num_z
         for move in range(len(MOVES)):
             jx, jy, jz = ix + MOVES[move, 0], iy + MOVES[move, 1], iz + MOVES[move, 2]
-            if (
-                lengths[move] > reach_m + 1e-9
-                or jx < 0
-                or jy < 0
-                or jz < 0
-                or jx >= num_x
-                or jy >= num_y
-                or jz >= num_z
-            ):
+            if lengths[move] > reach_m + 1e-9 or not (0 <= jx < num_x and 0 <= jy < num_y and 0 <= jz < num_z):
                 continue
             there = (jx * num_y + jy) * num_z + jz
             cost = (
@@ -301,11 +289,8 @@ def _choose(touched, best, target, voxels, costs, index, beam):
         reach_m, aside = max(reach_m, away), away - costs.behind_m
         climb, gap = z - costs.preferred_z, voxels.clearances[cell]  # known: the way here has asked for it
         near = max(0.0, 1.0 - gap / costs.influence_m)
-        bounds[k] = (
-            best[cell]
-            + costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
-            + costs.weights[SAFETY] * near * near
-        )
+        off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
+        bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
     horizon = make_horizon(index, target, reach_m)
     total, num = np.full(len(touched), np.inf), 0
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
