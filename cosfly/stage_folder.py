@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 Resume = Literal["never", "if-same", "force"]
 
 STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl")  # what stands in a folder before anything is finished
 
 
 # --- what became of the items -----------------------------------------------------------------------------------------
@@ -200,7 +201,7 @@ class StageFolder:
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
         if stage_file.exists() and not _holds_work(out):
             # An attempt that ended before anything was finished binds nobody to its settings.
-            for name in ("stage.json", "items.jsonl", "failures.jsonl"):
+            for name in BEGUN:
                 (out / name).unlink(missing_ok=True)
         elif stage_file.exists():
             record = _continue(out, record, resume)
@@ -291,12 +292,8 @@ def _holds_work(out: Path) -> bool:
     """Tell whether a stage folder holds anything that was finished, and not only the records of failures."""
     if any(record["status"] != "failed" for record in Journal(out / "items.jsonl").read()):
         return True
-    records = {out / name for name in ("stage.json", "items.jsonl", "failures.jsonl")}
-    return any(
-        path not in records
-        for path in out.rglob("*")
-        if path.is_file() and not any(part.endswith(".partial") for part in path.relative_to(out).parts)
-    )
+    files = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    return any(str(file) not in BEGUN and not any(part.endswith(".partial") for part in file.parts) for file in files)
 
 
 def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:

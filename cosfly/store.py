@@ -178,14 +178,11 @@ def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
         raise InputError(
             "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"
         )
-    if value.get("schema") != schema:
+    kind, found = value.get("schema"), value.get("schema_version")
+    if kind != schema:
         raise InputError(
-            "not the expected kind of file",
-            where=f"{path}: schema",
-            got=repr(value.get("schema")),
-            expected=repr(schema),
+            "not the expected kind of file", where=f"{path}: schema", got=repr(kind), expected=repr(schema)
         )
-    found = value.get("schema_version")
     if str(found).split(".")[0] != version.split(".")[0]:
         raise InputError("unknown version", where=f"{path}: schema_version", got=repr(found), expected=repr(version))
     return value
