@@ -123,9 +123,7 @@ def check_encoder(cfg: BertScoreConfig, folder: Path) -> None:
     if not isinstance(layers, int):
         raise InputError("not a text encoder", where=folder / "config.json", expected="num_hidden_layers")
     if cfg.layer > layers:
-        raise ConfigError(
-            "the model has fewer layers", where="bertscore.layer", got=f"{cfg.layer}", expected=f"<= {layers}"
-        )
+        raise ConfigError("the model has fewer layers", where="bertscore.layer", got=cfg.layer, expected=f"<= {layers}")
     if "t5" in str(folder) or str(folder).startswith("scibert"):  # bert-score reads the model's family off its path
         raise InputError(
             "bert-score would take this path for another kind of model",

@@ -39,18 +39,14 @@ class PrepareConfig(Config):
         "trajectory",
         description="what may not be shared by two splits; both flights of a trajectory always stay together",
     )
-    val_fraction: float = Field(
-        0.1, ge=0.0, lt=1.0, description="share of trajectories (towns) for validation; 0: none"
-    )
-    test_fraction: float = Field(0.1, ge=0.0, lt=1.0, description="share of trajectories (towns) for the test; 0: none")
+    val_fraction: float = Field(0.1, ge=0, lt=1, description="share of trajectories (towns) for validation; 0: none")
+    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of trajectories (towns) for the test; 0: none")
     too_few: Literal["refuse", "fill"] = Field(
         "refuse",
         description="with fewer trajectories (towns) than splits: refuse, or fill train, then val, and leave the rest empty",
     )
     repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
-    repaired_weight: float = Field(
-        1.0, gt=0.0, le=1.0, description="weight of a repaired sample in the loss; 1: as any"
-    )
+    repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
 
     @model_validator(mode="after")
     def _fractions_leave_something(self) -> PrepareConfig:

@@ -168,9 +168,7 @@ def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
     smallest = min(int(image_processor.size["shortest_edge"]), max_pixels)  # areas in pixels, in spite of the names
     side_px = image_processor.patch_size * image_processor.merge_size
     if max_pixels < side_px**2:
-        raise ConfigError(
-            "too small for one patch", where="max_pixels", got=str(max_pixels), expected=f">= {side_px**2}"
-        )
+        raise ConfigError("too small for one patch", where="max_pixels", got=max_pixels, expected=f">= {side_px**2}")
     image_processor.size = {"shortest_edge": smallest, "longest_edge": max_pixels}
     return tokenizer, image_processor
 

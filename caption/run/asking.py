@@ -10,7 +10,6 @@ import asyncio
 import logging
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from caption.run.flights import Allotted
 from caption.run.progress import Display
@@ -64,7 +63,8 @@ class Asking:
         self.stage, self.cfg, self.seed = stage, cfg, seed
         self.asked = Asked(Tally())
         self.failures: list[Failed] = []  # flights that cannot be read
-        self.quarantine = _read_quarantine(stage.path / QUARANTINE)
+        path = stage.path / QUARANTINE
+        self.quarantine = {failure.id: failure for failure in read_failures(path)} if path.exists() else {}
         self.only = frozenset(self.quarantine) if retry_failed else None
         in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.most_open = in_flight + WAITING_WINDOWS
@@ -223,7 +223,3 @@ def common_causes(failures: list[Failed], most: int = 3) -> str:
     counts = Counter(failure.code for failure in failures)
     ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
     return ", ".join(f"{cause} {count}" for cause, count in ordered[:most])
-
-
-def _read_quarantine(path: Path) -> dict[str, Failed]:
-    return {failure.id: failure for failure in read_failures(path)} if path.exists() else {}

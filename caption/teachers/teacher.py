@@ -142,14 +142,8 @@ class AskingTeacher:
         except BaseException:
             await self.__aexit__()
             raise
-        c = self.cfg
-        settings = TeacherSettings(
-            temperature=c.temperature,
-            top_p=c.top_p,
-            max_tokens=c.max_tokens,
-            seed=self.seed,
-            extra_body=dict(c.extra_body),
-        )
+        sampling = self.cfg.model_dump(include={"temperature", "top_p", "max_tokens", "extra_body"})
+        settings = TeacherSettings(**sampling, seed=self.seed)
         self.record = TeacherRecord(kind=self.engine.kind, model=self.engine.model, settings=settings)
         return self
 

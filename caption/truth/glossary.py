@@ -83,13 +83,10 @@ class Glossary:
         """Find the numbers of a text with their units; a unit after a list or a product holds for all of it."""
         found: list[Number] = []
         for match in self._numbers[language].finditer(text):
-            digits, unit = match["number"], match["unit"]
+            digits = match["number"]
             places = len(digits.partition(".")[2])
-            found.append(
-                Number(
-                    float(digits.replace("−", "-")), self._units[language].get(unit or "", ""), places, match.start()
-                )
-            )
+            value, unit = float(digits.replace("−", "-")), self._units[language].get(match["unit"] or "", "")
+            found.append(Number(value, unit, places, match.start()))
         # "34 x 59 px", "20.0 to 21.4 m": the unit stands once, after the last number.
         for i in range(len(found) - 2, -1, -1):
             between = text[found[i].start : found[i + 1].start]

@@ -205,10 +205,8 @@ class ChatClient:
         except httpx.InvalidURL:
             raise self.error("not a URL that can be asked", fix="check --teacher") from None
         except httpx.HTTPError as error:
-            reason = self.clean(f"{type(error).__name__} {error}")
-            raise self.error(
-                "cannot reach the teacher", got=reason, fix="start the server or check --teacher"
-            ) from None
+            why = self.clean(f"{type(error).__name__} {error}")
+            raise self.error("cannot reach the teacher", got=why, fix="start the server or check --teacher") from None
         wanted = self.cfg.model
         if response.status_code in (401, 403):
             self.stop_if_fatal(response)
@@ -234,15 +232,14 @@ class ChatClient:
 
     def stop_if_fatal(self, response: httpx.Response) -> None:
         """Raise for what would fail for every window."""
-        status, detail = response.status_code, self.detail(response)
+        status = response.status_code
+        said = f"HTTP {status} {self.detail(response)}"
         if status in (401, 403):
-            raise self.error("the teacher refuses the key", got=f"HTTP {status} {detail}", fix=f"set {KEY_VARIABLE}")
+            raise self.error("the teacher refuses the key", got=said, fix=f"set {KEY_VARIABLE}")
         if status == 404:
-            raise self.error(
-                "no such model or not a chat endpoint", got=f"HTTP 404 {detail}", fix="check URL and model"
-            )
+            raise self.error("no such model or not a chat endpoint", got=said, fix="check URL and model")
         if 300 <= status < 400 or status == 405:
-            raise self.error("not a chat endpoint", got=f"HTTP {status} {detail}", fix="check the URL")
+            raise self.error("not a chat endpoint", got=said, fix="check the URL")
 
     def error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)
