@@ -156,7 +156,11 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
                 self._send(404, {"error": {"message": f"no such path {self.path}"}})
 
         def do_POST(self) -> None:
-            raw = self.rfile.read(int(self.headers["Content-Length"]))
+            length = int(self.headers["Content-Length"])
+            raw = self.rfile.read(length)
+            if len(raw) < length:  # the client was killed while it sent: nobody asked anything
+                self.close_connection = True
+                return
             number = server.begin(raw, {name.lower(): value for name, value in self.headers.items()})
             try:
                 self._complete(number, json.loads(raw))
