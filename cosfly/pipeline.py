@@ -78,7 +78,9 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
     and `summary.json` in the run folder.
     """
-    release.package.choose_licence(cfg.release, {cfg.maps.source: cfg.maps.licence})  # the last stage would ask for it
+    release.package.choose_licence(
+        cfg.release, [(cfg.maps.source, cfg.maps.licence)]
+    )  # the last stage would ask for it
     todo = stages(cfg, out, resume=resume)
     _save_run(cfg, out)
     results = []

@@ -18,11 +18,18 @@ from typing import Any
 import pyarrow.parquet as pq
 import yaml
 
+from cosfly.products.captions import FIELDS
 from cosfly.products.frames import FrameFile
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, PICTURES, SCALAR_NAMES, WINDOW, schema
+from release.columns import CAPTION_FACTS, CAPTION_FIELDS, PICTURES, POINT, SCALAR_NAMES, WINDOW, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, History, Numbers, ReleaseRecord, Spread
 
 DIGITS = 4
+FLAGS = (
+    "is_perturbed",
+    "target_in_view",
+    "target_visible",
+    "has_caption",
+)  # columns of yes and no whose frames are counted
 FILE_TEXT: dict[FrameFile, str] = {
     "rgb": "`image`: colour, PNG",
     "depth": "`depth`: z-depth in metres, float32 `.npy` bytes, lossless",
@@ -33,12 +40,12 @@ FILE_TEXT: dict[FrameFile, str] = {
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def read_rows(shards: Iterable[Path]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of all shards without pictures and depth."""
+def read_rows(shards: Iterable[Path], columns: list[str] = SCALAR_NAMES) -> Iterator[dict[str, Any]]:
+    """Yield the rows of all shards, a row group at a time; by default without pictures and depth."""
     for shard in shards:
         with pq.ParquetFile(shard) as file:
             for k in range(file.num_row_groups):
-                yield from file.read_row_group(k, columns=SCALAR_NAMES).to_pylist()
+                yield from file.read_row_group(k, columns=columns).to_pylist()
 
 
 def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
@@ -50,29 +57,23 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
     Returns:
         sums are exact (fsum), so that the same rows give the same digits everywhere.
     """
-    counts: dict[str, Counter[str]] = {
-        name: Counter() for name in ("town", "track", "fov_deg", "image_px", *CAPTION_FACTS)
-    }
-    totals: Counter[str] = Counter()
+    counts = {name: Counter[str]() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
+    totals, characters = Counter[str](), Counter[str]()
     flights: dict[tuple[str, str, str], list[tuple[float, float, float, float]]] = {}
     samples: dict[str, list[float]] = {name: [] for name in ("height_m", "distance_m", "visibility")}
     fovs: dict[tuple[str, str], str] = {}  # a trajectory keeps its field of view
-    characters: Counter[str] = Counter()
     example: dict[str, str] = {}
     for row in read_rows(shards):
-        totals["frames"] += 1
-        for name in ("is_perturbed", "target_in_view", "target_visible", "has_caption"):
-            totals[name] += bool(row[name])
-        counts["town"][row["town"]] += 1
-        counts["track"][row["track"]] += 1
-        counts["fov_deg"][f"{row['fov_deg']:g}"] += 1
-        fovs[row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
-        counts["image_px"][f"{row['width_px']} x {row['height_px']}"] += 1
+        totals.update(name for name in FLAGS if row[name])
+        fov = fovs[row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
+        size = f"{row['width_px']} x {row['height_px']}"
+        for name, value in {"town": row["town"], "track": row["track"], "fov_deg": fov, "image_px": size}.items():
+            counts[name][value] += 1
         pose, target = row["pose"], row["target"]
         flight = flights.setdefault((row["town"], row["trajectory"], row["variant"]), [])
         flight.append((row["time_s"], pose["x_m"], pose["y_m"], pose["z_m"]))
         if target is not None:
-            offset = [pose[axis] - target[axis] for axis in ("x_m", "y_m", "z_m")]
+            offset = [pose[axis] - target[axis] for axis in POINT]
             samples["height_m"].append(offset[2])
             samples["distance_m"].append(math.hypot(*offset))
         if row["visibility"] is not None:
@@ -80,27 +81,16 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         if row["has_caption"]:
             for name in CAPTION_FACTS:
                 counts[name]["none" if row[name] is None else row[name]] += 1
-            totals["has_label"] += row["label"] is not None
+            totals["with_label"] += row["label"] is not None
             totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
             example = example or {"sample_id": row["sample_id"], **{name: row[name] for name in CAPTION_FIELDS}}
-            for name in CAPTION_FIELDS:
-                characters[name] += len(row[name] or "")
-    captions = {
-        "frames_with": totals["has_caption"],
-        "frames_without": totals["frames"] - totals["has_caption"],
-        "with_label": totals["has_label"],
-        "decision_equals_label": totals["decision_equals_label"],
-        **{name: _sorted(counts[name]) for name in CAPTION_FACTS},
-        "mean_characters": {
-            name: round(characters[name] / totals["has_caption"], 1) if totals["has_caption"] else None
-            for name in CAPTION_FIELDS
-        },
-        "example": example,
-    }
+            characters.update({name: len(row[name] or "") for name in CAPTION_FIELDS})
+    num_rows, num_captions = sum(counts["town"].values()), totals["has_caption"]
+    captions: dict[str, Any] = {name: _sorted(counts[name]) for name in CAPTION_FACTS}
     return Numbers(
-        frames=totals["frames"],
+        frames=num_rows,
         flights=len(flights),
-        trajectories=len({key[:2] for key in flights}),
+        trajectories=len(fovs),
         frames_by=FramesBy(**{name: _sorted(counts[name]) for name in FramesBy.model_fields}),
         trajectories_by_fov_deg=_sorted(Counter(fovs.values())),
         flights_by_track=_sorted(Counter("clean" if key[2] == "ORI" else "perturbed" for key in flights)),
@@ -114,7 +104,17 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
         frames_perturbed=totals["is_perturbed"],
         frames_target_in_view=totals["target_in_view"],
         frames_target_visible=totals["target_visible"],
-        captions=CaptionNumbers.model_validate(captions),
+        captions=CaptionNumbers(
+            frames_with=num_captions,
+            frames_without=num_rows - num_captions,
+            with_label=totals["with_label"],
+            decision_equals_label=totals["decision_equals_label"],
+            **captions,
+            mean_characters={
+                name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS
+            },
+            example=example,
+        ),
         files=FileNumbers(
             shards=len(shards),
             bytes=sum(shard.stat().st_size for shard in shards),
@@ -168,20 +168,14 @@ def render_card(record: ReleaseRecord) -> str:
 
 def size_category(num_frames: int) -> str:
     """Give the hub's size category."""
-    names = (
-        (1_000, "n<1K"),
-        (10_000, "1K<n<10K"),
-        (100_000, "10K<n<100K"),
-        (1_000_000, "100K<n<1M"),
-        (10_000_000, "1M<n<10M"),
-    )
-    return next((name for limit, name in names if num_frames < limit), "n>10M")
+    limits = ("1K", "10K", "100K", "1M", "10M")
+    k = sum(num_frames >= 10 ** (3 + i) for i in range(len(limits)))
+    return f"n<{limits[0]}" if k == 0 else f"n>{limits[-1]}" if k == len(limits) else f"{limits[k - 1]}<n<{limits[k]}"
 
 
 def _values(record: ReleaseRecord) -> dict[str, str]:
     numbers, history, settings = record.numbers, record.history, record.settings
     captions, frames = numbers.captions, numbers.frames
-    visible = f"{_share(numbers.frames_target_visible, frames)} of the frames"
     return {
         "front_matter": _front_matter(record),
         "name": record.name,
@@ -189,7 +183,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "frames_table": _table(("", "frames"), _groups(numbers.frames_by)),
         "fov_trajectories": ", ".join(f"{fov}: {n:,}" for fov, n in numbers.trajectories_by_fov_deg.items()),
         "flights_table": _spreads(numbers),
-        "visible": visible,
+        "visible": f"{_share(numbers.frames_target_visible, frames)} of the frames",
         "perturbed": f"{numbers.frames_perturbed:,} ({_share(numbers.frames_perturbed, frames)})",
         "num_frames": str(settings.num_frames),
         "frame_rule": record.frame_selection,
@@ -199,15 +193,11 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "agreement": _share(captions.decision_equals_label, captions.with_label),
         "with_label": f"{captions.with_label:,}",
         "example": _example(captions.example),
-        "decisions_table": _table(("decision", "frames", "share"), _histogram(captions.decision)),
-        "provenance_table": _table(
-            ("", "", "frames"),
-            [
-                (title, f"`{value}`", f"{n:,}")
-                for title, key in PROVENANCE
-                for value, n in getattr(captions, key).items()
-            ],
+        "decisions_table": _table(
+            ("decision", "frames", "share"),
+            [(f"`{name}`", f"{n:,}", _share(n, captions.frames_with)) for name, n in captions.decision.items()],
         ),
+        "provenance_table": _provenance(captions),
         "characters_table": _characters(captions.mean_characters),
         "files_table": _table(
             ("", "bytes"),
@@ -225,12 +215,15 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
     }
 
 
-PROVENANCE = (
-    ("verdict against the geometry", "verdict"),
-    ("repair", "repair_strategy"),
-    ("kind of teacher", "teacher_kind"),
-    ("teacher model", "teacher_model"),
-)
+def _provenance(captions: CaptionNumbers) -> str:
+    groups = (
+        ("verdict against the geometry", captions.verdict),
+        ("repair", captions.repair_strategy),
+        ("kind of teacher", captions.teacher_kind),
+        ("teacher model", captions.teacher_model),
+    )
+    rows = [(title, f"`{value}`", f"{n:,}") for title, counts in groups for value, n in counts.items()]
+    return _table(("", "", "frames"), rows)
 
 
 def _front_matter(record: ReleaseRecord) -> str:
@@ -241,9 +234,7 @@ def _front_matter(record: ReleaseRecord) -> str:
         "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
-        "configs": [
-            {"config_name": "default", "data_files": [{"split": "train", "path": "data/train-*.parquet"}]},
-        ],
+        "configs": [{"config_name": "default", "data_files": [{"split": "train", "path": "data/train-*.parquet"}]}],
     }
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
 
@@ -274,47 +265,34 @@ def _groups(frames_by: FramesBy) -> list[tuple[str, str]]:
 
 def _spreads(numbers: Numbers) -> str:
     titles = (
-        ("frames per flight", "frames_per_flight"),
-        ("duration of a flight, s", "flight_duration_s"),
-        ("length of a flight over its released frames, m", "flight_length_m"),
-        ("height over the target's hip, m", "height_over_target_m"),
-        ("distance to the target, m", "distance_to_target_m"),
-        ("rendered visibility of the target", "visibility"),
+        ("frames per flight", numbers.frames_per_flight),
+        ("duration of a flight, s", numbers.flight_duration_s),
+        ("length of a flight over its released frames, m", numbers.flight_length_m),
+        ("height over the target's hip, m", numbers.height_over_target_m),
+        ("distance to the target, m", numbers.distance_to_target_m),
+        ("rendered visibility of the target", numbers.visibility),
     )
     rows = []
-    for title, key in titles:
-        spread: Spread = getattr(numbers, key)
-        cells = (
-            "-" if value is None else f"{value:,.3f}" for value in (spread.mean, spread.std, spread.min, spread.max)
-        )
-        rows.append((title, *cells, f"{spread.count:,}"))
+    for title, spread in titles:
+        values = (spread.mean, spread.std, spread.min, spread.max)
+        rows.append((title, *("-" if value is None else f"{value:,.3f}" for value in values), f"{spread.count:,}"))
     return _table(("", "mean", "std", "min", "max", "values"), rows)
 
 
-def _histogram(counts: dict[str, int]) -> list[tuple[str, str, str]]:
-    total = sum(counts.values())
-    return [(f"`{name}`", f"{count:,}", _share(count, total)) for name, count in counts.items()]
-
-
 def _characters(mean: dict[str, float | None]) -> str:
-    rows = []
-    for english in CAPTION_FIELDS[: len(CAPTION_FIELDS) // 2]:
-        chinese = english.replace("_en_", "_zh_")
-        values = (mean.get(name) for name in (english, chinese))
-        cells = ("-" if value is None else f"{value:.1f}" for value in values)
-        rows.append((english.removeprefix("caption_en_"), *cells))
-    return _table(("mean characters", "English", "Chinese"), rows)
+    cells = {name: "-" if value is None else f"{value:.1f}" for name, value in mean.items()}
+    return _table(("mean characters", "English", "Chinese"), _both_languages(cells))
 
 
 def _example(example: dict[str, str]) -> str:
     if not example:
         return "No frame has a caption."
-    half = len(CAPTION_FIELDS) // 2
-    rows = [
-        (english.removeprefix("caption_en_"), example.get(english, "-"), example.get(chinese, "-"))
-        for english, chinese in zip(CAPTION_FIELDS[:half], CAPTION_FIELDS[half:], strict=True)
-    ]
-    return f"`{example.get('sample_id')}`:\n\n{_table(('', 'English', 'Chinese'), rows)}"
+    return f"`{example.get('sample_id')}`:\n\n{_table(('', 'English', 'Chinese'), _both_languages(example))}"
+
+
+def _both_languages(cells: dict[str, str]) -> list[tuple[str, ...]]:
+    """Give a row for each field of a caption, of cells by column."""
+    return [(name, *(cells.get(f"caption_{language}_{name}", "-") for language in ("en", "zh"))) for name in FIELDS]
 
 
 def _funnel(history: History) -> str:

@@ -16,19 +16,17 @@ import pyarrow as pa
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
+from cosfly.products.captions import FIELDS
 from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.playback import Flight, sample_id
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
-CAPTION_FIELDS = tuple(
-    f"caption_{language}_{field}"
-    for language in ("en", "zh")
-    for field in ("critical_components", "reasoning_trace", "flight_decision")
-)
+CAPTION_FIELDS = tuple(f"caption_{language}_{field}" for language in ("en", "zh") for field in FIELDS)
 CAPTION_FACTS = ("decision", "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model")
 
 WINDOW = "caption_window"
+ReleasedCaption = dict[str, Any]  # what a row holds of an accepted caption: CAPTION_FACTS, CAPTION_FIELDS and WINDOW
 PNG_END = b"IEND\xaeB`\x82"  # the last chunk and its checksum
 
 CONTRACT: dict[str, Any] = {
@@ -49,23 +47,13 @@ CONTRACT: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class ReleasedCaption:
-    """What a row holds of an accepted caption."""
-
-    window: tuple[int, ...]
-    values: dict[str, str | None]  # CAPTION_FACTS and CAPTION_FIELDS
-
-
 # --- the table --------------------------------------------------------------------------------------------------------
 
 # type -> what it is in parquet, and for `datasets`; a tuple names the members of a struct of float64
 TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
     **{
-        name: (kind, {"dtype": name, "_type": "Value"})
-        for name, kind in (
-            ("string", pa.string()), ("int32", pa.int32()), ("float64", pa.float64()), ("bool", pa.bool_()), ("binary", pa.binary()),
-        )
+        name: (pa.type_for_alias(name), {"dtype": name, "_type": "Value"})
+        for name in ("string", "int32", "float64", "bool", "binary")
     },
     "image": (pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}),
     # `element` is parquet's own name. `Sequence` is what `datasets` before version 4 calls a list; later versions still read it.
@@ -73,7 +61,7 @@ TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
         pa.list_(pa.field("element", pa.int32())),
         {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"},
     ),
-}  # fmt: skip
+}
 
 Value = Callable[[Flight, int, ReleasedCaption | None], Any]
 
@@ -95,8 +83,8 @@ class Column:
         return bool(value) if self.type == "bool" else value
 
 
-def _said(name: str) -> Column:
-    return Column(name, "string", lambda _, __, caption: caption.values[name] if caption else None)
+def _said(name: str, kind: str = "string") -> Column:
+    return Column(name, kind, lambda _, __, caption: caption and caption[name])
 
 
 def _picture(file: FrameFile) -> Value:
@@ -136,7 +124,7 @@ SCALARS = (  # everything but pictures and depth
     Column("target_offset", POINT, lambda f, i, _: f.target_offsets_m[i]),
     Column("has_caption", "bool", lambda f, i, caption: caption is not None),
     *map(_said, (*CAPTION_FACTS, *CAPTION_FIELDS)),
-    Column(WINDOW, "indices", lambda f, i, caption: list(caption.window) if caption else None),
+    _said(WINDOW, "indices"),
 )
 SCALAR_NAMES = [column.name for column in SCALARS]
 
@@ -175,12 +163,9 @@ def _read(flight: Flight, i: int, file: FrameFile) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            "cannot read a frame's file", where=path, got=error.strerror, fix="run cosfly inspect again"
-        ) from None
-    is_whole = (
-        len(data) > 4 * flight.camera.width_px * flight.camera.height_px if file == "depth" else PNG_END in data[-256:]
-    )
-    if not is_whole:
+        got, fix = error.strerror, "run cosfly inspect again"
+        raise InputError("cannot read a frame's file", where=path, got=got, fix=fix) from None
+    num_pixels = flight.camera.width_px * flight.camera.height_px
+    if not (len(data) > 4 * num_pixels if file == "depth" else PNG_END in data[-256:]):
         raise InputError("a frame's file is cut short", where=path, got=f"{len(data)} bytes", fix="render it again")
     return data

@@ -27,17 +27,9 @@ from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import (
-    CHECKSUMS,
-    atomic_file,
-    atomic_folder,
-    inside,
-    sha256_file,
-    write_bytes,
-    write_checksums,
-)
+from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, inside, sha256_file, write_bytes, write_checksums
 from release import columns
-from release.captions import Captions, load_captions
+from release.captions import ByFlight, load_captions
 from release.card import compute_numbers, render_card
 from release.columns import ReleasedCaption
 from release.record import (
@@ -92,7 +84,7 @@ class ReleaseConfig(Config):
 
 def choose_flights(inspection: Inspection, cfg: ReleaseConfig) -> tuple[list[FlightInspection], dict[str, int]]:
     """Give the flights to release, and why the others are left out: reason -> count."""
-    wanted = {"accepted", "review"} if cfg.include_review else {"accepted"}
+    wanted = ("accepted", "review") if cfg.include_review else ("accepted",)
     chosen, left_out = [], Counter[str]()
     for flight in inspection.flights:
         track: Track = "clean" if flight.variant == "ORI" else "perturbed"
@@ -106,22 +98,22 @@ def choose_flights(inspection: Inspection, cfg: ReleaseConfig) -> tuple[list[Fli
 
 
 def maps_of(data: Path, flights: list[FlightInspection]) -> list[ReleasedMap]:
-    """Give the maps below the flights, by town."""
-    towns = {flight.town: inside(data, flight.folder).parent.parent for flight in flights}
-    return [ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in sorted(towns.items())]
+    """Give the maps below the flights, by town; one for each folder, should a town stand in several of a deep tree."""
+    towns = sorted({(flight.town, inside(data, flight.folder).parent.parent) for flight in flights})
+    return [ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns]
 
 
-def choose_licence(cfg: ReleaseConfig, licences: dict[str, str]) -> str:
-    """Give the licence of the data set, given those of its maps: town -> licence.
+def choose_licence(cfg: ReleaseConfig, maps: list[tuple[str, str]]) -> str:
+    """Give the licence of the data set, given name and licence of each map.
 
     Raises:
         ConfigError: it is not given, and the maps' are unknown or differ.
     """
-    chosen = cfg.licence or next(iter(licences.values()))
-    if chosen == UNKNOWN_LICENCE or (cfg.licence is None and len(set(licences.values())) > 1):
+    chosen = cfg.licence or maps[0][1]
+    if chosen == UNKNOWN_LICENCE or (cfg.licence is None and len({licence for _, licence in maps}) > 1):
         raise ConfigError(
             "nobody says under which licence this may be released", where="release.licence",
-            got=", ".join(f"{town}: {licence}" for town, licence in licences.items()),
+            got=", ".join(f"{name}: {licence}" for name, licence in maps),
             expected="a licence identifier as the hub spells it", fix="--set release.licence=... (cc-by-4.0, apache-2.0, ...)",
         )  # fmt: skip
     return chosen
@@ -183,29 +175,17 @@ def open_writer(file: Path | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
     PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
     repeat their first bytes.
     """
-    compression, small = {}, []
-    for name in _leaves(schema):
-        is_png = name.endswith(".bytes")
-        compression[name] = "none" if is_png else "zstd"
-        if not is_png and name != "depth":
-            small.append(name)
-    repeated = [name for name in small if schema.field(name.split(".")[0]).type == pa.string()]
+    leaves: list[str] = []  # parquet's paths of the primitive columns
+    for member in schema:
+        inner = [child.name for child in member.type] if pa.types.is_struct(member.type) else []
+        inner = ["list.element"] if pa.types.is_list(member.type) else inner
+        leaves += [f"{member.name}.{name}" for name in inner] or [member.name]
+    compression = {name: "none" if name.endswith(".bytes") else "zstd" for name in leaves}
+    small = [name for name in leaves if name != "depth" and not name.endswith(".bytes")]
+    repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
     return pq.ParquetWriter(
         file, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6"
     )
-
-
-def _leaves(schema: pa.Schema) -> list[str]:
-    """Give the parquet paths of the primitive columns."""
-    names: list[str] = []
-    for member in schema:
-        if pa.types.is_struct(member.type):
-            names += [f"{member.name}.{child.name}" for child in member.type]
-        elif pa.types.is_list(member.type):
-            names.append(f"{member.name}.list.element")
-        else:
-            names.append(member.name)
-    return names
 
 
 # --- the shards -------------------------------------------------------------------------------------------------------
@@ -237,7 +217,10 @@ def assemble_shards(parts: list[Path], folder: Path, cfg: ReleaseConfig) -> list
         shard = folder / "data" / f"train-{number:05d}-of-{len(groups):05d}.parquet"
         shards.append(shard)
         if len(group) == 1:
-            _link(parts[group[0]], shard)
+            try:
+                os.link(parts[group[0]], shard)
+            except OSError:  # the file system has no links
+                shutil.copyfile(parts[group[0]], shard)
             continue
         with open_writer(shard, schema) as writer:
             for index in group:
@@ -246,14 +229,6 @@ def assemble_shards(parts: list[Path], folder: Path, cfg: ReleaseConfig) -> list
                         table = source.read_row_group(k)
                         writer.write_table(table, row_group_size=table.num_rows)
     return shards
-
-
-def _link(source: Path, target: Path) -> None:
-    """Give a file a second name, or a copy where the file system has no links."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -291,21 +266,18 @@ def run(
         tally = Tally(input=len(inspection.flights), dropped=left_out)
         raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
     maps = maps_of(data, chosen)
-    choose_licence(cfg, {shown.town: shown.licence for shown in maps})  # before the work, not after it
-    loaded = load_captions(captions)
-    items = [
-        Item(flight.folder, loaded.by_flight.get((flight.town, flight.trajectory, flight.variant), {}))
-        for flight in chosen
-    ]
+    licence = choose_licence(cfg, [(shown.town, shown.licence) for shown in maps])  # before the work, not after it
+    by_flight, dropped = load_captions(captions)
+    items = [Item(f.folder, by_flight.get((f.town, f.trajectory, f.variant), {})) for f in chosen]
     finished = run_items(stage, items, make_worker, (cfg, data, parts), workers=workers, label="release")
     results = {record.id: record.result for record in finished.kept}
     if not results:
         raise stage.nothing_kept(finished.tally)
     _check_parts(parts, results)
-    history = account(inspection, left_out, loaded, finished)
+    history = account(inspection, left_out, by_flight, dropped, finished)
     with atomic_folder(dataset) as folder:
         shards = assemble_shards([parts / part_name(item_id) for item_id in results], folder, cfg)
-        write_records(folder, make_record(folder, shards, results, history, maps, cfg))
+        write_records(folder, make_record(shards, results, history, licence, maps, cfg))
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
     stage.finish(outputs, finished.tally, history=history.model_dump(mode="json"))
@@ -317,30 +289,29 @@ def _check_parts(parts: Path, results: dict[str, dict]) -> None:
     for item_id, result in results.items():
         path = parts / part_name(item_id)
         if not path.is_file() or path.stat().st_size != result["bytes"]:
-            raise VerifyError(
-                "a part that was finished before is missing or has another size",
-                where=path,
-                expected=f"{result['bytes']} bytes",
-                fix=f"remove {parts.parent} and run again",
-            )
+            expected, fix = f"{result['bytes']} bytes", f"remove {parts.parent} and run again"
+            what = "a part that was finished before is missing or has another size"
+            raise VerifyError(what, where=path, expected=expected, fix=fix)
 
 
-def account(inspection: Inspection, left_out: dict[str, int], captions: Captions, finished: Finished) -> History:
+def account(
+    inspection: Inspection, left_out: dict[str, int], captions: ByFlight, dropped: dict[str, int], finished: Finished
+) -> History:
     """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
     results = [record.result for record in finished.kept]
     gone = left_out | {f"failed: {code}": count for code, count in finished.tally.failed.items()}
-    released = sum(result["captions"] for result in results)
+    accepted, released = sum(map(len, captions.values())), sum(result["captions"] for result in results)
     not_selected = sum(result["captions_not_selected"] for result in results)
     history = History(
         trajectories=inspection.funnel.trajectories,
         flights=FlightHistory(inspected=len(inspection.flights), released=len(results), left_out=gone),
         captions=CaptionHistory(
-            read=captions.num_read,
-            dropped=dict(sorted(captions.dropped.items())),
-            accepted=captions.num_accepted,
+            read=accepted + sum(dropped.values()),
+            dropped=dict(sorted(dropped.items())),
+            accepted=accepted,
             released=released,
             frame_not_selected=not_selected,
-            flight_left_out=captions.num_accepted - released - not_selected,
+            flight_left_out=accepted - released - not_selected,
         ),
     )
     assert history.flights.inspected == len(results) + sum(gone.values()), history
@@ -349,17 +320,17 @@ def account(inspection: Inspection, left_out: dict[str, int], captions: Captions
 
 
 def make_record(
-    folder: Path,
     shards: list[Path],
     results: dict[str, dict],
     history: History,
+    licence: str,
     maps: list[ReleasedMap],
     cfg: ReleaseConfig,
 ) -> ReleaseRecord:
-    """Give what release.json says of a folder that holds its shards."""
+    """Give what release.json says of its shards."""
     listed = [
         Shard(
-            path=shard.relative_to(folder).as_posix(),
+            path=f"data/{shard.name}",
             rows=pq.read_metadata(shard).num_rows,
             bytes=shard.stat().st_size,
             sha256=sha256_file(shard),
@@ -368,7 +339,7 @@ def make_record(
     ]
     return ReleaseRecord(
         name=cfg.name,
-        licence=choose_licence(cfg, {shown.town: shown.licence for shown in maps}),
+        licence=licence,
         credits=cfg.credits,
         maps=maps,
         made_by=f"cosfly {cosfly.__version__}",

@@ -7,7 +7,7 @@ target projected again from pose and intrinsics; every picture decoded.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+import itertools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -139,10 +139,9 @@ def _readable(folder: Path, names: list[str], record: ReleaseRecord, report: Rep
             continue
         has_features = (schema.metadata or {}).get(b"huggingface") == expected.metadata[b"huggingface"]
         if not schema.equals(expected) or not has_features:
-            wrong = [m.name for m in schema if m not in list(expected)] or [
-                "the order, or the features in the metadata"
-            ]
-            report.error("columns", name, ", ".join(wrong), "the columns of the release")
+            wrong = ", ".join(m.name for m in schema if m not in list(expected))
+            got = wrong or "the order, or the features in the metadata"
+            report.error("columns", name, got, "the columns of the release")
         elif num_rows != rows[name]:
             report.error("rows", name, num_rows, str(rows[name]))
         else:
@@ -189,10 +188,9 @@ def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
         return
     found = path.read_text(encoding="utf-8", errors="replace").split("\n")
     wanted = render_card(record).split("\n")
-    for number in range(max(len(found), len(wanted))):
-        pair = [lines[number] if number < len(lines) else "the end" for lines in (found, wanted)]
-        if pair[0] != pair[1]:
-            report.error("card", f"README.md:{number + 1}", repr(pair[0][:120]), repr(pair[1][:120]))
+    for number, (line, expected) in enumerate(itertools.zip_longest(found, wanted, fillvalue="the end"), 1):
+        if line != expected:
+            report.error("card", f"README.md:{number}", repr(line[:120]), repr(expected[:120]))
 
 
 # --- the rows ---------------------------------------------------------------------------------------------------------
@@ -200,7 +198,8 @@ def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
 
 def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
     """Check ids, frame selection, captions and the projection of the target, flight by flight."""
-    flights = {entry.flight: entry for entry in record.flights}
+    # The tree may stand deeper than the town.
+    flights = {"/".join(entry.flight.split("/")[-3:]): entry for entry in record.flights}
     frames: dict[str, list[int]] = {}
     seen: set[tuple[str, str]] = set()
     num_projected, worst_px = 0, 0.0
@@ -218,12 +217,12 @@ def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> Non
             if distance_px > REPROJECTION_TOLERANCE_PX:
                 expected = f"at most {REPROJECTION_TOLERANCE_PX} px between target_uv and the projected target"
                 report.error("projection", where, f"{distance_px:.3f} px", expected)
-    for flight in sorted(flights.keys() ^ {_listed(name, flights) or name for name in frames}):
+    for flight in sorted(flights.keys() ^ frames.keys()):
         report.error("flight", flight, "only in one of release.json and the shards", "the same flights in both")
     for flight, indices in frames.items():
-        entry = flights.get(_listed(flight, flights) or "")
-        if entry is None:
+        if flight not in flights:
             continue
+        entry = flights[flight]
         expected_indices = select_frames(entry.frames_available, record.settings.num_frames).tolist()
         if indices != expected_indices or len(indices) != entry.frames:
             got = f"{len(indices)} frames, first {indices[:3]}"
@@ -231,11 +230,6 @@ def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> Non
     report.facts.append(
         f"{len(seen):,} rows of {len(frames)} flights; {num_projected:,} targets projected, worst {worst_px:.4f} px"
     )
-
-
-def _listed(flight: str, flights: Iterable[str]) -> str | None:
-    """Give the folder name in release.json of a flight: the tree may stand deeper than the town."""
-    return next((name for name in flights if name == flight or name.endswith(f"/{flight}")), None)
 
 
 def _check_caption(row: dict[str, Any], where: str, report: Report) -> None:
@@ -274,24 +268,16 @@ def _check_pictures(paths: list[Path], record: ReleaseRecord, report: Report) ->
     """Decode every picture and compare its size with the row's."""
     files = record.settings.modalities
     count = 0
-    for row in _picture_rows(paths, files):
+    pictures = [PICTURES[file].name for file in files]
+    for row in read_rows(paths, ["town", "sample_id", "width_px", "height_px", *pictures]):
         size = (row["height_px"], row["width_px"])
-        for file in files:
-            column = PICTURES[file].name
+        for file, column in zip(files, pictures, strict=True):
             problem = picture_problem(file, row[column], size)
             count += 1
             if problem:
                 expected = f"a {file} picture of {size[1]} x {size[0]} px"
                 report.error("picture", f"{row['town']}/{row['sample_id']}: {column}", problem, expected)
     report.facts.append(f"{count:,} pictures decoded")
-
-
-def _picture_rows(paths: list[Path], files: list[FrameFile]) -> Iterator[dict[str, Any]]:
-    wanted = ["town", "sample_id", "width_px", "height_px", *(PICTURES[file].name for file in files)]
-    for path in paths:
-        with pq.ParquetFile(path) as file:
-            for k in range(file.num_row_groups):
-                yield from file.read_row_group(k, columns=wanted).to_pylist()
 
 
 def picture_problem(file: FrameFile, value: Any, size: tuple[int, int]) -> str | None:

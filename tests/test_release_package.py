@@ -308,6 +308,23 @@ def test_a_release_without_a_licence_is_refused(inputs, tmp_path, licences, got)
     assert not (tmp_path / "r" / "dataset").exists()
 
 
+def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(inputs, tmp_path):
+    """Two maps of one town's name are two maps: the licence of neither is lost."""
+    for name, licence in (("a", "mit"), ("b", "cc0-1.0")):
+        shutil.copytree(inputs / "tree", tmp_path / "in" / "tree" / name)
+        for town in ("Town01", "Town02"):
+            write_town_map(tmp_path / "in" / "tree" / name / town, MapHeader(licence=licence))
+    shutil.copy(inputs / "captions.jsonl", tmp_path / "in")
+    write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
+    with pytest.raises(ConfigError, match=r"Town01: mit, Town01: cc0-1\.0, Town02: mit, Town02: cc0-1\.0"):
+        build(tmp_path / "in", tmp_path / "r", CFG.model_copy(update={"licence": None}))
+    shutil.rmtree(tmp_path / "in" / "tree" / "b")
+    write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
+    folder = build(tmp_path / "in", tmp_path / "r2", CFG.model_copy(update={"licence": None}))
+    assert read_json(folder / "release.json")["flights"][0]["flight"].startswith("a/Town01/")
+    assert verify(folder).is_ok
+
+
 def test_releases_from_before_there_were_maps_in_the_record_verify(dataset):
     edit_record(dataset, lambda r: r.pop("maps"))
     card = re.sub(r"\n\nMap of [^\n]*", "", (dataset / "README.md").read_text(encoding="utf-8"))
