@@ -33,7 +33,13 @@ def set_up_logging(verbose: bool) -> None:
     else:
         handler = _Lines()
         handler.setFormatter(logging.Formatter("%(levelname)-8s %(message)s"))
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], force=True)
+    logging.basicConfig(handlers=[handler], force=True)
+    set_levels(logging.DEBUG if verbose else logging.INFO)
+
+
+def set_levels(level: int) -> None:
+    """Let our own log lines of a level through; of libraries, which log how they work, warnings only."""
+    logging.getLogger().setLevel(level)
     for noisy in ("httpx", "httpcore", "numba", "PIL", "asyncio", "urllib3"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 

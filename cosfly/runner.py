@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosfly.console import progress_bar
+from cosfly.console import progress_bar, set_levels
 from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
 
@@ -197,7 +197,7 @@ def _start_worker(make_worker: Callable, worker_args: tuple, logs: Any, level: i
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     root = logging.getLogger()
     root.handlers = [logging.handlers.QueueHandler(logs)]
-    root.setLevel(level)
+    set_levels(level)
     try:
         _work = make_worker(*worker_args)
     except Exception as error:
