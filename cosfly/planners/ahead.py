@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from cosfly.compiled import cache_folder
 
 WAIT_MAX_S = 120.0  # five times what it takes on a machine with nothing else to do; then the stage compiles for itself
-NICENESS = 10
 
 
 @contextlib.contextmanager
@@ -58,7 +57,6 @@ def main() -> None:
     """Compile what one planner needs, and mark it as done."""
     planner, folder = sys.argv[1], cache_folder()
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    os.nice(NICENESS)
     from cosfly.planners.contract import PlanConfig
     from cosfly.planners.stage import warm_up
 
