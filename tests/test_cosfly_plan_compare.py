@@ -228,7 +228,12 @@ def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("names", "words"),
-    [(["muco"], "at least 2"), (["muco", "muco"], "named twice"), (["muco", "track"], "did you mean 'track_astar'")],
+    [
+        (["muco"], "at least 2"),
+        (["nope"], "no such planner"),
+        (["muco", "muco"], "named twice"),
+        (["muco", "track"], "did you mean 'track_astar'"),
+    ],
 )
 def test_what_is_no_comparison(inputs, tmp_path, names, words):
     given = [word for name in names for word in ("--planner", name)]

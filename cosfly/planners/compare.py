@@ -135,14 +135,17 @@ def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
 class CompareConfig(PlanConfig):
     """Settings of a comparison: those of step 4, whose `planner` counts for nothing here, and who takes part."""
 
-    planners: tuple[str, ...] = Field(tuple(PLANNERS), min_length=2, description="who is compared, against the first")
+    planners: tuple[str, ...] = Field(tuple(PLANNERS), description="who is compared, against the first")
 
     @field_validator("planners")
     @classmethod
     def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) < len(names):
             raise ValueError("a planner is named twice")
-        return tuple(known_planner(name) for name in names)
+        known = tuple(known_planner(name) for name in names)  # first, so that a wrong name is what one hears of
+        if len(known) < 2:
+            raise ValueError(f"a comparison needs at least 2 planners; name another of {', '.join(PLANNERS)}")
+        return known
 
 
 # --- stage ------------------------------------------------------------------------------------------------------------
