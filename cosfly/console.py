@@ -6,22 +6,46 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
-console = Console(stderr=True)
+from cosfly.escaping import LONGEST_LOG, for_terminal
+
+
+class _Console(Console):
+    """Prints what it is given: no markup, and no control character gets through, wherever a text came from."""
+
+    def __init__(self, *, stderr: bool) -> None:
+        super().__init__(stderr=stderr, markup=False, highlight=False, emoji=False)
+
+    def render_str(self, text: str, **kwargs: Any) -> Text:
+        """Make words of plain text: rich calls this for every `str` that is printed or stands in a table."""
+        return super().render_str(for_terminal(text, LONGEST_LOG), **kwargs)
+
+
+console = _Console(stderr=True)
+answer_console = _Console(stderr=False)  # for what a command was asked to tell
 log = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_LINES = 10.0  # progress as log lines where there is no terminal
+
+
+class _Printable(logging.Formatter):
+    """Formats a record, whose words may be a server's, as text that a terminal prints."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return for_terminal(super().format(record), LONGEST_LOG)
 
 
 class _Lines(logging.Handler):
     """Writes a record as one line, however long; in a pipe there is no width to wrap it to."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        console.print(self.format(record), soft_wrap=True, markup=False, highlight=False)
+        console.print(self.format(record), soft_wrap=True)
 
 
 def set_up_logging(verbose: bool) -> None:
@@ -29,10 +53,10 @@ def set_up_logging(verbose: bool) -> None:
     handler: logging.Handler
     if console.is_terminal:
         handler = RichHandler(console=console, show_path=False, show_time=False, markup=False, rich_tracebacks=False)
-        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setFormatter(_Printable("%(message)s"))
     else:
         handler = _Lines()
-        handler.setFormatter(logging.Formatter("%(levelname)-8s %(message)s"))
+        handler.setFormatter(_Printable("%(levelname)-8s %(message)s"))
     logging.basicConfig(handlers=[handler], force=True)
     set_levels(logging.DEBUG if verbose else logging.INFO)
 
@@ -49,7 +73,7 @@ def progress_bar(label: str, total: int, done: int = 0) -> Iterator[Callable[[in
     """Show progress: a bar on a terminal, a log line every few seconds elsewhere. Yields advance(count)."""
     if console.is_terminal:
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),

@@ -23,6 +23,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cosfly.escaping import for_terminal
+
 
 class CosflyError(Exception):
     """An error that a user can act on.
@@ -58,7 +60,9 @@ class CosflyError(Exception):
             parts.append(f"expected {self.expected}")
         if self.fix is not None:
             parts.append(self.fix)
-        return " ".join("; ".join(parts).split())  # one line, whatever the parts held
+        return " ".join(
+            "; ".join(map(for_terminal, parts)).split()
+        )  # one line that a terminal prints, whatever the parts held
 
     def __reduce__(self) -> tuple:
         # Errors cross process borders; the default reduction would drop the keyword arguments.

@@ -7,6 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from cosfly.escaping import cut, for_terminal
+
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -26,7 +28,7 @@ class Issue(BaseModel):
     def __str__(self) -> str:
         times = f" ({self.count} times, this is the first)" if self.count > 1 else ""
         text = f"{self.severity}: {self.code}: {self.where}: got {self.got}; expected {self.expected}{times}"
-        return " ".join(text.split())
+        return " ".join(for_terminal(text).split())
 
 
 def sort_key(issue: Issue) -> tuple:
@@ -43,7 +45,8 @@ class Report:
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
         """Put a finding on the list."""
-        self.issues.append(Issue(severity=severity, code=code, where=str(where), got=str(got), expected=expected))
+        place, value = cut(str(where)), cut(str(got))
+        self.issues.append(Issue(severity=severity, code=code, where=place, got=value, expected=expected))
 
     def error(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("error", code, where, got, expected)
@@ -73,4 +76,6 @@ class Report:
             f"{self.num(severity)} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
         )
         verdict = "OK" if self.is_ok else "NOT OK"
-        return "\n".join([*self.facts, *map(str, sorted(self.issues, key=sort_key)), f"{verdict}: {counts}"])
+        return "\n".join(
+            [*map(for_terminal, self.facts), *map(str, sorted(self.issues, key=sort_key)), f"{verdict}: {counts}"]
+        )

@@ -18,6 +18,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import yaml
 
+from cosfly.escaping import for_markdown, for_terminal, markdown_code
 from cosfly.products.captions import FIELDS
 from cosfly.products.frames import FrameFile
 from release.columns import (
@@ -190,7 +191,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
     captions, frames = numbers.captions, numbers.frames
     return {
         "front_matter": _front_matter(record),
-        "name": record.name,
+        "name": for_markdown(record.name),
         "summary": _summary(record),
         "frames_table": _table(("", "frames"), _groups(numbers.frames_by)),
         "fov_trajectories": ", ".join(f"{fov}: {n:,}" for fov, n in numbers.trajectories_by_fov_deg.items()),
@@ -198,7 +199,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "visible": f"{_share(numbers.frames_target_visible, frames)} of the frames",
         "perturbed": f"{numbers.frames_perturbed:,} ({_share(numbers.frames_perturbed, frames)})",
         "num_frames": str(settings.num_frames),
-        "frame_rule": record.frame_selection,
+        "frame_rule": for_markdown(record.frame_selection),
         "short_flights": str(numbers.flights_shorter_than_num_frames),
         "captions_with": f"{captions.frames_with:,}",
         "captions_without": f"{captions.frames_without:,}",
@@ -207,7 +208,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "example": _example(captions.example),
         "decisions_table": _table(
             ("decision", "frames", "share"),
-            [(f"`{name}`", f"{n:,}", _share(n, captions.frames_with)) for name, n in captions.decision.items()],
+            [(_Code(name), f"{n:,}", _share(n, captions.frames_with)) for name, n in captions.decision.items()],
         ),
         "provenance_table": _provenance(captions),
         "characters_table": _characters(captions.mean_characters),
@@ -221,9 +222,9 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "decode": _decode_snippet(settings.modalities),
         "columns_table": _columns(settings.modalities),
         "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record.coordinates.items()]),
-        "licence": record.licence,
-        "credits": "".join(f"\n\n{line}" for line in (*_maps(record), record.credits) if line),
-        "made_by": record.made_by,
+        "licence": for_markdown(record.licence),
+        "credits": "".join(f"\n\n{for_markdown(line)}" for line in (*_maps(record), record.credits) if line),
+        "made_by": for_markdown(record.made_by),
     }
 
 
@@ -236,17 +237,19 @@ def _provenance(captions: CaptionNumbers) -> str:
         ("kind of teacher", captions.teacher_kind),
         ("teacher model", captions.teacher_model),
     )
-    rows = [(title, f"`{value}`", f"{n:,}") for title, counts in groups for value, n in counts.items()]
+    rows: list[tuple[str, ...]] = [
+        (title, _Code(value), f"{n:,}") for title, counts in groups for value, n in counts.items()
+    ]
     for name, share in captions.mean_proved.items():
-        rows.append(("sentences proved, mean", f"`{name}`", "-" if share is None else f"{100.0 * share:.1f} %"))
+        rows.append(("sentences proved, mean", _Code(name), "-" if share is None else f"{100.0 * share:.1f} %"))
     return _table(("", "", "frames"), rows)
 
 
 def _front_matter(record: ReleaseRecord) -> str:
     matter = {
-        "license": record.licence,
+        "license": for_terminal(record.licence),
         "language": ["en", "zh"],
-        "pretty_name": record.name,
+        "pretty_name": for_terminal(record.name),
         "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
@@ -267,7 +270,7 @@ def _summary(record: ReleaseRecord) -> str:
     numbers = record.numbers
     tracks = ", ".join(f"{count} {name}" for name, count in numbers.flights_by_track.items())
     towns = len(numbers.frames_by.town)
-    return (
+    return for_markdown(
         f"{numbers.frames:,} frames of {numbers.flights:,} flights ({tracks}) "
         f"over {numbers.trajectories:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
         f"{numbers.captions.frames_with:,} frames carry a reason in English and in Chinese."
@@ -303,7 +306,7 @@ def _characters(mean: dict[str, float | None]) -> str:
 def _example(example: dict[str, str]) -> str:
     if not example:
         return "No frame has a caption."
-    return f"`{example.get('sample_id')}`:\n\n{_table(('', 'English', 'Chinese'), _both_languages(example))}"
+    return f"{markdown_code(example['sample_id'])}:\n\n{_table(('', 'English', 'Chinese'), _both_languages(example))}"
 
 
 def _both_languages(cells: dict[str, str]) -> list[tuple[str, ...]]:
@@ -336,10 +339,10 @@ def _columns(files: list[FrameFile]) -> str:
             kind = "image"
         elif kind.startswith("struct"):
             kind = "texts " if member.type[0].type == "string" else "numbers "
-            kind += ", ".join(f"`{child.name}`" for child in member.type)
+            kind += ", ".join(child.name for child in member.type)
         elif member.name in CAPTION_LISTS:
             kind = "list of int32"
-        rows.append((f"`{member.name}`", kind))
+        rows.append((_Code(member.name), kind))
     return _table(("column", "type"), rows)
 
 
@@ -366,11 +369,19 @@ def _share(count: int, total: int) -> str:
     return f"{100.0 * count / total:.1f} %" if total else "-"
 
 
+class _Code(str):
+    """A cell that is shown as code."""
+
+
 def _table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """Give a Markdown table; numbers to the right."""
+    """Give a Markdown table; numbers to the right. Cells are foreign text: they are shown as they are."""
     lines = [
         "| " + " | ".join(heads) + " |",
         "|" + "|".join("---" if i == 0 else "---:" for i in range(len(heads))) + "|",
     ]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |" for cells in rows]
+    lines += ["| " + " | ".join(map(_cell, cells)) + " |" for cells in rows]
     return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    return markdown_code(text) if isinstance(text, _Code) else for_markdown(text)

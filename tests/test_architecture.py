@@ -174,3 +174,13 @@ def test_an_installed_cosfly_has_every_package_and_every_data_file():
         for path in (ROOT / package.replace(".", "/").replace("cosfly_configs", "configs")).glob(pattern)
     }
     assert data <= packed
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
+def test_foreign_text_is_escaped_in_one_place(name):
+    """No module escapes on its own, opens a console of its own, or writes a page without the policy of the others."""
+    text = SOURCES[name].read_text(encoding="utf-8")
+    if name != "cosfly.escaping":
+        assert not re.search(r"html import escape|html\.escape|rich\.markup|<!doctype", text, re.IGNORECASE)
+    if name != "cosfly.console":
+        assert not re.search(r"\bConsole\(", text)

@@ -16,7 +16,6 @@ from rich.console import RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
-from rich.text import Text
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import Troubles
@@ -167,9 +166,10 @@ class Display:
     def panel(self) -> RenderableType:
         """Give what stands on a terminal: the bar, which counts windows, and the figures below it."""
         grid = Table.grid()
+        grid.add_column(overflow="fold")
         grid.add_row(ProgressBar(total=max(self.total, 1), completed=self.num_done, width=48))
         for part in self._parts():
-            grid.add_row(Text(part, overflow="fold"))
+            grid.add_row(part)
         return grid
 
     def closing_table(self) -> Table:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 
 from caption.run.ledger import CaptionReport, Histogram
 from caption.truth.sentences import sentences_of
 from cosfly.chat.budget import BudgetConfig
+from cosfly.escaping import for_html, html_page
 from cosfly.frame_views import thumbnail
 from cosfly.products.captions import ACTIONS, Caption, Language
 from cosfly.products.frames import frame_name
@@ -48,14 +48,11 @@ def page_html(
     """Give the page's text."""
     teacher = report.teacher
     who = f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown"
-    note = f'<p class="note">{escape(DIFFERENT_TEACHER)}</p>' if teacher and teacher.kind == "rules" else ""
-    note = "".join(f'<p class="note bad">{escape(warning)}</p>' for warning in report.warnings) + note
+    note = f'<p class="note">{for_html(DIFFERENT_TEACHER)}</p>' if teacher and teacher.kind == "rules" else ""
+    note = "".join(f'<p class="note bad">{for_html(warning)}</p>' for warning in report.warnings) + note
     shown = "".join(_card(caption, folders) for caption in cards)
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>cosfly: captions</title><style>{STYLE}</style></head><body>
-<h1>Captions</h1>
-<p class="lead">{escape(who)}</p>
+    body = f"""<h1>Captions</h1>
+<p class="lead">{for_html(who)}</p>
 {_tiles(report)}
 {note}
 <h2>Verdicts</h2>
@@ -78,9 +75,8 @@ that can be measured, or not sure enough to say; it is not verified.</p>
 <div class="grid">{_repairs(report)}{_checks(report)}{_cost(report, budget)}</div>
 <h2>{len(cards)} samples</h2>
 <p class="lead">Chosen by the hash of their ids, the kinds of outcome taking turns. The last frame is the current one, the others are one time step apart.</p>
-{shown}
-</body></html>
-"""
+{shown}"""
+    return html_page("cosfly: captions", STYLE, body)
 
 
 def _tiles(report: CaptionReport) -> str:
@@ -183,7 +179,7 @@ def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
 
 
 def _words(token: str) -> str:
-    return escape(token.replace("_", " "))
+    return for_html(token.replace("_", " "))
 
 
 def _histograms(lengths: Mapping[str, Mapping[str, Histogram]]) -> str:
@@ -220,8 +216,8 @@ def _histogram(histogram: Histogram) -> str:
 
 
 def _table(title: str, rows: Sequence[tuple[str, str]], nothing: str) -> str:
-    lines = "".join(f'<tr><td>{escape(name)}</td><td class="n">{escape(value)}</td></tr>' for name, value in rows)
-    return f'<div class="panel"><h3>{title}</h3>{f"<table>{lines}</table>" if rows else escape(nothing)}</div>'
+    lines = "".join(f'<tr><td>{for_html(name)}</td><td class="n">{for_html(value)}</td></tr>' for name, value in rows)
+    return f'<div class="panel"><h3>{title}</h3>{f"<table>{lines}</table>" if rows else for_html(nothing)}</div>'
 
 
 def _repairs(report: CaptionReport) -> str:
@@ -281,9 +277,9 @@ def _card(caption: Caption, folders: Mapping[str, Path]) -> str:
     folder = folders.get(flight_of(caption.sample_id))
     pictures = "".join(_picture(folder, index) for index in caption.window[-5:])
     problems = caption.checks.evidence
-    found = "" if not isinstance(problems, list) else "".join(f'<p class="bad">{escape(p)}</p>' for p in problems)
+    found = "" if not isinstance(problems, list) else "".join(f'<p class="bad">{for_html(p)}</p>' for p in problems)
     return (
-        f'<article class="card"><header><b>{escape(caption.sample_id)}</b>{"".join(tags)}</header>'
+        f'<article class="card"><header><b>{for_html(caption.sample_id)}</b>{"".join(tags)}</header>'
         f'<div class="frames">{pictures}</div>'
         f'<div class="texts">{_text(caption, "en")}{_text(caption, "zh")}</div>{found}</article>'
     )
@@ -307,10 +303,10 @@ def _text(caption: Caption, language: Language) -> str:
     marked = {"C": "", "R": ""}
     for i, (name, text) in enumerate(sentences_of(coc)):
         color = STATES[states[i]] if i < len(states) else "transparent"
-        marked[name[0]] += f'<span style="border-bottom:2px solid {color}">{escape(text)}</span> '
+        marked[name[0]] += f'<span style="border-bottom:2px solid {color}">{for_html(text)}</span> '
     what = f"{LANGUAGE_NAMES[language]}: critical components"
     return (
         f'<div lang="{"en" if language == "en" else "zh-CN"}"><span class="what">{what}</span><p>{marked["C"]}</p>'
         f'<span class="what">reasoning</span><p>{marked["R"]}</p>'
-        f'<span class="what">decision</span><p><code>{escape(coc.flight_decision)}</code></p></div>'
+        f'<span class="what">decision</span><p><code>{for_html(coc.flight_decision)}</code></p></div>'
     )

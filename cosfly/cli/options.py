@@ -13,6 +13,7 @@ from cosfly.errors import ConfigError, InputError, nearest
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from cosfly.settings import RunConfig
     from cosfly.stage_folder import Tally
@@ -102,7 +103,7 @@ def data_folder(data: Path | None) -> Path:
     )
 
 
-def plain_table(title: str | None, rows: Iterable[Sequence[str]]) -> Table:
+def plain_table(title: str | None, rows: Iterable[Sequence[str | Text]]) -> Table:
     """A table without lines and without a header."""
     from rich.table import Table
 
@@ -114,10 +115,10 @@ def plain_table(title: str | None, rows: Iterable[Sequence[str]]) -> Table:
 
 def tell_checks(checks: Sequence[Any], console: Console, title: str | None = None) -> None:
     """Print what was examined, each with name, state and detail; exit 1 where something that is needed does not work."""
-    from rich.markup import escape
+    from rich.text import Text
 
     colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}
-    rows = [(check.name, f"[{colors[check.state]}]{check.state}[/]", escape(check.detail)) for check in checks]
+    rows = [(check.name, Text(check.state, colors[check.state]), check.detail) for check in checks]
     console.print(plain_table(title, rows))
     if any(colors[check.state] == "red" for check in checks):
         raise typer.Exit(1)

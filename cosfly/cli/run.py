@@ -55,7 +55,7 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
         table.add_row(result.stage.name, f"{counts.kept} of {counts.input}", dropped, failed, seconds, product)
     console.print(table)
     for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
-        console.print(f"  look at  {os.path.relpath(out / name)}", highlight=False)
+        console.print(f"  look at  {os.path.relpath(out / name)}", soft_wrap=True)
 
 
 config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
@@ -92,8 +92,7 @@ def doctor(
     out: Annotated[Path, typer.Option(help="Where runs will be written.")] = Path("runs"),
 ) -> None:
     """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
-    from rich.console import Console
-
     from cosfly import doctor as examination
+    from cosfly.console import answer_console
 
-    options.tell_checks(examination.examine(out, teacher), Console())
+    options.tell_checks(examination.examine(out, teacher), answer_console)

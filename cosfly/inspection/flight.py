@@ -5,12 +5,11 @@ The poses that were drawn are measured against the map themselves: a perturbed f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
@@ -28,7 +27,7 @@ from cosfly.flight_metrics import (
 )
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.frames import FrameNumbers, check_checksums, check_files, check_pixels, choose_frames, target_box
-from cosfly.inspection.report import draw_flight
+from cosfly.inspection.report import FlightView, draw_flight
 from cosfly.issues import Report
 from cosfly.products.inspection import FlightInspection
 from cosfly.products.inspection import Result as FlightResult
@@ -92,12 +91,11 @@ class InspectConfig(Config):
 # --- one flight -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Inspected:
-    """A flight's record, and what the report draws of it."""
+class Inspected(BaseModel):
+    """A flight's record, and what the report draws of it; so it stands in `items.jsonl`."""
 
     record: FlightInspection
-    view: dict[str, Any]
+    view: FlightView
 
 
 def inspect_flight(
@@ -141,7 +139,7 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    return Inspected(record, draw_flight(flight, _heights_m(flight), cfg.thumbnail_px))
+    return Inspected(record=record, view=draw_flight(flight, _heights_m(flight), cfg.thumbnail_px))
 
 
 def trace_id(flight: Flight) -> str:

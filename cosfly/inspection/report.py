@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field
 
+from cosfly.escaping import for_html, html_page
 from cosfly.frame_views import thumbnail
 from cosfly.issues import Issue
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
@@ -33,11 +34,19 @@ COLUMNS = (
 )
 
 
-def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> dict[str, Any]:
-    """Give what a row shows, JSON-able: two curves, and the first, middle and last frame as small JPEGs.
+class FlightView(BaseModel):
+    """What a row shows: two curves with gaps, and the first, middle and last frame as JPEGs in base64, None for one that cannot be read."""
+
+    height_m: list[float | None] = []
+    visibility: list[float | None] = []
+    pictures: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")] | None] = [None, None, None]
+
+
+def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> FlightView:
+    """Give what a row shows.
 
     Args:
-        heights_m: (n,) of the drone over the person. width_px: of the pictures; None stands for one that cannot be read.
+        heights_m: (n,) of the drone over the person. width_px: of the pictures.
     """
     rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
     curves = {"height_m": heights_m[rows], "visibility": flight.visibility[rows]}
@@ -45,26 +54,23 @@ def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> dict[st
         name: [None if np.isnan(v) else round(float(v), 3) for v in values.tolist()] for name, values in curves.items()
     }
     middle, last = len(flight) // 2, len(flight) - 1
-    return {**numbers, "pictures": [thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)]}
+    return FlightView(**numbers, pictures=[thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)])
 
 
-def write_report(path: Path, inspection: Inspection, views: dict[str, dict[str, Any]]) -> None:
+def write_report(path: Path, inspection: Inspection, views: dict[str, FlightView]) -> None:
     """Write the page; `views` holds pictures and curves by flight folder."""
     write_bytes(path, report_html(inspection, views).encode())
 
 
-def report_html(inspection: Inspection, views: dict[str, dict[str, Any]]) -> str:
+def report_html(inspection: Inspection, views: dict[str, FlightView]) -> str:
     """Give the page's text. Flights that need a look come first."""
     order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
     counts = inspection.funnel.flights
     summary = f"{counts.inspected} flights: {counts.accepted} accepted, {counts.review} to review, {counts.rejected} rejected."
-    heads = "".join(f'<th class="n">{escape(title)}</th>' for title, _, _ in COLUMNS)
-    rows = "\n".join(_row(flight, views.get(flight.folder, {})) for flight in order)
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>cosfly: inspection</title><style>{STYLE}</style></head><body>
-<h1>Inspection</h1>
-<p class="lead">{escape(summary)} A rejected flight breaks a rule; one in review is for a person to decide.</p>
+    heads = "".join(f'<th class="n">{for_html(title)}</th>' for title, _, _ in COLUMNS)
+    rows = "\n".join(_row(flight, views.get(flight.folder, FlightView())) for flight in order)
+    body = f"""<h1>Inspection</h1>
+<p class="lead">{for_html(summary)} A rejected flight breaks a rule; one in review is for a person to decide.</p>
 <h2>Funnel</h2>
 <div class="funnel">{_funnel(inspection)}</div>
 <h2>Flights</h2>
@@ -74,9 +80,8 @@ drawn poses to an obstacle; five-ray: their mean visibility on the map; rendered
 {rows}
 </tbody></table></div>
 <h2>Settings</h2>
-<p class="lead">{escape(", ".join(f"{name} {value}" for name, value in inspection.settings.items()))}</p>
-</body></html>
-"""
+<p class="lead">{for_html(", ".join(f"{name} {value}" for name, value in inspection.settings.items()))}</p>"""
+    return html_page("cosfly: inspection", STYLE, body)
 
 
 def _funnel(inspection: Inspection) -> str:
@@ -102,14 +107,14 @@ def _bar(label: str, count: int, total: int, kind: str = "", *, sub: bool = Fals
     width = 100.0 * count / total if total else 0.0
     shade = f"{kind} zero" if count == 0 else kind
     return (
-        f'<div class="bar{" sub" if sub else ""}"><span>{escape(label.replace("_", " "))}</span>'
+        f'<div class="bar{" sub" if sub else ""}"><span>{for_html(label.replace("_", " "))}</span>'
         f'<i class="{shade}" style="width:{width:.1f}%"></i><b>{count}</b></div>'
     )
 
 
-def _row(flight: FlightInspection, view: dict[str, Any]) -> str:
+def _row(flight: FlightInspection, view: FlightView) -> str:
     issues = "".join(_issue(issue) for issue in flight.issues if issue.severity != "note")
-    name = f"<b>{escape(flight.trajectory)}</b><br>{escape(flight.variant)} <small>{escape(flight.town)}</small>"
+    name = f"<b>{for_html(flight.trajectory)}</b><br>{for_html(flight.variant)} <small>{for_html(flight.town)}</small>"
     label = f'{name}<br><span class="tag {flight.result}">{flight.result}</span>'
     wide = (
         f'<tr class="wide"><td colspan="{len(COLUMNS) + 3}"><ul class="issues">{issues}</ul></td></tr>'
@@ -121,11 +126,9 @@ def _row(flight: FlightInspection, view: dict[str, Any]) -> str:
         f'<img alt="frame" src="data:image/jpeg;base64,{picture}">'
         if picture
         else '<span class="gone">no picture</span>'
-        for picture in view.get("pictures", [None] * 3)
+        for picture in view.pictures
     )
-    curves = _curve(view.get("height_m", []), "#2b6cb0", "m", least_span=5.0) + _curve(
-        view.get("visibility", []), "#2f855a", "", (0, 1)
-    )
+    curves = _curve(view.height_m, "#2b6cb0", "m", least_span=5.0) + _curve(view.visibility, "#2f855a", "", (0, 1))
     first = '<tr class="open">' if issues else "<tr>"
     return f'{first}<td>{label}</td><td class="pictures">{pictures}</td>{numbers}<td>{curves}</td></tr>{wide}'
 
@@ -133,7 +136,7 @@ def _row(flight: FlightInspection, view: dict[str, Any]) -> str:
 def _issue(issue: Issue) -> str:
     times = f" &times;{issue.count}" if issue.count > 1 else ""
     text = f"{issue.where}: {issue.got}; expected {issue.expected}"
-    return f'<li class="{issue.severity}"><b>{escape(issue.code)}</b>{times} {escape(text)}</li>'
+    return f'<li class="{issue.severity}"><b>{for_html(issue.code)}</b>{times} {for_html(text)}</li>'
 
 
 def _number(value: float | int | None, form: str) -> str:

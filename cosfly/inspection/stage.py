@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from cosfly.errors import InputError
-from cosfly.inspection.flight import InspectConfig, inspect_flight, trace_id
-from cosfly.inspection.report import write_report
+from cosfly.inspection.flight import InspectConfig, Inspected, inspect_flight, trace_id
+from cosfly.inspection.report import FlightView, write_report
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.inspection import (
@@ -27,6 +26,7 @@ from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.runner import Finished, Item, Outcome, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder
+from cosfly.store import validation_errors
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
@@ -39,8 +39,9 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     def work(item: Item) -> Outcome:
         inspected = inspect_flight(data / item.payload, data, by_id, obstacles, cfg)
         record = inspected.record
-        result = {"record": record.model_dump(mode="json"), "view": inspected.view}
-        return Outcome(result, drop_reason=record.reason if record.result == "rejected" else None)
+        return Outcome(
+            inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None
+        )
 
     return work
 
@@ -81,15 +82,18 @@ def run(
 
 def assemble(
     finished: Finished, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
-) -> tuple[Inspection, dict[str, dict[str, Any]]]:
+) -> tuple[Inspection, dict[str, FlightView]]:
     """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
-    flights, views = [], {}
+    flights: list[FlightInspection] = []
+    views: dict[str, FlightView] = {}
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, planned or [], data))
         else:
-            flights.append(FlightInspection.model_validate(outcome.result["record"]))
-            views[outcome.id] = outcome.result["view"]
+            with validation_errors(f"items.jsonl: {outcome.id}"):  # it may be of an earlier run
+                inspected = Inspected.model_validate(outcome.result)
+            flights.append(inspected.record)
+            views[outcome.id] = inspected.view
     flights = _with_twins_trace(flights)
     funnel = Funnel(trajectories=_trajectory_funnel(flights, planned), flights=_flight_funnel(flights))
     funnel.trajectories.check()

@@ -1,0 +1,251 @@
+"""Foreign text: the terminal obeys none of it, pages and cards show it as it is, and no length of it is too long."""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+from pydantic import BaseModel, ValidationError
+from rich.table import Table
+
+from caption.run.report import page_html
+from caption.run.stage import run as caption
+from caption.schema import CaptionConfig
+from cosfly import console as shared
+from cosfly.chat.budget import BudgetConfig
+from cosfly.errors import InputError
+from cosfly.escaping import LONGEST, cut, for_html, for_markdown, for_terminal, markdown_code
+from cosfly.inspection.report import FlightView, report_html
+from cosfly.inspection.stage import run as inspect
+from cosfly.issues import Report
+from cosfly.products.captions import Caption, read_captions
+from cosfly.products.inspection import Inspection, read_inspection
+from cosfly.store import read_json
+from release.card import render_card
+from release.record import ReleaseRecord
+from specimens import make_playback_tree
+
+OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # by a terminal
+HOSTILE = (
+    "\x1b]0;owned\x07\x1b[31m\u202e</p><script>alert(1)</script><img src=x onerror='alert(2)'>`|[a](javascript:b)[/]"
+)
+
+
+# --- the terminal -----------------------------------------------------------------------------------------------------
+
+
+@given(st.text(alphabet=st.characters(codec=None), max_size=200))
+def test_a_terminal_is_given_nothing_that_it_obeys(text):
+    assert not OBEYED.search(for_terminal(text))
+    for_terminal(text).encode("utf-8")  # half of a surrogate pair would stop the stream
+
+
+@given(st.text(alphabet="ab é漢\n\t<>&'", max_size=200))
+def test_plain_text_stays_as_it_is(text):
+    assert for_terminal(text) == text
+
+
+@pytest.mark.parametrize("count", [0, 1, LONGEST, LONGEST + 1, 3_000_000])
+def test_no_text_is_too_long(count):
+    shown = cut("a" * count)
+    assert len(shown) <= LONGEST + 60
+    assert (shown == "a" * count) == (count <= LONGEST)
+
+
+def printed(monkeypatch, *, is_terminal: bool = True, width: int = 400) -> io.StringIO:
+    """Let the shared console write into memory."""
+    stream = io.StringIO()
+    terminal = type(shared.console)(stderr=True)
+    terminal.file, terminal._force_terminal, terminal.width, terminal.no_color = stream, is_terminal, width, True
+    monkeypatch.setattr(shared, "console", terminal)
+    return stream
+
+
+def test_lines_and_cells_are_printed_and_not_obeyed(monkeypatch):
+    stream = printed(monkeypatch)
+    table = Table(title=HOSTILE)
+    table.add_column(HOSTILE)
+    table.add_row(HOSTILE)
+    shared.console.print(HOSTILE)
+    shared.console.print(table)
+    lines = stream.getvalue()
+    assert "\x1b]0" not in lines
+    assert "\x07" not in lines
+    assert "\u202e" not in lines
+    assert lines.count("\\x1b]0;owned\\x07") == 4
+    assert lines.count("[/]") == 4  # and no MarkupError
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_log_records_are_printed_and_not_obeyed(monkeypatch, is_terminal):
+    stream = printed(monkeypatch, is_terminal=is_terminal)
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    shared.set_up_logging(verbose=False)
+    logging.getLogger("cosfly.x").error("the server says %s", HOSTILE)
+    monkeypatch.undo()
+    assert "\\x1b]0;owned" in stream.getvalue()
+    assert "\x1b]0" not in stream.getvalue()
+    assert "\x07" not in stream.getvalue()
+
+
+def test_an_error_is_one_short_line_whatever_it_names():
+    error = InputError("not a number", where=Path(HOSTILE), got=HOSTILE + "9" * 5_000_000, expected="one\nline")
+    assert len(str(error)) < 5 * LONGEST
+    assert not OBEYED.search(str(error))
+    assert "\n" not in str(error)
+
+
+def test_findings_are_short_lines_whatever_they_name():
+    report = Report(facts=[HOSTILE])
+    report.error("code", HOSTILE, "9" * 5_000_000, "a number")
+    assert len(report.issues[0].got) < 2 * LONGEST
+    assert not OBEYED.search(str(report).replace("\n", ""))
+
+
+# --- pages ------------------------------------------------------------------------------------------------------------
+
+
+class Tags(HTMLParser):
+    """Collects the tags of a page with the names of their attributes."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.seen: set[tuple[str, ...]] = set()
+        self.links: list[str] = []
+        self.policy = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.add((tag, *sorted(name for name, _ in attrs)))
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if ("http-equiv", "Content-Security-Policy") in attrs:
+            self.policy = dict(attrs)["content"] or ""
+
+    handle_startendtag = handle_starttag
+
+
+def texts_in(value: Any, path: tuple = ()) -> Iterator[tuple]:
+    """Yield where texts stand in JSON."""
+    if isinstance(value, str):
+        yield path
+    elif isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from texts_in(value[key], (*path, key))
+
+
+def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
+    """Give the same record with every text that can be anything hostile; at least so many can."""
+    value = honest.model_dump(mode="json")
+    count = 0
+    for path in list(texts_in(value)):
+        other = copy.deepcopy(value)
+        place = other
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = HOSTILE
+        try:
+            model.model_validate(other)
+        except ValidationError:
+            continue  # one of a closed set
+        value, count = other, count + 1
+    assert count >= least
+    return model.model_validate(value)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12, width_px=64, height_px=36)
+
+
+@pytest.fixture(scope="module")
+def inspection(tree, tmp_path_factory) -> Path:
+    from cosfly.inspection.flight import InspectConfig
+
+    return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
+
+
+def check_page(page: str, honest: str) -> None:
+    """Same tags as in the honest page, none of them the forger's; and a policy that would stop them."""
+    found = Tags(page)
+    assert found.seen <= Tags(honest).seen | {("ul", "class"), ("li", "class"), ("td", "colspan"), ("tr", "class")}
+    assert "script" not in {tag for tag, *_ in found.seen}
+    assert all(link.startswith("data:image/jpeg;base64,") for link in found.links)
+    assert "default-src 'none'" in found.policy
+    assert "script-src" not in found.policy
+    assert HOSTILE[:8] not in page
+    assert "&lt;script&gt;" in page  # shown, not left out
+
+
+def test_the_page_of_an_inspection_shows_forged_records(inspection):
+    honest = read_inspection(inspection)
+    false = forged(Inspection, honest, 8)
+    check_page(report_html(false, {}), (inspection.parent / "report.html").read_text(encoding="utf-8"))
+
+
+def test_a_forged_journal_of_an_inspection_is_refused():
+    with pytest.raises(ValidationError):
+        FlightView(pictures=['" onerror="alert(1)', None, None])
+
+
+def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
+    done = caption(CaptionConfig(), tree, tmp_path / "caption").parent
+    from caption.run.ledger import CaptionReport
+
+    value = read_json(done / "caption_report.json")
+    report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
+    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig())
+    check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
+
+
+# --- the card ---------------------------------------------------------------------------------------------------------
+
+markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
+
+
+@given(st.text(max_size=60))
+def test_markdown_shows_a_text_as_it_is(text):
+    [_, inline, _] = markdown.parse("x" + for_markdown("x" + text + "x") + "x")
+    assert {token.type for token in inline.children} <= {"text", "text_special"}
+    words = "".join(token.content for token in inline.children)
+    assert words == "xx" + " ".join(for_terminal("x" + text + "x").split())[1:] + "x"
+
+
+@given(st.text(alphabet="a`|\\ <\n", max_size=30))
+def test_a_code_span_holds_a_text(text):
+    row = markdown.render(f"| a | b |\n|---|---|\n| {markdown_code(text)} | end |\n")
+    [cell, last] = re.findall("<td>(.*?)</td>", row)
+    assert last == "end"
+    assert cell.startswith("<code>") or not text.split()
+    assert "<a" not in cell
+
+
+def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
+    from release.package import ReleaseConfig, run
+    from release.sources import Source
+
+    captions = caption(CaptionConfig(), tree, tmp_path / "caption")
+    folder = run(ReleaseConfig(licence="mit"), [Source.of_files(tree, captions, inspection)], tmp_path / "release")
+    folder = folder if folder.is_dir() else folder.parent
+    value = read_json(folder / "release.json")
+    record = ReleaseRecord.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    card = render_card(forged(ReleaseRecord, record, 8))
+    page = markdown.render(card.split("\n---\n", 1)[1])
+    assert "alert(1)" in page
+    assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
+    assert not OBEYED.search(card.replace("\n", ""))
+
+
+def test_html_is_shown_as_it_is():
+    assert for_html('<a href="b">\'&') == "&lt;a href=&quot;b&quot;&gt;&#x27;&amp;"
