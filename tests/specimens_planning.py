@@ -1,10 +1,12 @@
 """Hand-made worlds for planners, and the check that a flight through them is safe."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 
 from cosfly import kernels
 from cosfly.geometry import DT_S
-from cosfly.planners.contract import PlanConfig
+from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.stage import make_scenario
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.kinds import KINDS
@@ -46,7 +48,14 @@ WORLDS = {
 def scenario_of(world):
     box_map, corners = WORLDS[world]
     obstacles = kernels.obstacle_index(box_map)
-    return make_scenario(walk_along(world, corners), obstacles), obstacles
+    return make_scenario(walk_along(world, corners), obstacles, PlanConfig()), obstacles
+
+
+def first_points(scenario, num):
+    """The beginning of a scenario."""
+    wish = {f.name: getattr(scenario.wish, f.name) for f in fields(scenario.wish)}
+    wish = Wish(**{name: value if isinstance(value, bool) else value[:num] for name, value in wish.items()})
+    return replace(scenario, targets_m=scenario.targets_m[:num], ground_m=scenario.ground_m[:num], wish=wish)
 
 
 def assert_safe(positions, obstacles, cfg=PlanConfig(), ground_m=0.0):

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
 
 from cosfly import kernels
-from cosfly.planners import behind
 from cosfly.planners.contract import PlanConfig, Scenario
 from cosfly.planners.muco import loss, muco, nearby, step
+from cosfly.planners.wish import follow
 
 
 def random_boxes(rng, count, size_m=40.0):
@@ -84,10 +84,9 @@ def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
         obstacles.rows[:, :3], obstacles.rows[:, 3:6] * [1, 1, 4], obstacles.rows[:, 6:15].reshape(-1, 3, 3)
     )
     targets = np.column_stack([np.linspace(-30, 30, 80), np.full(80, 2.0), np.full(80, 1.0)])
-    scenario = Scenario("w", targets, np.zeros(len(targets)))
-    headings = behind.smoothed_headings(targets, 4.0)
-    problem = muco.make_problem(scenario, headings, cfg)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, cfg)
+    scenario = Scenario("w", targets, np.zeros(len(targets)), follow(targets, cfg))
+    problem = muco.make_problem(scenario, cfg)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, cfg)
     points, solver = muco.optimize(first, problem, obstacles, cfg.muco)
     monkeypatch.setattr(step, "remember_boxes", lambda *_: None)
     monkeypatch.setattr(muco, "descend", step.descend.py_func)  # the loop in Python, so that it calls what is set above

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from specimens_planning import CANYON, WORLDS, assert_safe, scenario_of, town_of, walk_along
+from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
 from cosfly import flight_metrics as metrics
@@ -17,8 +17,8 @@ from cosfly import kernels
 from cosfly.config import load
 from cosfly.errors import ConfigError, InputError, NoPathError, NothingKept, ResumeError
 from cosfly.geometry import DT_S, look_at
-from cosfly.planners import behind
-from cosfly.planners.contract import MucoConfig, PlanConfig
+from cosfly.planners import wish
+from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.products.boxes import write_boxes
@@ -26,10 +26,6 @@ from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
 
 CFG = PlanConfig()
-
-
-def problem_of(scenario, cfg=CFG):
-    return muco.make_problem(scenario, behind.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s), cfg)
 
 
 # --- metrics ----------------------------------------------------------------------------------------------------------
@@ -86,7 +82,7 @@ def plain_terms(points, problem, obstacles):
     targets, weights = problem.targets, problem.weights
     terms = dict.fromkeys(loss.TERM_NAMES, 0.0)
     for i, (p, x) in enumerate(zip(points, targets, strict=True)):
-        terms["tracking"] += weights[0] * (np.linalg.norm(p - x) - 28.0) ** 2
+        terms["tracking"] += weights[0] * (np.linalg.norm(p - x) - problem.distances[i]) ** 2
         gap = kernels.signed_distances(obstacles, p[None])[0][0]
         if gap < 8.0:
             terms["safety"] += weights[3] * 0.5 * (8.0 - gap) ** 2
@@ -94,11 +90,12 @@ def plain_terms(points, problem, obstacles):
         seen = kernels.visibility(obstacles, np.array(window), np.repeat(x[None], 7, axis=0)).mean()
         terms["visibility"] += weights[4] * (1 - seen) ** 2
         pitch, yaw = look_at(p, x)
-        turn = np.angle(np.exp(1j * (yaw - problem.headings_rad[i])))
-        terms["view_angle"] += weights[5] * ((-pitch - np.pi / 4) ** 2 + turn**2)
-        outside = max(np.pi / 6 + pitch, 0) + max(-pitch - np.pi / 3, 0)
+        turn = np.angle(np.exp(1j * (yaw - problem.views_rad[i])))
+        terms["view_angle"] += weights[5] * ((-pitch - problem.pitches_rad[i, 1]) ** 2 + turn**2)
+        outside = max(problem.pitches_rad[i, 0] + pitch, 0) + max(-pitch - problem.pitches_rad[i, 2], 0)
         terms["pitch"] += 20 * outside**2
-        terms["altitude"] += 50 * max(20 - p[2], 0) ** 2 + 20 * max(p[2] - 20, 0) ** 2
+        terms["altitude"] += 50 * max(problem.altitudes[i, 0] - p[2], 0) ** 2
+        terms["altitude"] += 20 * max(p[2] - problem.altitudes[i, 1], 0) ** 2
     terms["smoothness"] = weights[1] * (np.diff(points, n=2, axis=0) ** 2).sum()
     terms["jerk"] = weights[2] * (np.diff(points, n=3, axis=0) ** 2).sum()
     terms["path_length"] = weights[6] * 0.1 * np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
@@ -109,8 +106,10 @@ def plain_terms(points, problem, obstacles):
 def shaken(world, seed=3):
     """A trajectory behind the target, shaken, so that every term is at work."""
     scenario, obstacles = scenario_of(world)
-    problem = problem_of(scenario)
-    points = behind.behind(scenario.targets_m, problem.headings_rad, 18.0, np.full(len(scenario.targets_m), 21.0))
+    problem = muco.make_problem(scenario, CFG)
+    points = replace(scenario.wish, ground_distance_m=np.full(len(scenario.targets_m), 18.0)).places_m(
+        scenario.targets_m, scenario.ground_m + 1.0
+    )
     points += np.random.default_rng(seed).normal(0, 2.5, points.shape)
     return points, problem, obstacles
 
@@ -125,6 +124,37 @@ def test_terms_agree_with_their_definitions(world):
     assert total == pytest.approx(sum(expected.values()))
     if world == "tower_behind":
         assert min(expected.values()) > 0  # every term is at work somewhere
+
+
+def test_the_wish_of_each_waypoint_reaches_the_loss():
+    scenario, obstacles = scenario_of("corner")
+    num = len(scenario.targets_m)
+    paper = muco.make_problem(scenario, CFG)
+    np.testing.assert_array_equal(paper.pitches_rad, np.tile(np.radians([30, 45, 60]), (num, 1)))
+    np.testing.assert_array_equal(paper.altitudes, np.tile([20.0, 20.0, 100.0], (num, 1)))
+    np.testing.assert_array_equal(
+        paper.views_rad, scenario.wish.heading_rad
+    )  # behind looks the way that the walker goes
+    wished = Wish(
+        heading_rad=scenario.wish.heading_rad,
+        bearing_rad=np.linspace(-3.0, 3.0, num),
+        distance_m=np.linspace(12.0, 40.0, num),
+        ground_distance_m=np.linspace(9.0, 30.0, num),
+        pitch_rad=np.linspace(0.3, 1.2, num),
+        altitude_m=np.linspace(8.0, 50.0, num),
+        altitude_min_m=np.linspace(6.0, 40.0, num),
+        altitude_max_m=np.full(num, 90.0),
+    )
+    problem = muco.make_problem(replace(scenario, wish=wished), CFG)
+    points = wished.places_m(scenario.targets_m, scenario.ground_m)
+    np.testing.assert_allclose(np.hypot(*(points - scenario.targets_m)[:, :2].T), wished.ground_distance_m)
+    np.testing.assert_allclose(points[:, 2], wished.altitude_m)
+    yaw = look_at(points, scenario.targets_m)[1]
+    np.testing.assert_allclose(np.angle(np.exp(1j * (yaw - problem.views_rad))), 0, atol=1e-12)
+    points += np.random.default_rng(0).normal(0, 2.5, points.shape)
+    state = loss.make_state(num, len(obstacles.rows))
+    loss.evaluate(points, problem, obstacles, np.zeros(num, dtype=bool), state)
+    np.testing.assert_allclose(state.terms, list(plain_terms(points, problem, obstacles).values()), rtol=1e-9)
 
 
 def test_gradient_is_the_derivative_of_the_loss():
@@ -212,19 +242,19 @@ def test_low_visibility_runs(low, expected):
 
 def test_headings_follow_the_walk_and_survive_standing_still():
     walk = walk_along("w", [(0, 0), (50, 0), (50, 50)])
-    headings = behind.smoothed_headings(walk.positions_m, 4.0)
+    headings = wish.smoothed_headings(walk.positions_m, 4.0)
     assert headings[0] == pytest.approx(0, abs=1e-6)
     assert headings[-1] == pytest.approx(np.pi / 2, abs=1e-6)
     assert (np.diff(headings) >= -1e-12).all()
     assert np.diff(headings).max() < 0.12  # the turn is spread over seconds
     standing = np.vstack([walk.positions_m[:5], np.repeat(walk.positions_m[4:5], 10, axis=0)])
-    np.testing.assert_allclose(behind.smoothed_headings(standing, 0.0), 0, atol=1e-12)
-    np.testing.assert_array_equal(behind.smoothed_headings(np.zeros((4, 3)), 4.0), 0)
+    np.testing.assert_allclose(wish.smoothed_headings(standing, 0.0), 0, atol=1e-12)
+    np.testing.assert_array_equal(wish.smoothed_headings(np.zeros((4, 3)), 4.0), 0)
 
 
 def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():
     scenario, obstacles = scenario_of("tower_behind")
-    problem = problem_of(scenario)
+    problem = muco.make_problem(scenario, CFG)
     point = np.array([-17.0, 1.0, 20.0])
     assert step.push_out(point, problem, obstacles, nothing_nearby(1), 0) == pytest.approx(3.0, abs=1e-5)
     slit = kernels.obstacle_index(town_of(((-5, 0, 60), (2.3, 500, 60)), ((5, 0, 60), (2.3, 500, 60))))  # 5.4 m wide
@@ -238,8 +268,8 @@ def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
-    problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     assert_safe(first, obstacles)
     points, solver = muco.optimize(first, problem, obstacles, CFG.muco)
     assert_safe(points, obstacles)
@@ -283,9 +313,9 @@ def papers_losses(points, problem, obstacles, cfg, num_steps):
 def test_the_papers_optimizer_is_the_one_that_is_printed(world):
     """It overshoots, goes on all the same, over infeasible trajectories too, and gives the last feasible one, not converged."""
     scenario, obstacles = scenario_of(world)
-    scenario = replace(scenario, targets_m=scenario.targets_m[:16], ground_m=scenario.ground_m[:16])
-    problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
+    scenario = first_points(scenario, 16)
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     cfg = MucoConfig(step="paper", iterations_max=5)
     points, plain = muco.optimize(first, problem, obstacles, cfg)
     expected, _ = papers_losses(first, problem, obstacles, cfg, 5)
@@ -298,9 +328,9 @@ def test_the_papers_optimizer_is_the_one_that_is_printed(world):
 def test_the_papers_optimizer_goes_on_after_an_infeasible_step():
     """A drone hardly faster than the walker: jumps of half a metre break the speed limit at the end that stays in its place."""
     scenario, obstacles = scenario_of("empty")
-    scenario = replace(scenario, targets_m=scenario.targets_m[:16], ground_m=scenario.ground_m[:16])
-    problem = problem_of(scenario)._replace(step_max_m=0.7)
-    first = behind.behind(scenario.targets_m, problem.headings_rad, 20.0, problem.altitudes[:, 0])
+    scenario = first_points(scenario, 16)
+    problem = muco.make_problem(scenario, CFG)._replace(step_max_m=0.7)
+    first = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)
     assert step.is_feasible(first, problem, obstacles, nothing_nearby(len(first)))
     cfg = MucoConfig(step="paper", iterations_max=8)
     losses, num_infeasible = papers_losses(first, problem, obstacles, cfg, 8)
@@ -312,8 +342,8 @@ def test_the_papers_optimizer_goes_on_after_an_infeasible_step():
 
 def test_the_papers_tolerance_is_absolute():
     scenario, obstacles = scenario_of("empty")
-    problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     slow = {"step": "paper", "learning_rate": 0.001}
     _, coarse = muco.optimize(first, problem, obstacles, MucoConfig(**slow, tolerance=1e-3))
     assert coarse["stopped"] == "converged"
@@ -324,8 +354,8 @@ def test_the_papers_tolerance_is_absolute():
 @pytest.mark.parametrize("world", ["corner", "tower_midway"])
 def test_the_end_is_within_five_percent_of_a_general_solver(world):
     scenario, obstacles = scenario_of(world)
-    problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     _, solver = muco.optimize(first, problem, obstacles, CFG.muco)
     state, unmasked = loss.make_state(len(first), len(obstacles.rows)), np.zeros(len(first), dtype=bool)
 
@@ -344,8 +374,8 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
 
 def test_a_small_learning_rate_lets_the_papers_step_fall():
     scenario, obstacles = scenario_of("empty")
-    problem = problem_of(scenario)
-    first, _ = muco.start_trajectory(scenario.path_id, problem, obstacles, CFG)
+    problem = muco.make_problem(scenario, CFG)
+    first, _ = muco.start_trajectory(scenario, problem, obstacles, CFG)
     _, slow = muco.optimize(
         first, problem, obstacles, MucoConfig(step="paper", learning_rate=0.001, iterations_max=200)
     )
@@ -359,13 +389,13 @@ def test_the_safety_checker_notices_a_flight_through_a_tower():
     with pytest.raises(AssertionError):
         assert_safe(through, obstacles)
     scenario, _ = scenario_of("tower_behind")
-    assert not step.is_feasible(through, problem_of(scenario), obstacles, nothing_nearby(len(through)))
+    assert not step.is_feasible(through, muco.make_problem(scenario, CFG), obstacles, nothing_nearby(len(through)))
 
 
 def test_a_thin_wall_between_two_waypoints_is_a_collision():
     wall = kernels.obstacle_index(town_of(((0, 0, 20), (0.01, 50, 40))))
     points = np.array([[-2.45, 0, 20.0], [2.45, 0, 20.0]])
-    problem = problem_of(scenario_of("empty")[0])._replace(floor_m=2.0)
+    problem = muco.make_problem(scenario_of("empty")[0], CFG)._replace(floor_m=2.0)
     assert not step.is_feasible(points, problem, wall, nothing_nearby(len(points)))
     assert step.is_feasible(points - np.array([5.0, 0, 0]), problem, wall, nothing_nearby(len(points)))
 

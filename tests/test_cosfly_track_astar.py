@@ -1,17 +1,17 @@
 """TA*+Smooth: sight and search against slow plain versions, whole flights over hand-made maps, every acceptance criterion."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from specimens_planning import CANYON, WORLDS, assert_safe, scenario_of, town_of, walk_along
+from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
 from cosfly import flight_metrics, kernels
 from cosfly.errors import NoPathError
-from cosfly.planners.contract import PlanConfig, TrackAStarConfig
+from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
 from cosfly.planners.track_astar import sight, smooth, track_astar
+from cosfly.planners.wish import follow
 
 CFG = PlanConfig(planner="track_astar")
 
@@ -92,8 +92,8 @@ def test_a_wide_beam_finds_the_cheapest_way(world):
     obstacles = kernels.obstacle_index(box_map)
     settings = TrackAStarConfig(voxel_m=8, voxel_height_m=8, corridor_m=28, beam=100000, weight_smoothness=0)
     cfg = PlanConfig(altitude_max_m=40, relaxed_safety_m=3.0, track_astar=settings)
-    scenario = planners.make_scenario(walk_along(world, corners), obstacles)
-    scenario = replace(scenario, targets_m=scenario.targets_m[:16])  # layers of three frames
+    scenario = planners.make_scenario(walk_along(world, corners), obstacles, cfg)
+    scenario = first_points(scenario, 16)  # layers of three frames
     raw, facts = track_astar.search_flight(scenario, obstacles, cfg, 3.0)
     layers = np.arange(0, 16, track_astar.frames_per_layer(cfg))
     targets = scenario.targets_m[layers]
@@ -145,7 +145,7 @@ def test_flights_keep_the_nominal_distance_and_see(world):
 def test_smoothing_makes_flights_smoother_and_loses_no_sight():
     scenario, obstacles = scenario_of("corner")
     raw, _ = track_astar.search_flight(scenario, obstacles, CFG, 3.0)
-    points, facts = smooth.smooth_flight(raw, scenario.targets_m, obstacles, CFG, 3.0, np.zeros(len(raw)))
+    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smoothing"] == "accepted"
     assert flight_metrics.jerk_rms(points) < 0.5 * flight_metrics.jerk_rms(raw)
     assert flight_metrics.length_m(points) <= flight_metrics.length_m(raw)
@@ -157,7 +157,7 @@ def test_smoothing_makes_flights_smoother_and_loses_no_sight():
 def test_a_slit_needs_the_relaxed_distance():
     walls = [((0, side * 302.7, 60), (500, 300, 60)) for side in (-1, 1)]  # 5.4 m between them, 120 m high
     obstacles = kernels.obstacle_index(town_of(*walls))
-    scenario = planners.make_scenario(walk_along("slit", [(0, 0), (30, 0)]), obstacles)
+    scenario = planners.make_scenario(walk_along("slit", [(0, 0), (30, 0)]), obstacles, CFG)
     cfg = CFG.model_copy(update={"track_astar": TrackAStarConfig(corridor_m=44.0)})  # a row of voxels in the middle
     made = track_astar.plan(scenario, obstacles, cfg, np.random.default_rng(0))
     assert made.solver["safety_m"] == 2.5
@@ -255,7 +255,9 @@ def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
     assert smooth.judge(all_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "mean_visibility"
     assert smooth.judge(all_hidden, np.zeros(40), targets, obstacles, settings, 3.0) == "accepted"  # as blind as before
     monkeypatch.setattr(smooth, "judge", lambda *_: "clearance")
-    result, facts = smooth.smooth_flight(points, targets, obstacles, CFG, 3.0, np.zeros(len(points)))
+    result, facts = smooth.smooth_flight(
+        points, Scenario("w", targets, np.zeros(40), follow(targets, CFG)), obstacles, CFG, 3.0
+    )
     assert result is points
     assert facts["smoothing"] == "clearance"
 

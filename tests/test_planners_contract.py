@@ -30,7 +30,7 @@ def flown(request):
     walk = replace(walk, positions_m=walk.positions_m + up)
     obstacles = kernels.obstacle_index(replace(box_map, centers=box_map.centers + up))
     cfg = PlanConfig(planner=name)
-    scenario = make_scenario(walk, obstacles)
+    scenario = make_scenario(walk, obstacles, cfg)
     before = scenario.targets_m.copy(), [part.copy() for part in obstacles]
     plan = load_planner(name)(scenario, obstacles, cfg, rng_for(0, "plan", walk.path_id))
     np.testing.assert_array_equal(scenario.targets_m, before[0])  # what a planner gets it leaves as it is
@@ -92,7 +92,7 @@ def test_the_time_step_is_the_walks(name, dt_s):
 @pytest.mark.parametrize("name", PLANNERS)
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
-    scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof)
+    scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())
     with pytest.raises(NoPathError, match="no free") as caught:
         load_planner(name)(scenario, roof, PlanConfig(planner=name), np.random.default_rng(0))
     assert caught.value.where == "w"

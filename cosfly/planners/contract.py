@@ -182,12 +182,48 @@ class PlanConfig(Config):
 
 
 @dataclass(frozen=True)
+class Wish:
+    """What a flight should be at each of n waypoints, all (n,); a planner comes as near as boxes, speed and sight allow.
+
+    heading_rad: the walker's smoothed direction, continuous. bearing_rad: where the drone stands as seen from the walker,
+    counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point; ground_distance_m: in
+    the plane. pitch_rad: downward pitch of the view. Two of the three would do, but the paper's do not agree with each other.
+    altitude_m: above the ground under the walker; altitude_min_m and altitude_max_m are bounds, which a flight keeps.
+    any_bearing: a search may stand anywhere round the walker for the sake of sight and begins at the bearing.
+    """
+
+    heading_rad: np.ndarray
+    bearing_rad: np.ndarray
+    distance_m: np.ndarray
+    ground_distance_m: np.ndarray
+    pitch_rad: np.ndarray
+    altitude_m: np.ndarray
+    altitude_min_m: np.ndarray
+    altitude_max_m: np.ndarray
+    any_bearing: bool = False
+
+    @property
+    def view_rad(self) -> np.ndarray:
+        """Azimuth in which the drone looks at the walker, (n,)."""
+        return self.heading_rad + (self.bearing_rad - np.pi)
+
+    def places_m(self, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
+        """Give the wished places, (n, 3), for hip points (n, 3) and the ground below them (n,)."""
+        back = -self.ground_distance_m[:, None] * np.stack([np.cos(self.view_rad), np.sin(self.view_rad)], axis=1)
+        return np.column_stack([targets_m[:, :2] + back, ground_m + self.altitude_m])
+
+
+@dataclass(frozen=True)
 class Scenario:
-    """What a planner gets to know. targets_m: (n, 3) hip points, n >= 2, dt_s apart. ground_m: (n,) height of the ground below each."""
+    """What a planner gets to know; n >= 2 waypoints, dt_s apart.
+
+    targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. wish: what the flight should be at each.
+    """
 
     path_id: str
     targets_m: np.ndarray
     ground_m: np.ndarray
+    wish: Wish
     dt_s: float = DT_S
 
 

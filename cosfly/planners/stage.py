@@ -33,13 +33,14 @@ COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in 
 # --- one walk ---------------------------------------------------------------------------------------------------------
 
 
-def make_scenario(walk: Walk, obstacles: BoxIndex) -> Scenario:
-    """Check a walk and give the scenario of it.
+def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
+    """Check a walk and give the scenario of it, with the paper's wish.
 
     Raises:
         NoPathError: nobody can walk or follow this: one point, uneven times, huge coordinates, or a way through a box.
     """
     from cosfly.kernels import segments_hit
+    from cosfly.planners.wish import follow
 
     targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
@@ -64,7 +65,7 @@ def make_scenario(walk: Walk, obstacles: BoxIndex) -> Scenario:
             got=f"{int(hits.sum())} steps inside a box, the first at ({place[0]:.1f}, {place[1]:.1f})",
             fix="was it planned on this map?",
         )  # fmt: skip
-    return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), dt_s)
+    return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
 def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
@@ -75,7 +76,7 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
     """
     from cosfly.kernels import segments_hit, signed_distances, visibility
 
-    scenario = make_scenario(walk, obstacles)
+    scenario = make_scenario(walk, obstacles, cfg)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
     positions = np.round(made.positions_m, 4)  # measured as it is written
     targets = np.round(scenario.targets_m, 4)

@@ -17,7 +17,6 @@ from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
-from cosfly.planners import behind
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
 from cosfly.planners.muco.loss import evaluate, make_state
@@ -42,7 +41,7 @@ def make_scenes(wanted: list[str]) -> list[Scene]:
         walks, obstacles = scenes.walks_on(town), obstacle_index(town)
         short = [scenes.first_points(walk, SHORT_POINTS) for walk in walks if len(walk.time_s) >= SHORT_POINTS]
         for name, chosen in (("(a) town", walks), (f"(a) first {SHORT_POINTS} points", short)):
-            found.append(Scene(name, obstacles, [make_scenario(walk, obstacles) for walk in chosen]))
+            found.append(Scene(name, obstacles, [make_scenario(walk, obstacles, PlanConfig()) for walk in chosen]))
     city = scenes.city() if {"b", "c"} & set(wanted) else None
     if city is not None:
         simple = scenes.simplified(city)
@@ -54,7 +53,7 @@ def make_scenes(wanted: list[str]) -> list[Scene]:
             obstacles = obstacle_index(scenes.tiled(simple, columns, rows))
             low, high = simple.bounds()
             shift = np.append((high - low + scenes.CITY_GAP_M)[:2] * (columns // 2, rows // 2), 0.0)
-            scenarios = [make_scenario(scenes.moved(walk, shift), obstacles) for walk in walks]
+            scenarios = [make_scenario(scenes.moved(walk, shift), obstacles, PlanConfig()) for walk in walks]
             found.append(Scene(f"({key}) city {columns} x {rows}", obstacles, scenarios))
     return found
 
@@ -136,9 +135,8 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     """
     rows, without_rule = [], cfg.muco.model_copy(update={"low_visibility_frames": 1_000_000})
     for scenario in scene.scenarios:
-        headings = behind.smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s)
-        problem = muco.make_problem(scenario, headings, cfg)
-        first, _ = muco.start_trajectory(scenario.path_id, problem, scene.obstacles, cfg)
+        problem = muco.make_problem(scenario, cfg)
+        first, _ = muco.start_trajectory(scenario, problem, scene.obstacles, cfg)
         ms, (_, solver) = scenes.cpu_ms(lambda f=first, p=problem: muco.optimize(f, p, scene.obstacles, without_rule))
         _, ruled = muco.optimize(first, problem, scene.obstacles, cfg.muco)
         state, unmasked = make_state(len(first), len(scene.obstacles.rows)), np.zeros(len(first), dtype=bool)

@@ -21,6 +21,7 @@ TERM_NAMES = (
 )  # fmt: skip
 TRACKING, SMOOTHNESS, JERK, SAFETY, VISIBILITY, VIEW_ANGLE, PATH_LENGTH, ALTITUDE, PITCH = range(9)
 LEAST, PREFERRED, GREATEST = range(3)  # altitudes
+LOW_PITCH, WISHED_PITCH, HIGH_PITCH = range(3)
 BELOW, ABOVE, SWING = range(3)  # altitude weights; the swing is the oscillation
 BAND_ROWS = 10  # jerk couples x_i with x_{i+3}, nine places on in x_0 y_0 z_0 x_1 ...
 
@@ -31,21 +32,20 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 class Problem(NamedTuple):
     """What stays fixed during one optimisation; n waypoints.
 
-    targets: (n, 3) m, hip points. headings_rad: (n,) smoothed walking direction. weights: (7,) in the order of TERM_NAMES.
-    altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m. altitude_weights: (3,) below, above, oscillation.
+    targets: (n, 3) m, hip points. views_rad: (n,) wished azimuth of the view. distances: (n,) m, wished. weights: (7,) in the order
+    of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m. pitches_rad: (n, 3) lower edge of the
+    band, wished, upper edge. altitude_weights: (3,) below, above, oscillation.
     """
 
     targets: np.ndarray
-    headings_rad: np.ndarray
+    views_rad: np.ndarray
+    distances: np.ndarray
     weights: np.ndarray
     altitudes: np.ndarray
     altitude_weights: np.ndarray
-    distance_m: float
+    pitches_rad: np.ndarray
     influence_m: float
     difference_m: float
-    pitch_rad: float
-    pitch_low_rad: float
-    pitch_high_rad: float
     pitch_weight: float
     safety_m: float
     floor_m: float
@@ -140,7 +140,8 @@ def point_terms(points, begin, end, problem, index, masked, state):
     """Tracking, safety, view angle, altitude bounds and pitch band of waypoints [begin, end)."""
     terms, gradient, band, rough, contacts = state.terms, state.gradient, state.band, state.rough, state.contacts
     anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
-    targets, headings, weights = problem.targets, problem.headings_rad, problem.weights
+    targets, views, weights = problem.targets, problem.views_rad, problem.weights
+    distances, pitches = problem.distances, problem.pitches_rad
     influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
     below, above = problem.altitude_weights[BELOW], problem.altitude_weights[ABOVE]
     for i in range(begin, end):
@@ -149,7 +150,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
         dx, dy, dz = x - targets[i, 0], y - targets[i, 1], z - targets[i, 2]
         distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
         ax, ay, az = dx / distance, dy / distance, dz / distance
-        excess = distance - problem.distance_m
+        excess = distance - distances[i]
         _add_square(terms, gradient, band, TRACKING, i, weights[TRACKING], excess, ax, ay, az, True)
 
         count = known(anchors, num_around, i, x, y, z)
@@ -165,18 +166,18 @@ def point_terms(points, begin, end, problem, index, masked, state):
                 if gap < problem.safety_m + 0.01:
                     contacts[i, 0], contacts[i, 1], contacts[i, 2] = nx, ny, nz
 
-        # View angle: deviations, in radians, of the downward pitch from 45 degrees and of the view's azimuth from the walking
-        # direction. Straight above the target both lose their meaning: a floor of one metre keeps their derivatives finite.
+        # View angle: deviations, in radians, of the downward pitch from the wished (the paper: 45 degrees) and of the view's azimuth
+        # (the walking direction). Straight above the target both lose their meaning: a floor of one metre keeps their derivatives finite.
         flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
         pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
         px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
-        off, is_free = pitch - problem.pitch_rad, not masked[i]
+        off, is_free = pitch - pitches[i, WISHED_PITCH], not masked[i]
         _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], off, px, py, pz, is_free)
-        turn = np.arctan2(-dy, -dx) - headings[i]
+        turn = np.arctan2(-dy, -dx) - views[i]
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
         tx, ty = -dy / flat / flat, dx / flat / flat
         _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], turn, tx, ty, 0.0, is_free)
-        outside = min(pitch - problem.pitch_low_rad, 0.0) + max(pitch - problem.pitch_high_rad, 0.0)
+        outside = min(pitch - pitches[i, LOW_PITCH], 0.0) + max(pitch - pitches[i, HIGH_PITCH], 0.0)
         if outside != 0.0:
             _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
 

@@ -12,9 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.errors import NoPathError
 from cosfly.kernels import BoxIndex, visibility
-from cosfly.planners.behind import behind, smoothed_headings
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
-from cosfly.planners.muco.loss import PREFERRED, TERM_NAMES, Problem, make_state
+from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.start import search_start
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
@@ -29,31 +28,31 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     Raises:
         NoPathError: no free trajectory round this walk was found.
     """
-    headings = smoothed_headings(scenario.targets_m, cfg.heading_smoothing_s, scenario.dt_s)
-    problem = make_problem(scenario, headings, cfg)
-    start, kind = start_trajectory(scenario.path_id, problem, obstacles, cfg)
+    problem = make_problem(scenario, cfg)
+    start, kind = start_trajectory(scenario, problem, obstacles, cfg)
     points, solver = optimize(start, problem, obstacles, cfg.muco)
     del solver["loss_history"]  # for tests and plots; a product does not need it
     return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in AT_REST)
 
 
-def make_problem(scenario: Scenario, headings_rad: np.ndarray, cfg: PlanConfig) -> Problem:
+def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     """Bring settings and scenario into the form of the compiled loss."""
-    muco = cfg.muco
+    muco, wish = cfg.muco, scenario.wish
     weights = np.array([getattr(muco, f"weight_{name}") for name in TERM_NAMES[:7]])
-    low, high = np.radians(muco.pitch_band_deg)
+    # The band stands round the settings' pitch; it goes where the wish goes.
+    shift = wish.pitch_rad - np.radians(muco.pitch_deg)
+    low, high = (edge + shift for edge in np.radians(muco.pitch_band_deg))
+    bounds = (wish.altitude_min_m, wish.altitude_m, wish.altitude_max_m)
     return Problem(
         targets=np.ascontiguousarray(scenario.targets_m),
-        headings_rad=headings_rad,
+        views_rad=wish.view_rad,
+        distances=wish.distance_m,
         weights=weights,
-        altitudes=scenario.ground_m[:, None] + [cfg.altitude_min_m, cfg.altitude_preferred_m, cfg.altitude_max_m],
+        altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1),
         altitude_weights=np.array([muco.weight_below, muco.weight_above, muco.weight_oscillation]),
-        distance_m=muco.track_distance_m,
+        pitches_rad=np.stack([low, wish.pitch_rad, high], axis=1),
         influence_m=muco.influence_m,
         difference_m=muco.difference_m,
-        pitch_rad=np.radians(muco.pitch_deg),
-        pitch_low_rad=low,
-        pitch_high_rad=high,
         pitch_weight=muco.weight_pitch,
         safety_m=cfg.safety_distance_m,
         floor_m=cfg.relaxed_safety_m,
@@ -66,28 +65,31 @@ def make_problem(scenario: Scenario, headings_rad: np.ndarray, cfg: PlanConfig) 
 # --- start ------------------------------------------------------------------------------------------------------------
 
 
-def start_trajectory(path_id: str, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str]:
-    """Give a feasible trajectory to start from and its kind: `behind`, or `search` where behind is blocked or blind.
+def start_trajectory(
+    scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
+) -> tuple[np.ndarray, str]:
+    """Give a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are blocked or blind.
 
     Raises:
         NoPathError: neither is feasible.
     """
     targets = problem.targets
-    plain = behind(targets, problem.headings_rad, cfg.behind_distance_m, problem.altitudes[:, PREFERRED])
+    plain = scenario.wish.places_m(targets, scenario.ground_m)
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
     if plain_is_free and visibility(obstacles, plain, targets).mean() >= cfg.muco.start_visibility:
         return plain, "behind"
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        found = search_start(problem, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
+        found = search_start(problem, scenario.wish, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
         if found is not None and is_feasible(found, problem, obstacles, nothing_nearby(len(found))):
             return _rounded_off(found, problem, obstacles), "search"
     if plain_is_free:
         return plain, "behind"
+    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
     raise NoPathError(
         "no free drone trajectory round this walk",
-        where=path_id,
-        expected=f"places from {cfg.altitude_min_m:g} to {cfg.altitude_max_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
+        where=scenario.path_id,
+        expected=f"places from {low_m:g} to {high_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
         fix="is the walk roofed over? raise altitude_max_m or leave the path out",
     )
 

@@ -1,6 +1,6 @@
-"""Where a flight begins its life: behind the walker where that works, else the best of a coarse search round the walker.
+"""Where a flight begins its life: at the wished places where that works, else the best of a coarse search round the walker.
 
-The plain start, `behind_distance_m` behind the target at the preferred altitude, ends up inside towers and behind corners. Pushing
+The wished places (the paper: 20 m behind the walker and as high) end up inside towers and behind corners. Pushing
 each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search here chooses places that can be
 reached from each other: dynamic programming over time, places on rings round the target, edges that keep their distance to boxes.
 """
@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from cosfly.compiled import njit
 from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box
-from cosfly.planners.contract import PlanConfig
+from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.muco.loss import GREATEST, PREFERRED, Problem
 
 # Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
@@ -24,14 +24,14 @@ MAX_TURN = 3  # azimuths between one key frame and the next: 60 degrees, 21 m on
 BETWEEN_KEYS_S = 3.0
 
 # Costs of the search, in units of "the target fully hidden for one key frame" = 1.
-TURN_COST = 0.5  # looking at the walker's face instead of the back
+TURN_COST = 0.5  # looking from the side opposite to the wished one
 CLIMB_COST = 0.6  # each preferred altitude more
 STEEP_COST = 0.1  # a ring other than the normal one
 MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
 
 
 def search_start(
-    problem: Problem, index: BoxIndex, cfg: PlanConfig, *, climbing: bool, clearance_m: float
+    problem: Problem, wish: Wish, index: BoxIndex, cfg: PlanConfig, *, climbing: bool, clearance_m: float
 ) -> np.ndarray | None:
     """Find a free trajectory that sees the target well, by dynamic programming over key frames.
 
@@ -47,9 +47,9 @@ def search_start(
     around = 2 * stride + 1
     preferred_m = maximum_filter1d(problem.altitudes[:, PREFERRED], around, mode="nearest")[keys]
     greatest_m = minimum_filter1d(problem.altitudes[:, GREATEST], around, mode="nearest")[keys]
-    rings = _rings(cfg.behind_distance_m, preferred_m, greatest_m, climbing)
+    rings = _rings(wish.ground_distance_m[keys], preferred_m, greatest_m, climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    angles = problem.headings_rad[keys, None, None] + np.pi + azimuths[None, None, :]
+    angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
     offsets = rings[:, :, 0, None]
     x = targets_m[keys, 0, None, None] + offsets * np.cos(angles)
     y = targets_m[keys, 1, None, None] + offsets * np.sin(angles)
@@ -66,10 +66,11 @@ def search_start(
     return np.stack([np.interp(frames, keys, path[:, axis]) for axis in range(3)], axis=1)
 
 
-def _rings(distance_m: float, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
+def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
     """Give (m, r, 2): horizontal distance and z of the rings of each key frame, the normal one first."""
     all_rings = []
-    for preferred, greatest in zip(preferred_m.tolist(), greatest_m.tolist(), strict=True):
+    columns = (distances_m.tolist(), preferred_m.tolist(), greatest_m.tolist())
+    for distance_m, preferred, greatest in zip(*columns, strict=True):
         rings = [(distance_m, preferred), (STEEP_RADIUS * distance_m, min(preferred + STEEP_CLIMB_M, greatest))]
         climbs = np.geomspace(8.0, max(greatest - preferred, 8.0), NUM_CLIMBS if climbing else 0)
         all_rings.append(rings + [(distance_m + 0.2 * climb, min(preferred + climb, greatest)) for climb in climbs])

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.compiled import njit
-from cosfly.geometry import DT_S
 from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, signed_distances, visibility
 
 if TYPE_CHECKING:
-    from cosfly.planners.contract import PlanConfig, TrackAStarConfig
+    from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
 
 ROUNDING_M = 1e-9
 GAP, STEP = range(2)  # places in `limits`: least distance to boxes, longest step, m
@@ -27,28 +26,22 @@ LOW, HIGH = range(2)  # columns of `heights`, (n, 2): least and greatest z of ea
 
 
 def smooth_flight(
-    raw: np.ndarray,
-    targets_m: np.ndarray,
-    obstacles: BoxIndex,
-    cfg: PlanConfig,
-    safety_m: float,
-    ground_m: np.ndarray,
-    dt_s: float = DT_S,
+    raw: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, safety_m: float
 ) -> tuple[np.ndarray, dict]:
     """Smooth a raw flight; give it back as it is if the result is not accepted.
 
     Args:
-        raw, targets_m: (n, 3). ground_m: (n,) under the targets. safety_m: the distance that the raw flight keeps.
-        dt_s: between two points.
+        raw: (n, 3). safety_m: the distance that it keeps.
     Returns:
         (n, 3), and facts: shortcuts, elastic iterations, anchors, `smoothing`: `accepted` or the criterion that failed.
     """
-    settings = cfg.track_astar
-    raw, targets = np.ascontiguousarray(raw, dtype=np.float64), np.ascontiguousarray(targets_m, dtype=np.float64)
+    settings, wish = cfg.track_astar, scenario.wish
+    raw = np.ascontiguousarray(raw, dtype=np.float64)
+    targets = np.ascontiguousarray(scenario.targets_m, dtype=np.float64)
     seen = visibility(obstacles, raw, targets)
     floors = seen - settings.visibility_loss_point
-    limits = np.array([safety_m, cfg.speed_max_mps * dt_s])
-    heights = ground_m[:, None] + [cfg.altitude_min_m, cfg.altitude_max_m]
+    limits = np.array([safety_m, cfg.speed_max_mps * scenario.dt_s])
+    heights = scenario.ground_m[:, None] + np.stack([wish.altitude_min_m, wish.altitude_max_m], axis=1)
     anchors = anchor_flags(seen, settings.anchor_visibility)
     points = raw.copy()
     num_shortcuts = shortcut(points, targets, floors, heights, obstacles, limits, settings.shortcut_frames)

@@ -5,7 +5,8 @@ voxel (two, with the paper's settings), so that no direction is dearer than anot
 states of a layer have the same way to go in time, so a best-first order by cost alone with a beam per layer is the whole search:
 there is no heuristic to add. The paper names the five weights but not the terms; the terms are these, per layer:
 
-    tracking    distance to the ring round the target at the behind distance and the preferred altitude, in voxels
+    tracking    distance to the ring round the target at the wished distance and altitude, in voxels; to the wished place on it
+                where the wish is not that of the paper, to which any bearing will do
     visibility  1 - five-ray visibility
     path        length of the move, in voxels
     safety      (1 - clearance / influence)^2 below the influence distance; below the safety distance a voxel is closed
@@ -25,7 +26,6 @@ from cosfly.compiled import njit
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, collect_hits, nearest_box
-from cosfly.planners.behind import behind, smoothed_headings
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.track_astar.sight import look, make_horizon
 from cosfly.planners.track_astar.smooth import smooth_flight
@@ -58,10 +58,15 @@ class Voxels(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Weights and lengths of the search; weights: (5,), places below. least_z, preferred_z, greatest_z: (m,) of each layer."""
+    """Weights and lengths of the search; weights: (5,), places below.
+
+    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at each layer, NaN
+    where any on the ring will do. start: (3,).
+    """
 
     weights: np.ndarray
-    behind_m: float
+    ring_m: np.ndarray
+    wished: np.ndarray
     least_z: np.ndarray
     preferred_z: np.ndarray
     greatest_z: np.ndarray
@@ -83,14 +88,13 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
         found = search_flight(scenario, obstacles, cfg, safety_m)
         if found is not None:
             raw, facts = found
-            points, smoothing = smooth_flight(
-                raw, scenario.targets_m, obstacles, cfg, safety_m, scenario.ground_m, scenario.dt_s
-            )
+            points, smoothing = smooth_flight(raw, scenario, obstacles, cfg, safety_m)
             return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
+    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
     raise NoPathError(
         "no free voxels lead along this walk",
         where=scenario.path_id,
-        expected=f"places from {cfg.altitude_min_m:g} to {cfg.altitude_max_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
+        expected=f"places from {low_m:g} to {high_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
         fix="is the walk roofed over? raise altitude_max_m or leave the path out",
     )
 
@@ -105,21 +109,23 @@ def search_flight(
     Returns:
         (n, 3) one position per target, and facts of the search; None if there is no way.
     """
-    settings, targets = cfg.track_astar, scenario.targets_m
+    settings, targets, wish = cfg.track_astar, scenario.targets_m, scenario.wish
     voxels = make_voxels(scenario, cfg)
     stride = frames_per_layer(cfg, scenario.dt_s)
     frames = np.unique(np.append(np.arange(0, len(targets), stride), len(targets) - 1))
-    headings = smoothed_headings(targets, cfg.heading_smoothing_s, scenario.dt_s)
-    start = behind(targets[:1], headings[:1], cfg.behind_distance_m, np.zeros(1))[0]
     # Between layers the flight is straight while the ground may rise and fall: a layer keeps the bounds of all frames around it.
     around, ground_m = 2 * stride + 1, scenario.ground_m
-    highest_m, lowest_m = (f(ground_m, around, mode="nearest")[frames] for f in (maximum_filter1d, minimum_filter1d))
-    preferred_z = highest_m + cfg.altitude_preferred_m
+
+    def highest(altitudes_m: np.ndarray) -> np.ndarray:
+        return maximum_filter1d(ground_m + altitudes_m, around, mode="nearest")[frames]
+
+    preferred_z, places = highest(wish.altitude_m), wish.places_m(targets, ground_m)[frames, :2]
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
-        behind_m=cfg.behind_distance_m, least_z=highest_m + cfg.altitude_min_m, preferred_z=preferred_z,
-        greatest_z=lowest_m + cfg.altitude_max_m, influence_m=settings.influence_m, safety_m=safety_m,
-        start=np.array([start[0], start[1], preferred_z[0]]),
+        ring_m=wish.ground_distance_m[frames], wished=np.full_like(places, np.nan) if wish.any_bearing else places,
+        least_z=highest(wish.altitude_min_m), preferred_z=preferred_z,
+        greatest_z=minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames],
+        influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
     reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
     cells, cost, num_seen = _search(
@@ -147,11 +153,11 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     Raises:
         NoPathError: more than MAX_CELLS.
     """
-    settings, flat = cfg.track_astar, scenario.targets_m[:, :2]
+    settings, flat, wish = cfg.track_astar, scenario.targets_m[:, :2], scenario.wish
     low_xy = flat.min(axis=0) - settings.corridor_m
     num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1
-    rise_m = float(np.ptp(scenario.ground_m))
-    num_z = np.floor((cfg.altitude_max_m - cfg.altitude_min_m + rise_m) / settings.voxel_height_m + 1e-9) + 1
+    least_z, greatest_z = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
+    num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
         raise NoPathError(
             "the walk is too long for the voxel grid", where=scenario.path_id, got=f"{num_xy.prod() * num_z:.0f} voxels",
@@ -159,7 +165,7 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
         )  # fmt: skip
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])
-    low = np.array([*low_xy, scenario.ground_m.min() + cfg.altitude_min_m])
+    low = np.array([*low_xy, least_z.min()])
     num_cells = int(shape.prod())
     return Voxels(
         low, shape, size, _corridor(low, shape, size, np.ascontiguousarray(flat), settings.corridor_m),
@@ -313,7 +319,10 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
         cell = touched[k]
         x, y, z = _place(cell, voxels)
         away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-        reach_m, aside = max(reach_m, away), away - costs.behind_m
+        reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
+        wished_x, wished_y = costs.wished[layer, 0], costs.wished[layer, 1]
+        if not np.isnan(wished_x):
+            aside = np.sqrt((x - wished_x) ** 2 + (y - wished_y) ** 2)
         climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known: the way here has asked for it
         near = max(0.0, 1.0 - gap / costs.influence_m)
         off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]

@@ -1,4 +1,4 @@
-"""The plain place of a drone: behind the walker, looking the way that the walker goes. What every planner may begin with."""
+"""What a flight is wished to be: the paper's, behind the walker; and the heading that wishes are counted from."""
 
 from __future__ import annotations
 
@@ -6,6 +6,27 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.geometry import DT_S
+from cosfly.planners.contract import PlanConfig, Wish
+
+
+def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Wish:
+    """The paper's wish: behind the walker, the settings' height, distance and pitch throughout.
+
+    Args:
+        targets_m: (n, 3), n >= 2. dt_s: between points.
+    """
+    num, muco = len(targets_m), cfg.muco
+    return Wish(
+        heading_rad=smoothed_headings(targets_m, cfg.heading_smoothing_s, dt_s),
+        bearing_rad=np.full(num, np.pi),
+        distance_m=np.full(num, muco.track_distance_m),
+        ground_distance_m=np.full(num, cfg.behind_distance_m),
+        pitch_rad=np.full(num, np.radians(muco.pitch_deg)),
+        altitude_m=np.full(num, cfg.altitude_preferred_m),
+        altitude_min_m=np.full(num, cfg.altitude_min_m),
+        altitude_max_m=np.full(num, cfg.altitude_max_m),
+        any_bearing=True,
+    )
 
 
 def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = DT_S) -> np.ndarray:
@@ -24,9 +45,3 @@ def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = D
     before = np.searchsorted(moves, np.arange(len(targets_m)), side="right") - 1
     yaws = yaws[np.maximum(before, 0)]
     return gaussian_filter1d(yaws, smoothing_s / dt_s, mode="nearest") if smoothing_s > 0 else yaws
-
-
-def behind(targets_m: np.ndarray, headings_rad: np.ndarray, distance_m: float, altitudes_m: np.ndarray) -> np.ndarray:
-    """Give the places `distance_m` behind the target, (n, 3), at the world altitudes (n,)."""
-    back = -distance_m * np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=1)
-    return np.column_stack([targets_m[:, :2] + back, altitudes_m])
