@@ -265,6 +265,35 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     assert len(set(texts)) == 3
 
 
+def test_shares_of_paces_move_no_route_and_the_plain_one_is_the_default():
+    ground = walkable_ground(town(), PedestriansConfig())
+
+    def walks(**settings):
+        cfg = PedestriansConfig(**settings)
+        return [make_walk("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(12)]
+
+    plain, mixed = walks(), walks(pace={"walk": 1, "stop_and_look": 1, "hurry": 1, "turn_back": 1})
+    assert {walk.pace for walk in plain} == {"walk"}
+    assert "pace" not in plain[0].as_json()
+    assert {walk.pace for walk in mixed} == {"walk", "stop_and_look", "hurry", "turn_back"}
+    for before, after in zip(plain, mixed, strict=True):
+        same = before.as_json() == after.as_json()
+        assert same == (after.pace == "walk")
+        if after.pace != "turn_back":
+            np.testing.assert_array_equal(before.polyline_m, after.polyline_m)
+        if after.pace == "hurry":
+            assert after.speeds_mps.mean() > 1.15 * before.speeds_mps.mean()
+            assert after.speeds_mps.max() <= 1.6
+        if after.pace == "stop_and_look":
+            assert (np.diff(after.positions_m[:, :2], axis=0) == 0).all(axis=1).sum() >= 8, "4 s at least"
+
+
+def test_who_hurries_may_run():
+    cfg = PedestriansConfig(pace={"hurry": 1}, hurry_speed_mps=3.0)
+    walk = make_walk("p", walkable_ground(town(), cfg), cfg, rng_for(0, "pedestrians", "a")).walk
+    assert 2.5 < walk.speeds_mps.max() <= 3.0
+
+
 def test_a_start_without_a_goal_is_given_up_and_counted():
     # The yard on the left measures 35 m from corner to corner; every start in the field has a goal 40 m off.
     ground = ground_of("\n".join(["1" * 20 + "0" + "2" * 84] * 30))
@@ -317,6 +346,10 @@ def test_no_goal_for_any_start_is_an_error_that_names_the_path():
         ({"resolution_m": 0}, "resolution_m"),
         ({"speed_jitter": 1.0}, "speed_jitter"),
         ({"max_detour": 0.5}, "max_detour 0.5 is below 1"),
+        ({"pace": {"hury": 1}}, "pace: .*'hury' is no pace .did you mean 'hurry'"),
+        ({"pace": {"walk": 0, "hurry": 0}}, "pace: .*add up to something positive"),
+        ({"pace": {}}, "pace: .*add up to something positive"),
+        ({"pace": {"walk": 2, "hurry": -1}}, "pace: .*share of hurry is -1"),
     ],
 )
 def test_bad_settings_are_config_errors(settings, words):

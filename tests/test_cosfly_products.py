@@ -1,6 +1,7 @@
 """Products of stages 1-4: round trips, and every error names file and field."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,7 +141,13 @@ def a_trace(n=4):
 
 @pytest.mark.parametrize(
     ("write", "read", "make", "group"),
-    [(write_paths, read_paths, a_path, "paths"), (write_traces, read_traces, a_trace, "traces")],
+    [
+        (write_paths, read_paths, a_path, "paths"),
+        (write_traces, read_traces, a_trace, "traces"),
+        (write_paths, read_paths, lambda: replace(a_path(), pace="hurry"), "paths"),
+        (write_traces, read_traces, lambda: replace(a_trace(), pace="hurry"), "traces"),
+    ],
+    ids=["path", "trace", "hurried_path", "hurried_trace"],
 )
 def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
     path = tmp_path / "p.json"
@@ -156,6 +163,14 @@ def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
         read(path)
+
+
+def test_a_pace_is_a_name(tmp_path):
+    path = tmp_path / "p.json"
+    write_paths(path, [replace(a_path(), pace="hurry")], {})
+    path.write_text(path.read_text().replace('"hurry"', "3"))
+    with pytest.raises(InputError, match=r"paths\[0\]\.pace: .*got 3"):
+        read_paths(path)
 
 
 def test_columns_of_different_lengths(tmp_path):

@@ -8,9 +8,10 @@ import textwrap
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cosfly.chance import draws_for, rng_for
+from cosfly.chance import draw_by_share, draws_for, rng_for
 from cosfly.config import Config
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.journal import Journal
@@ -207,3 +208,22 @@ def test_an_item_is_named_once_in_the_log(tmp_path, caplog):
     run_items(_stage(tmp_path / "s"), _items(("fail", "x"), ("bug", "y")), make_worker, (tmp_path / "log",))
     assert "demo: i0: broken" in caplog.text
     assert "demo: i1: KeyError" in caplog.text
+
+
+def test_names_are_drawn_by_their_shares():
+    shares = {"b": 3.0, "none": 0.0, "a": 1.0}
+    rng = np.random.default_rng(0)
+    drawn = [draw_by_share(shares, rng) for _ in range(4000)]
+    assert set(drawn) == {"a", "b"}
+    assert 0.22 < drawn.count("a") / 4000 < 0.28
+    turned = dict(reversed(shares.items()))
+    assert [draw_by_share(turned, np.random.default_rng(k)) for k in range(20)] == [
+        draw_by_share(shares, np.random.default_rng(k)) for k in range(20)
+    ]
+    assert draw_by_share({"a": 0.0, "b": 1.0, "c": 0.0}, rng) == "b"
+
+
+@pytest.mark.parametrize("shares", [{}, {"a": 0.0}, {"a": 2.0, "b": -1.0}], ids=["none", "zero", "negative"])
+def test_shares_that_add_up_to_nothing_are_a_value_error(shares):
+    with pytest.raises(ValueError, match="shares"):
+        draw_by_share(shares, np.random.default_rng(0))

@@ -3,7 +3,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS, arrival_times, menger_curvature, resample, speed_profile
+from cosfly.pedestrians.paces import PACES, Pace, take_pace
+from cosfly.pedestrians.walking import (
+    SLOWEST_SPEED_MPS,
+    arrival_times,
+    menger_curvature,
+    resample,
+    speed_profile,
+    stood_s,
+)
 
 BEND_45 = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.5]])  # a straight step, then a diagonal one
 
@@ -89,7 +97,7 @@ def test_no_speed_is_a_value_error():
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():
     polyline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.3]])
     speeds = np.full(3, 1.0)
-    time_s, positions, sampled = resample(polyline, speeds, arrival_times(polyline, speeds), 0.5)
+    time_s, positions, sampled = resample(polyline, speeds, arrival_times(polyline, speeds), 0.5, np.zeros(3))
     np.testing.assert_allclose(time_s, [0, 0.5, 1.0, 1.5, 2.0, 2.5])
     np.testing.assert_allclose(positions, [[0, 0], [0.5, 0], [1, 0], [1, 0.5], [1, 1.0], [1, 1.3]], atol=1e-12)
     np.testing.assert_allclose(sampled, 1.0)
@@ -97,7 +105,7 @@ def test_even_speed_gives_even_steps_and_ends_at_the_goal():
 
 def test_a_walk_that_ends_on_a_step_has_no_second_last_point():
     polyline = np.array([[0.0, 0.0], [1.0, 0.0]])
-    time_s, positions, _ = resample(polyline, np.ones(2), np.array([0.0, 1.0]), 0.5)
+    time_s, positions, _ = resample(polyline, np.ones(2), np.array([0.0, 1.0]), 0.5, np.zeros(2))
     np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])
     np.testing.assert_allclose(positions[-1], [1.0, 0.0])
 
@@ -109,7 +117,7 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     polyline = np.cumsum(rng.uniform(0.2, 1.0, (count, 2)), axis=0)
     speeds = rng.uniform(0.1, 1.6, count)
     times = arrival_times(polyline, speeds)
-    time_s, positions, sampled = resample(polyline, speeds, times, 0.5)
+    time_s, positions, sampled = resample(polyline, speeds, times, 0.5, np.zeros(count))
     # The slow way: speed is linear in time between waypoints, the way walked is its integral.
     fine_s = np.linspace(0.0, times[-1], 200_001)
     fine_mps = np.interp(fine_s, times, speeds)
@@ -122,3 +130,84 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     np.testing.assert_allclose(sampled, np.interp(now_s, times, speeds), atol=1e-9)
     np.testing.assert_allclose(positions[[0, -1]], polyline[[0, -1]], atol=1e-9)
     assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() <= 1.6 * 0.5 + 1e-9
+
+
+def test_a_stop_by_hand():
+    """1 m at an even brake, 3 s standing, 1 m of getting on: 2 s each at a mean of 0.5 m/s."""
+    polyline, speeds = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), np.array([1.0, 0.0, 1.0])
+    stops = np.array([0.0, 3.0, 0.0])
+    time_s, positions, sampled = resample(polyline, speeds, arrival_times(polyline, speeds), 0.5, stops)
+    assert time_s[-1] == 7.0
+    np.testing.assert_allclose(positions[4:11, 0], 1.0)
+    np.testing.assert_allclose(sampled[4:11], 0.0, atol=1e-12)
+    np.testing.assert_allclose(positions[[2, 12], 0], [0.75, 1.25])
+    np.testing.assert_allclose(positions[-1], [2.0, 0.0])
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10**6), st.integers(3, 10))
+def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.2, 3.0, count)) - 0.2
+    stops = rng.uniform(0.0, 5.0, count) * (rng.random(count) < 0.5)
+    fine_s = np.arange(0.0, times[-1] + stops.sum() + 1.0, 0.01)
+    stood = stood_s(fine_s, times, stops)
+    walked = fine_s - stood
+    assert (np.diff(stood) >= -1e-12).all()
+    assert (np.diff(walked) >= -1e-12).all(), "nobody goes back in time"
+    assert stood[-1] == pytest.approx(stops.sum())
+    for at, stop in zip(times, stops, strict=True):
+        assert (np.abs(walked - at) < 1e-9).sum() * 0.01 == pytest.approx(stop, abs=0.03)
+
+
+# --- paces ------------------------------------------------------------------------------------------------------------
+
+ROUTE = np.column_stack([0.5 * np.arange(201), np.zeros(201)])  # 100 m
+
+
+def test_plain_paces_go_a_route_as_it_is():
+    for name in ("walk", "hurry"):
+        way = take_pace(ROUTE, PACES[name], np.random.default_rng(0))
+        assert way.polyline_m is ROUTE
+        assert not way.stops_s.any()
+
+
+def test_stops_lie_as_far_apart_and_last_as_long_as_the_row_says():
+    row = PACES["stop_and_look"]
+    for seed in range(30):
+        way = take_pace(ROUTE, row, np.random.default_rng(seed))
+        at = np.flatnonzero(way.stops_s)
+        gaps_m = np.diff(np.concatenate([[0.0], way.polyline_m[at, 0]]))
+        assert 2 <= len(at) <= 6
+        assert gaps_m.min() >= row.stop_every_m[0] - 0.5
+        assert gaps_m.max() <= row.stop_every_m[1] + 0.5
+        assert row.stop_s[0] <= way.stops_s[at].min() <= way.stops_s[at].max() <= row.stop_s[1]
+        assert way.stops_s[[0, -1]].tolist() == [0.0, 0.0]
+
+
+def test_who_turns_back_stands_at_the_turn_and_walks_the_same_way():
+    for seed in range(30):
+        way = take_pace(ROUTE, PACES["turn_back"], np.random.default_rng(seed))
+        (turn,) = np.flatnonzero(way.stops_s)
+        x = way.polyline_m[:, 0]
+        assert 45.0 <= x[turn] <= 75.0
+        assert turn == np.argmax(x)
+        np.testing.assert_allclose(np.abs(np.diff(x)), 0.5)
+        assert 0.49 <= (x[turn] - x[-1]) / x[turn] <= 0.91
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 30), st.sampled_from(sorted(PACES)), st.floats(0.5, 20.0))
+def test_every_way_arrives(seed, count, name, cell_m):
+    """However coarse the cells and short the route: no two neighbours are stops, or a piece would take for ever."""
+    route = np.column_stack([cell_m * np.arange(count + 1), np.zeros(count + 1)])
+    way = take_pace(route, PACES[name], np.random.default_rng(seed))
+    speeds = np.where(way.stops_s > 0, 0.0, 1.2)
+    assert np.isfinite(arrival_times(way.polyline_m, speeds)).all()
+    np.testing.assert_array_equal(way.polyline_m[0], route[0])
+
+
+def test_a_pace_may_stop_at_every_other_waypoint():
+    row = Pace(stop_every_m=(0.1, 0.1), stop_s=(1.0, 1.0))
+    way = take_pace(ROUTE[:8], row, np.random.default_rng(0))
+    assert way.stops_s.tolist() == [0, 1, 0, 1, 0, 1, 0, 0]

@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.chance import rng_for
+from cosfly.chance import draw_by_share, rng_for
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.overview import draw_overview
+from cosfly.pedestrians.paces import PACES, Pace, Way, take_pace
 from cosfly.pedestrians.walkable import (
     Clock,
     PedestriansConfig,
@@ -35,7 +36,7 @@ from cosfly.pedestrians.walkable import (
 from cosfly.pedestrians.walking import arrival_times, menger_curvature, resample, speed_profile
 from cosfly.products.boxes import read_boxes
 from cosfly.products.roi import read_roi
-from cosfly.products.walks import Walk, write_paths
+from cosfly.products.walks import Walk, pace_field, write_paths
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import write_bytes, write_json
@@ -58,28 +59,37 @@ class MadeWalk:
 
 
 def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> MadeWalk:
-    """Make one walk: draw its ends, find the route, give it speeds, sample it.
+    """Make one walk: draw its ends, find the route, take it at a pace, sample it.
 
     Raises:
         NoPathError: no pair of ends served.
     """
     clock = Clock()
-    polyline_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
+    pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces move no route
+    route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
     with clock("report"):
-        speeds_mps = speed_profile(
-            menger_curvature(polyline_m),
-            rng,
-            cruise_speed_mps=cfg.cruise_speed_mps,
-            curvature_gain_m=cfg.curvature_gain_m,
-            jitter=cfg.speed_jitter,
-            min_speed_mps=cfg.min_speed_mps,
-            max_speed_mps=cfg.max_speed_mps,
-        )
-        time_s, positions_m, sampled_mps = resample(
-            polyline_m, speeds_mps, arrival_times(polyline_m, speeds_mps), cfg.dt_s
-        )
+        name = draw_by_share(cfg.pace, pace_rng)
+        way = take_pace(route_m, PACES[name], pace_rng)
+        time_s, positions_m, speeds_mps = walked(way, PACES[name], cfg, rng)
         on_ground = np.column_stack([positions_m, ground.heights.height_at(positions_m)])
-    return MadeWalk(Walk(path_id, polyline_m, time_s, on_ground, sampled_mps), retries, clock.seconds)
+    return MadeWalk(Walk(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name), retries, clock.seconds)
+
+
+def walked(
+    way: Way, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Walk a way: times (n,) s, positions (n, 2) m and speeds (n,) m/s, as `resample` gives them."""
+    speeds_mps = speed_profile(
+        menger_curvature(way.polyline_m),
+        rng,
+        cruise_speed_mps=cfg.hurry_speed_mps if pace.hurries else cfg.cruise_speed_mps,
+        curvature_gain_m=cfg.curvature_gain_m,
+        jitter=cfg.speed_jitter,
+        min_speed_mps=cfg.min_speed_mps,
+        max_speed_mps=max(cfg.max_speed_mps, cfg.hurry_speed_mps) if pace.hurries else cfg.max_speed_mps,
+    )
+    speeds_mps[way.stops_s > 0] = 0.0
+    return resample(way.polyline_m, speeds_mps, arrival_times(way.polyline_m, speeds_mps), cfg.dt_s, way.stops_s)
 
 
 def _draw_route(
@@ -133,6 +143,7 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
         lines.append(
             {
                 "id": path.path_id,
+                **pace_field(path.pace),
                 "cells": len(path.polyline_m),
                 "length_m": round(length_m, 3),
                 "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cosfly.config import Config
-from cosfly.errors import NoPathError
+from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
 from cosfly.grid import (
     SURFACE_REACH_M,
@@ -32,11 +32,13 @@ from cosfly.grid import (
     roi_mask,
     surface,
 )
+from cosfly.pedestrians.paces import PACES
 from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.roi import Roi
+from cosfly.products.walks import PLAIN_PACE
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +73,15 @@ class PedestriansConfig(Config):
     speed_jitter: float = Field(0.15, ge=0, lt=1, description="beta of eq:speed: random share of speed; 0 is off")
     min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
     max_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="speeds are cut to this, m/s")
+    pace: dict[str, float] = Field(
+        {PLAIN_PACE: 1.0},
+        description=f"share of the walks at each pace, drawn for each walk: {', '.join(PACES)}",
+    )
+    hurry_speed_mps: float = Field(
+        1.6,
+        ge=SLOWEST_SPEED_MPS,
+        description="speed on straight ground of who hurries, m/s; cut to it or max_speed_mps",
+    )
     dt_s: float = Field(
         DT_S,
         ge=0.05,
@@ -78,6 +89,18 @@ class PedestriansConfig(Config):
         description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames (caption.window, "
         "plan.muco.low_visibility_frames) and the thresholds of caption.label over a window's future are for 0.5",
     )
+
+    @field_validator("pace")
+    @classmethod
+    def _paces_are_known(cls, pace: dict[str, float]) -> dict[str, float]:
+        for name, share in pace.items():
+            if name not in PACES:
+                raise ValueError(f"{name!r} is no pace{nearest(name, PACES)}; there are {', '.join(PACES)}")
+            if share < 0:
+                raise ValueError(f"the share of {name} is {share:g}: a share is not negative")
+        if not sum(pace.values()) > 0:
+            raise ValueError("the shares must add up to something positive")
+        return pace
 
     @model_validator(mode="after")
     def _ranges_are_ordered(self) -> PedestriansConfig:

@@ -69,7 +69,7 @@ def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
 
 
 def resample(
-    polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, step_s: float
+    polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, step_s: float, stops_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample a timed polyline at equal steps.
 
@@ -77,13 +77,14 @@ def resample(
     its length over the mean of its speeds. The last sample is the goal, reached within the last step.
 
     Args:
-        polyline_m: (k, 2) m, k at least 2, no two neighbours equal; speeds_mps: (k,); times_s: (k,) from arrival_times.
+        polyline_m: (k, 2) m, k at least 2, no two neighbours equal; speeds_mps: (k,); times_s: (k,) from arrival_times, which
+            knows no stops; stops_s: (k,) how long the person stands at each waypoint, whose speed is 0 there.
     Returns:
         time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
     """
-    num_samples = int(np.ceil(times_s[-1] / step_s - 1e-9)) + 1
+    num_samples = int(np.ceil((times_s[-1] + stops_s.sum()) / step_s - 1e-9)) + 1
     time_s = np.arange(num_samples) * step_s
-    now_s = np.minimum(time_s, times_s[-1])
+    now_s = np.minimum(time_s - stood_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]
     since_s = now_s - times_s[piece]
@@ -92,3 +93,10 @@ def resample(
     along_m = polyline_m[piece + 1] - polyline_m[piece]
     share = np.clip(walked_m / np.linalg.norm(along_m, axis=1), 0.0, 1.0)
     return time_s, polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * since_s / duration_s
+
+
+def stood_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:
+    """How long the person has stood still until each time, (n,) s; times_s, stops_s: (k,) as for `resample`."""
+    at = np.flatnonzero(stops_s)
+    begins_s = times_s[at] + np.cumsum(stops_s[at]) - stops_s[at]
+    return np.clip(time_s[:, None] - begins_s, 0.0, stops_s[at]).sum(axis=1)

@@ -103,6 +103,7 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
         metrics=metrics,
         solver=made.solver,
         drop_reason=drop_reason(metrics, cfg, made.is_converged),
+        pace=walk.pace,
     )
 
 

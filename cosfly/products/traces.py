@@ -10,6 +10,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import column, records, rounded, text_id
+from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.store import check_schema, read_json, write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
@@ -23,6 +24,7 @@ class DroneTrace:
     targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
     clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts.
     drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are rendered.
+    pace: of the walk.
     """
 
     path_id: str
@@ -36,12 +38,14 @@ class DroneTrace:
     metrics: dict = field(default_factory=dict)
     solver: dict = field(default_factory=dict)
     drop_reason: str | None = None
+    pace: str = PLAIN_PACE
 
     def as_json(self) -> dict:
         names = ("x", "y", "z")
         return {
             "id": self.path_id,
             "planner": self.planner,
+            **pace_field(self.pace),
             "drop_reason": self.drop_reason,
             "metrics": self.metrics,
             "solver": self.solver,
@@ -68,6 +72,7 @@ class DroneTrace:
             text_id(record, where), str(record.get("planner", "")), time_s, groups["drone"][:, :3], groups["drone"][:, 3:],
             groups["target"], column(record, "visibility", where, len(time_s)),
             column(record, "clearance", where, len(time_s)), record.get("metrics", {}), record.get("solver", {}), record.get("drop_reason"),
+            pace_of(record, where),
         )  # fmt: skip
 
 

@@ -16,6 +16,8 @@ from cosfly.store import check_schema, read_json, write_json
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)
 TARGET_HEIGHT_M = 0.9  # hip height over the ground: the box stands on it
 
+PLAIN_PACE = "walk"  # files do not name it
+
 PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
 
 
@@ -23,7 +25,8 @@ PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
 class Walk:
     """One walk, the product of stage 3.
 
-    polyline_m: (k, 2) the A* route. time_s: (n,), even steps from 0. positions_m: (n, 3), feet on the ground. speeds_mps: (n,).
+    polyline_m: (k, 2) the way that is walked: the A* route, or what a pace makes of it. time_s: (n,), even steps from 0.
+    positions_m: (n, 3), feet on the ground. speeds_mps: (n,), 0 at a stop. pace: the profile.
     """
 
     path_id: str
@@ -31,10 +34,12 @@ class Walk:
     time_s: np.ndarray
     positions_m: np.ndarray
     speeds_mps: np.ndarray
+    pace: str = PLAIN_PACE
 
     def as_json(self) -> dict:
         return {
             "id": self.path_id,
+            **pace_field(self.pace),
             "start": rounded(self.polyline_m[0]),
             "goal": rounded(self.polyline_m[-1]),
             "length_m": round(float(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1).sum()), 3),
@@ -52,7 +57,25 @@ class Walk:
             raise InputError("columns of different lengths", where=where, got=str(lengths))
         polyline = matrix(record, "polyline", 2, where)
         positions = np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
-        return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"])
+        pace = pace_of(record, where)
+        return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"], pace)
+
+
+def pace_field(pace: str) -> dict[str, str]:
+    """Give what stands of a pace in the record of a walk or a flight."""
+    return {} if pace == PLAIN_PACE else {"pace": pace}
+
+
+def pace_of(record: dict, where: str) -> str:
+    """Read the pace of such a record: PLAIN_PACE where it names none.
+
+    Raises:
+        InputError: it is no text.
+    """
+    pace = record.get("pace", PLAIN_PACE)
+    if not isinstance(pace, str):
+        raise InputError("not a pace", where=f"{where}.pace", got=repr(pace)[:60], expected="a name")
+    return pace
 
 
 def write_paths(path: Path, paths: list[Walk], header: dict) -> None:

@@ -23,6 +23,7 @@ from cosfly.products.frames import Camera, FrameFile, Look
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.products.walks import pace_field
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
@@ -146,7 +147,13 @@ def script_flight(
         clothes=clothes,
         look=cfg.look,
         is_original=track == "clean",
-        source={"path_index": number, "scenario_id": trace.path_id, "scenario_name": town, "algorithm": trace.planner},
+        source={
+            "path_index": number,
+            "scenario_id": trace.path_id,
+            "scenario_name": town,
+            "algorithm": trace.planner,
+            **pace_field(trace.pace),
+        },
     )
 
 
