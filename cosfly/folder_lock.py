@@ -33,6 +33,12 @@ class FolderLock:
     def __init__(self, path: Path, file: IO[str] | None) -> None:
         self.path, self._file = path, file
 
+    def __enter__(self) -> FolderLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
     def release(self) -> None:
         """Let others in; the file goes, so that a finished folder holds products only."""
         if self._file is not None:

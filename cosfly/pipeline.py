@@ -28,7 +28,7 @@ from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
 from cosfly.settings import RunConfig, num_workers
 from cosfly.stage_folder import Manifest, Resume, read_manifest
-from cosfly.store import read_json, write_bytes, write_json
+from cosfly.store import read_json, refuse_link, write_bytes, write_json
 from release.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)
@@ -84,10 +84,25 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     """
     choose_licence(cfg.release.licence, [(cfg.maps.source, cfg.maps.licence)])  # the last stage would ask for it
     todo = stages(cfg, out, resume=resume)
-    lock = hold_folder(out)
-    is_new = not (out / "run.yaml").exists()
-    if is_new:
-        _save_run(cfg, out)
+    for stage in todo:
+        refuse_link(out / stage.name)
+    with hold_folder(out):
+        is_new = not (out / "run.yaml").exists()
+        if is_new:
+            _save_run(cfg, out)
+        results = _work(cfg, out, todo)
+        tree = out / "render"
+        if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
+            contact_sheet(tree, out / "contact_sheet.png")
+            preview_gif(tree, out / "preview.gif")
+        _save_summary(results, out)
+        if not is_new:
+            _save_run(cfg, out)  # not before every stage has taken these settings
+    return results
+
+
+def _work(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
+    """Do the stages that are not complete."""
     results = []
     to_plan = not (out / "plan/manifest.json").exists()
     with compiled_ahead(cfg.plan.planner, needed=to_plan) as wait_for_compiled:
@@ -101,14 +116,6 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
             if was_complete:
                 log.info("[%d/%d] %s: already complete", number, len(todo), stage.name)
             results.append(StageResult(stage, read_manifest(out / stage.name), was_complete))
-    tree = out / "render"
-    if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
-        contact_sheet(tree, out / "contact_sheet.png")
-        preview_gif(tree, out / "preview.gif")
-    _save_summary(results, out)
-    if not is_new:
-        _save_run(cfg, out)  # not before every stage has taken these settings
-    lock.release()
     return results
 
 

@@ -27,6 +27,7 @@ from cosfly.store import (
     inside,
     model_lines,
     read_model,
+    refuse_links,
     remove_partials,
     sha256_bytes,
     sha256_file,
@@ -219,6 +220,7 @@ class StageFolder:
             return complete
         lock = hold_folder(out)
         try:
+            refuse_links(out)
             record = _taken_up(out, record, resume)
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
@@ -241,6 +243,7 @@ class StageFolder:
     def reopen(self) -> None:
         """Make a complete stage one that has more to do."""
         self._lock = hold_folder(self.path)
+        refuse_links(self.path)
         (self.path / "manifest.json").unlink()
         self.is_complete = False
 

@@ -51,10 +51,12 @@ def _concerns(error: OSError, path: Path) -> bool:
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or the new."""
     partial = _partial(path)
+    refuse_link(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)  # a kill left it, or somebody put a link there
         try:
-            with open(partial, "wb") as file:
+            with open(partial, "xb") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -268,6 +270,31 @@ def fingerprint(path: Path) -> str:
 # --- folders of many files ----------------------------------------------------------------------------------------------
 
 
+def refuse_link(path: Path) -> None:
+    """Refuse to write to a link, which may lead anywhere.
+
+    Raises:
+        StorageError: the path is a link; says where it leads.
+    """
+    if path.is_symlink():
+        raise StorageError(
+            "a link stands where files are written, and writing follows none",
+            where=path,
+            got=f"a link to {os.readlink(path)}",
+            fix="remove it, or put what it leads to in its place; the folder that --out names may itself be a link",
+        )
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse to write into a folder in which a link stands, at any depth; the folder itself may be one."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                refuse_link(Path(entry.path))
+            elif entry.is_dir():
+                refuse_links(Path(entry.path))
+
+
 def remove_partials(folder: Path) -> None:
     """Remove what a kill left under temporary names."""
     for path in sorted(folder.rglob(".*.partial"), reverse=True):
@@ -318,6 +345,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Fill a folder under a temporary name; rename it when the block ends without an error."""
     partial = _partial(path)
+    refuse_link(path)
     with storage_errors(path):
         partial.mkdir(parents=True)
         try:

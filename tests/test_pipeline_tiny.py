@@ -11,7 +11,7 @@ import pytest
 
 from cosfly import pipeline
 from cosfly.config import load
-from cosfly.errors import ConfigError, ResumeError
+from cosfly.errors import ConfigError, ResumeError, StorageError
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
@@ -121,6 +121,18 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_pat
         pipeline.run(tiny(**{"pedestrians.num_paths": 5}), out)
     assert (out / "run.yaml").read_bytes() == before
     assert "pedestrians: already complete" not in caplog.text
+    assert not (out / ".lock").exists(), "who failed holds nobody up"
+
+
+def test_a_stage_folder_that_is_a_link_is_refused_before_anything_is_done(base, tmp_path):
+    out = begin(base, tmp_path / "run", "render")
+    shutil.copytree(base / "render", tmp_path / "elsewhere")
+    (out / "render").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere/manifest.json").unlink()
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    with pytest.raises(StorageError, match="run/render: a link stands where files are written"):
+        pipeline.run(tiny(), out)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
 def test_a_second_run_in_the_same_folder_is_refused(base, tmp_path, held_by_another):

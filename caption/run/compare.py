@@ -26,7 +26,7 @@ from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Coc
-from cosfly.store import write_json
+from cosfly.store import refuse_links, write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RESULT = "compare_strategies.json"
@@ -80,6 +80,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     if cfg.caption_file is not None:
         raise ConfigError("captions of a file cannot be asked for again", where="--teacher", got=cfg.teacher)
     out.mkdir(parents=True, exist_ok=True)
+    refuse_links(out)
     num_windows, trials = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
