@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -21,9 +21,17 @@ from cosfly.config import Config
 from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.folder_lock import LOCK, FolderLock, hold_folder
 from cosfly.journal import Journal
+from cosfly.provenance import (
+    MANIFEST_SCHEMA,
+    STAGE_SCHEMA,
+    VERSION,
+    Output,
+    StageRecord,
+    checked_inputs,
+    read_stage_record,
+)
 from cosfly.store import (
     dump_json,
-    fingerprint,
     inside,
     model_lines,
     read_model,
@@ -40,7 +48,6 @@ log = logging.getLogger(__name__)
 
 Resume = Literal["never", "if-same", "force"]
 
-STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
 BEGUN = ("stage.json", "items.jsonl", "failures.jsonl")  # what stands in a folder before anything is finished
 
 
@@ -122,36 +129,6 @@ class Tally(BaseModel):
 # --- what stands in the folder ----------------------------------------------------------------------------------------
 
 
-class StageInput(_Record):
-    """A file or folder that a stage reads."""
-
-    path: str
-    sha256: str
-
-
-class StageRecord(_Record):
-    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on.
-
-    package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
-    """
-
-    stage: str
-    config: dict[str, Any]
-    seed: int
-    inputs: dict[str, StageInput]
-    code_version: str
-    package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
-    resumed_with_other: list[str] = Field([], exclude_if=lambda differences: not differences)
-
-
-class Output(_Record):
-    """A file of a finished stage, its path relative to the stage folder."""
-
-    path: str
-    bytes: int
-    sha256: str
-
-
 class Manifest(BaseModel):
     """`manifest.json`: what a finished stage made. `facts` are what else the stage says of itself."""
 
@@ -194,6 +171,7 @@ class StageFolder:
         seed: int,
         resume: Resume = "if-same",
         package_files: Mapping[str, Path] = MappingProxyType({}),
+        audited: Collection[str] = (),
     ) -> StageFolder:
         """Start or continue a stage.
 
@@ -203,14 +181,16 @@ class StageFolder:
             resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed;
                 `force` continues with the finished items in spite of a difference, which stays on record.
             package_files: name -> file or flat folder of the package that decides what is made.
+            audited: names of inputs that the stage itself holds against their records, item by item.
         Raises:
+            VerifyError: an input is not what its stage finished, or was made of another one than that which is given with it.
             ResumeError: the folder holds work that may not be continued; names what differs.
         """
         record = StageRecord(
             stage=stage,
             config=config.recorded(),
             seed=seed,
-            inputs={name: StageInput(path=str(p), sha256=fingerprint(p)) for name, p in sorted(inputs.items())},
+            inputs=checked_inputs(inputs, audited),
             code_version=cosfly.__version__,
             package_files={name: _digest(p) for name, p in sorted(package_files.items())},
         )
@@ -309,17 +289,13 @@ def _taken_up(out: Path, record: StageRecord, resume: Resume) -> StageRecord:
         for name in BEGUN:
             (out / name).unlink(missing_ok=True)
         return record
-    noted = [*_found(out).resumed_with_other, *_may_continue(out, record, resume)]
+    noted = [*read_stage_record(out).resumed_with_other, *_may_continue(out, record, resume)]
     return record.model_copy(update={"resumed_with_other": noted})
-
-
-def _found(out: Path) -> StageRecord:
-    return read_model(out / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION)
 
 
 def _may_continue(out: Path, record: StageRecord, resume: Resume) -> list[str]:
     """See whether the work that stands in a folder may be continued as `record` says; gives what differs where it is forced."""
-    found = _found(out)
+    found = read_stage_record(out)
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
     differences = _differences(found, record)

@@ -9,7 +9,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -250,23 +250,6 @@ def sha256_file(path: Path) -> str:
         raise InputError("cannot read the file", where=path, got=error.strerror, fix="check the path") from None
 
 
-def fingerprint(path: Path) -> str:
-    """Give one digest for an input: a file's bytes, a finished stage's products, or a playback tree's trajectory files."""
-    if path.is_file():
-        return sha256_file(path)
-    if not path.is_dir():
-        raise InputError(
-            "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
-        )
-    manifest = path / "manifest.json"
-    if manifest.is_file():
-        return sha256_bytes(dump_json(read_json(manifest).get("outputs", [])).encode())
-    digest = hashlib.sha256()
-    for file in sorted(path.rglob("trajectory.json")):
-        digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
-    return digest.hexdigest()
-
-
 # --- folders of many files ----------------------------------------------------------------------------------------------
 
 
@@ -321,8 +304,12 @@ CHECKSUMS = "checksums.sha256"
 
 def write_checksums(folder: Path, digests: dict[str, str]) -> None:
     """Write `checksums.sha256` (the format of sha256sum) for files named relative to the folder."""
-    lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
-    write_bytes(folder / CHECKSUMS, lines.encode())
+    write_bytes(folder / CHECKSUMS, checksum_lines(digests).encode())
+
+
+def checksum_lines(digests: Mapping[str, str]) -> str:
+    """Give the lines of `checksums.sha256`."""
+    return "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
 
 
 def read_checksums(folder: Path) -> dict[str, str]:

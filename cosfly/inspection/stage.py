@@ -65,7 +65,8 @@ def run(
     """
     given = {"simplified": simplified, "traces": traces, "data": data}
     inputs = {name: path for name, path in given.items() if path is not None}
-    stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, resume=resume)
+    # Flights of the tree that were changed since are found one by one, and rejected.
+    stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, resume=resume, audited=("data",))
     product = out / "inspect.json"
     if stage.is_complete:
         return product

@@ -24,13 +24,14 @@ from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
+from cosfly.provenance import fingerprint
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Kept, Resume, StageFolder, Tally
-from cosfly.store import CHECKSUMS, atomic_folder, dump_json, fingerprint, sha256_bytes, write_json
+from cosfly.store import CHECKSUMS, atomic_folder, dump_json, sha256_bytes, write_json
 
 log = logging.getLogger(__name__)
 

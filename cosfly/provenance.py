@@ -1,0 +1,305 @@
+"""What stands on disk against the records of the stages that made it.
+
+`manifest.json` holds the sha256 of what a stage made, `stage.json` that of what it was made of, and a flight's `checksums.sha256` that of
+each of its files. Every stage compares its inputs with the first two when it begins, for it reads them anyway; `verify` reads all of it.
+The digests find what was changed, exchanged or mixed up; they are no signatures against somebody who changes the records too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.console import progress_bar
+from cosfly.errors import InputError, VerifyError
+from cosfly.store import (
+    CHECKSUMS,
+    checksum_lines,
+    dump_json,
+    inside,
+    read_checksums,
+    read_json,
+    read_model,
+    sha256_bytes,
+    sha256_file,
+)
+
+log = logging.getLogger(__name__)
+
+STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
+RECORDS = (("manifest.json", MANIFEST_SCHEMA), ("stage.json", STAGE_SCHEMA))
+FLIGHT = "trajectory.json"
+ROLES = {"maps": "boxes", "map": "simplified"}  # a product that stages call by two names
+CONVERSION, CONVERTED = "convert-tree", "data"  # the stage that makes another form of the same tree, and its input
+NUM_NAMED = 5  # files that an error names
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class StageInput(_Record):
+    """A file or folder that a stage reads."""
+
+    path: str
+    sha256: str
+
+
+class StageRecord(_Record):
+    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on.
+
+    package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
+    """
+
+    stage: str
+    config: dict[str, Any]
+    seed: int
+    inputs: dict[str, StageInput]
+    code_version: str
+    package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
+    resumed_with_other: list[str] = Field([], exclude_if=lambda differences: not differences)
+
+
+class Output(_Record):
+    """A file of a finished stage, its path relative to the stage folder."""
+
+    path: str
+    bytes: int
+    sha256: str
+
+
+class _Made(_Record):
+    """Of `manifest.json` what is compared with the disk."""
+
+    outputs: list[Output]
+
+
+def read_stage_record(folder: Path) -> StageRecord:
+    """Read `stage.json`.
+
+    Raises:
+        InputError: it is missing or malformed.
+    """
+    return read_model(folder / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION, what="stage record")
+
+
+def fingerprint(path: Path) -> str:
+    """Give one digest for an input: a file's bytes, what a finished stage says of its products, or a playback tree's trajectory files."""
+    if path.is_file():
+        return sha256_file(path)
+    if not path.is_dir():
+        raise InputError(
+            "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
+        )
+    manifest = path / "manifest.json"
+    if manifest.is_file():
+        return sha256_bytes(dump_json(read_json(manifest).get("outputs", [])).encode())
+    digest = hashlib.sha256()
+    for file in sorted(path.rglob(FLIGHT)):
+        digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
+    return digest.hexdigest()
+
+
+def folder_digests(folder: Path) -> dict[str, str]:
+    """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, of what that leaves out its own."""
+    listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
+    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return listed | {name: sha256_file(folder / name) for name in found if name not in (*listed, CHECKSUMS)}
+
+
+def digest_of(digests: Mapping[str, str]) -> str:
+    """Give one digest for the files of a folder."""
+    return sha256_bytes(checksum_lines(digests).encode())
+
+
+# --- the inputs of a stage --------------------------------------------------------------------------------------------
+
+
+def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) -> dict[str, StageInput]:
+    """Fingerprint what a stage reads, and see that it is what was finished and belongs together.
+
+    Args:
+        inputs: name -> file or folder; of several runs with a number in front, as `2.data`.
+        audited: names of inputs whose files the stage itself compares with their records, one by one.
+    Raises:
+        InputError: an input is missing.
+        VerifyError: one was changed since its stage finished it, its stage is not finished, or it was made of another one than
+            that which is given with it.
+    """
+    for name, path in inputs.items():
+        if name not in audited:
+            _check_finished(path)
+    found = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
+    for name, path in inputs.items():
+        _check_belongs(name, path, inputs, found)
+    return found
+
+
+def _stage_folder(path: Path) -> Path | None:
+    """Find the folder of the stage that made an input: itself, the one it stands in, or that one's; None where none of ours did."""
+    places = [path] if path.is_dir() else [path.absolute().parent, path.absolute().parent.parent]
+    return next((place for place in places if any(_has_record(place, *record) for record in RECORDS)), None)
+
+
+def _has_record(folder: Path, name: str, schema: str) -> bool:
+    """Tell whether a folder has a record of ours; others write files of these names too."""
+    value = read_json(folder / name) if (folder / name).is_file() else None
+    return isinstance(value, dict) and value.get("schema") == schema
+
+
+def _outputs(folder: Path) -> dict[str, Output]:
+    """Read what a finished stage's manifest lists, by the paths in its folder."""
+    made = read_model(folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
+    return {output.path: output for output in made.outputs}
+
+
+def _check_finished(path: Path) -> None:
+    """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
+    folder = _stage_folder(path)
+    if folder is None or not path.exists():
+        return
+    for name, schema in RECORDS:
+        if not _has_record(folder, name, schema):
+            raise VerifyError(
+                "the stage that makes this is not finished, or its records are gone", where=path,
+                got=f"no {name} in {folder}", expected=f"{name} of that stage",
+                fix="run that stage again; to use what is there as it is, copy it to a folder of its own",
+            )  # fmt: skip
+    outputs = _outputs(folder)
+    if path.is_file():
+        name = path.absolute().relative_to(folder.absolute()).as_posix()
+        outputs = {name: outputs[name]} if name in outputs else {}
+    wrong = [*_changed(folder, {name: output.sha256 for name, output in outputs.items()}), *_strangers(folder, outputs)]
+    if wrong:
+        raise _not_as_recorded(folder, wrong)
+
+
+def _changed(folder: Path, digests: Mapping[str, str]) -> Iterator[str]:
+    for name, digest in digests.items():
+        path = inside(folder, name)
+        if not path.is_file():
+            yield f"{name} is missing"
+        elif sha256_file(path) != digest:
+            yield f"{name} has other bytes"
+
+
+def _strangers(folder: Path, outputs: Mapping[str, Output]) -> Iterator[str]:
+    """Find the flights in a tree that its manifest does not know."""
+    if not any(name.endswith(f"/{FLIGHT}") for name in outputs):
+        return
+    for place, folders, files in os.walk(folder):
+        if FLIGHT in files:
+            folders.clear()  # frames
+            name = (Path(place) / FLIGHT).relative_to(folder).as_posix()
+            if name not in outputs:
+                yield f"{name} is no flight of this tree"
+        folders[:] = [inner for inner in folders if not inner.startswith(".")]
+
+
+def _not_as_recorded(where: Path, wrong: list[str]) -> VerifyError:
+    more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
+    return VerifyError(
+        "what stands here is not what its stage finished", where=where, got="; ".join(wrong[:NUM_NAMED]) + more,
+        expected="the files that its records hold the digests of",
+        fix="put the files back or make them again; to use a file that you changed, copy it to a folder of its own",
+    )  # fmt: skip
+
+
+def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
+    """See that what an input was made of, where it is given too, is what is given."""
+    folder = _stage_folder(path)
+    if folder is None or not _has_record(folder, "stage.json", STAGE_SCHEMA):
+        return
+    front = name.rpartition(".")[0]
+    peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == front}
+    for made_of, record in read_stage_record(folder).inputs.items():
+        peer = peers.get(_role(made_of), name)
+        if peer != name and record.sha256 not in _lineage(inputs[peer], found[peer].sha256):
+            raise VerifyError(
+                f"it was made of another input {made_of!r} than the one given with it", where=path,
+                got=f"given: {inputs[peer]}", expected=f"{record.path}, as it was then",
+                fix=f"give the two that belong together, or make {path.name} again",
+            )  # fmt: skip
+
+
+def _role(name: str) -> str:
+    role = name.rpartition(".")[2]
+    return ROLES.get(role, role)
+
+
+def _lineage(path: Path, digest: str) -> set[str]:
+    """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
+    record = read_stage_record(path) if _has_record(path, "stage.json", STAGE_SCHEMA) else None
+    return {digest} | (
+        {record.inputs[CONVERTED].sha256} if record is not None and record.stage == CONVERSION else set()
+    )
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+def verify(paths: Iterable[Path]) -> int:
+    """Hash every file of the stages that made some products, pictures and shards included; gives how many.
+
+    Args:
+        paths: files or folders; those without any record are told in the log.
+    Raises:
+        VerifyError: names the files that are missing, have other bytes, or are in no record.
+    """
+    start_s, num_bytes, wrong = time.monotonic(), 0, []
+    digests: dict[Path, str] = {}
+    folders = list(dict.fromkeys(_stage_folder(path) or (path if path.is_dir() else path.parent) for path in paths))
+    for folder in folders:
+        listed = _recorded_files(folder)
+        if not listed:
+            log.warning("verify: %s: nothing here to verify against: no manifest, no %s", folder, CHECKSUMS)
+        digests |= listed
+        wrong += [f"{path} is in no record" for path in _unrecorded(folder, listed)]
+        if _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
+            wrong += [f"{folder}: {stranger}" for stranger in _strangers(folder, _outputs(folder))]
+    with progress_bar("verify", total=len(digests)) as advance:
+        for path, digest in digests.items():
+            if not path.is_file():
+                wrong.append(f"{path} is missing")
+            elif sha256_file(path) != digest:
+                wrong.append(f"{path} has other bytes")
+            else:
+                num_bytes += path.stat().st_size
+            advance(1)
+    if wrong:
+        raise _not_as_recorded(Path(os.path.commonpath(folders)), wrong)
+    seconds = time.monotonic() - start_s
+    log.info(
+        "verify: %d files, %.0f MB, %.1f s, %.0f MB/s",
+        len(digests),
+        num_bytes / 1e6,
+        seconds,
+        num_bytes / 1e6 / seconds,
+    )
+    return len(digests)
+
+
+def _recorded_files(folder: Path) -> dict[Path, str]:
+    """Give the sha256 of every file that a stage folder or tree has on record."""
+    is_finished = _has_record(folder, "manifest.json", MANIFEST_SCHEMA)
+    found = {
+        inside(folder, output.path): output.sha256 for output in (_outputs(folder) if is_finished else {}).values()
+    }
+    for lists in sorted(folder.rglob(CHECKSUMS)):
+        found |= {lists.parent.resolve() / name: digest for name, digest in read_checksums(lists.parent).items()}
+    return found
+
+
+def _unrecorded(folder: Path, listed: Collection[Path]) -> Iterator[Path]:
+    """Find the files beside a checksum file that it does not list; what begins with a dot is others'."""
+    for lists in sorted(folder.rglob(CHECKSUMS)):
+        for path in sorted(lists.parent.rglob("[!.]*")):
+            if path.is_file() and path != lists and path.resolve() not in listed:
+                yield path

@@ -1,0 +1,154 @@
+"""Products against the records of who made them: what is noticed when a stage begins, and what when all is read."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from cosfly import provenance
+from cosfly.config import Config
+from cosfly.errors import VerifyError
+from cosfly.stage_folder import StageFolder, Tally
+from cosfly.store import dump_json, read_json, sha256_bytes, sha256_file, write_bytes, write_checksums, write_json
+
+
+def begin(out: Path, name: str, **inputs: Path) -> StageFolder:
+    return StageFolder.open(out, name, config=Config(), inputs=inputs, seed=0)
+
+
+def make(out: Path, name: str, files: dict[str, str], **inputs: Path) -> Path:
+    """A finished stage with some files."""
+    stage = begin(out, name, **inputs)
+    for file, text in files.items():
+        write_bytes(out / file, text.encode())
+    stage.finish([out / file for file in files], Tally(input=1, kept=1))
+    return out
+
+
+def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
+    """A finished tree of two flights, one frame each."""
+    stage = begin(out, "render", **inputs)
+    outputs = []
+    for flight in ("Town1/trajectory_1/ORI", "Town1/trajectory_2/ORI"):
+        folder = out / flight
+        files = {"trajectory.json": f"{flight}{text}", "frames_playback/frame_00000/rgb.png": f"picture of {flight}"}
+        for name, content in files.items():
+            write_bytes(folder / name, content.encode())
+        write_checksums(folder, {name: sha256_file(folder / name) for name in files})
+        outputs += [folder / "trajectory.json", folder / "checksums.sha256"]
+    stage.finish(outputs, Tally(input=2, kept=2))
+    return out
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """simplify/, plan/, render/ and caption/, each made of the one before."""
+    boxes = make(tmp_path / "simplify", "simplify", {"map.json": "boxes"}) / "map.json"
+    traces = make(tmp_path / "plan", "plan", {"traces.json": "flights"}, map=boxes) / "traces.json"
+    tree = make_tree(tmp_path / "render", simplified=boxes, traces=traces)
+    make(tmp_path / "caption", "caption", {"captions.jsonl": "a\nb\n"}, data=tree)
+    return tmp_path
+
+
+def inputs_of(run: Path) -> dict[str, Path]:
+    files = {"simplified": "simplify/map.json", "traces": "plan/traces.json", "data": "render"}
+    return {name: run / path for name, path in (files | {"captions": "caption/captions.jsonl"}).items()}
+
+
+def test_what_belongs_together_is_taken(run):
+    found = provenance.checked_inputs(inputs_of(run))
+    assert found["simplified"].sha256 == sha256_bytes(b"boxes")
+    listed = read_json(run / "render/manifest.json")["outputs"]
+    assert found["data"].sha256 == sha256_bytes(dump_json(listed).encode()), "as in the records of earlier runs"
+    assert provenance.verify(inputs_of(run).values()) == 1 + 1 + 6 + 1
+
+
+@pytest.mark.parametrize(
+    "name", ["plan/traces.json", "caption/captions.jsonl", "render/Town1/trajectory_1/ORI/trajectory.json"]
+)
+@pytest.mark.parametrize("text", ["of other bytes", ""])
+def test_a_changed_file_is_named(run, name, text):
+    (run / name).write_text(text)
+    with pytest.raises(VerifyError, match=rf"{Path(name).name} has other bytes"):
+        provenance.checked_inputs(inputs_of(run))
+    with pytest.raises(VerifyError, match=rf"{name} has other bytes"):
+        provenance.verify(inputs_of(run).values())
+
+
+def test_a_picture_is_noticed_when_all_is_read(run):
+    one, two = (run / f"render/Town1/trajectory_{k}/ORI/frames_playback/frame_00000/rgb.png" for k in (1, 2))
+    text = one.read_text()
+    one.write_text(two.read_text())
+    provenance.checked_inputs(inputs_of(run))
+    with pytest.raises(VerifyError, match=r"trajectory_1/ORI/\S+rgb\.png has other bytes"):
+        provenance.verify([run / "render"])
+    one.unlink()
+    with pytest.raises(VerifyError, match=r"rgb\.png is missing"):
+        provenance.verify([run / "render"])
+    one.write_text(text)
+    (one.parent / "more.png").write_text("")
+    with pytest.raises(VerifyError, match=r"more\.png is in no record"):
+        provenance.verify([run / "render"])
+
+
+def test_a_flight_of_another_tree_is_no_flight_of_this_one(run):
+    shutil.copytree(run / "render/Town1/trajectory_1", run / "render/Town1/trajectory_3")
+    with pytest.raises(VerifyError, match=r"trajectory_3/ORI/trajectory.json is no flight of this tree"):
+        provenance.checked_inputs(inputs_of(run))
+    with pytest.raises(VerifyError, match=r"trajectory_3/ORI/trajectory.json is no flight of this tree"):
+        provenance.verify([run / "render"])
+
+
+def test_captions_of_another_tree_are_refused(run):
+    other = make_tree(run / "other", "of another seed")
+    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'.*given: .*other"):
+        provenance.checked_inputs(inputs_of(run) | {"data": other})
+    captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
+    two = {f"{k}.{name}": path for k, (data, c) in enumerate([(run / "render", run / "caption/captions.jsonl"), (other, captions)])
+           for name, path in (("data", data), ("captions", c))}  # fmt: skip
+    provenance.checked_inputs(two)
+    with pytest.raises(VerifyError, match="another input 'data'"):
+        provenance.checked_inputs(two | {"0.captions": captions})
+
+
+def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
+    other = make(run / "s2", "simplify", {"map.json": "other boxes"}) / "map.json"
+    with pytest.raises(VerifyError, match=r"traces\.json: it was made of another input 'map'"):
+        provenance.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
+
+
+def test_a_converted_tree_goes_with_the_captions_of_the_older_one(run):
+    converted = make(
+        run / "new", "convert-tree", {"Town1/trajectory_1/ORI/trajectory.json": "new"}, data=run / "render"
+    )
+    provenance.checked_inputs({"data": converted, "captions": run / "caption/captions.jsonl"})
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
+def test_a_stage_without_its_records_is_not_finished(run, name):
+    (run / "caption" / name).unlink()
+    with pytest.raises(VerifyError, match=f"not finished, or its records are gone; got no {name}"):
+        provenance.checked_inputs(inputs_of(run))
+    alone = run / "alone/captions.jsonl"
+    alone.parent.mkdir()
+    shutil.copy(run / "caption/captions.jsonl", alone)
+    provenance.checked_inputs(inputs_of(run) | {"captions": alone})
+
+
+def test_records_of_others_are_not_ours(tmp_path, caplog):
+    write_json(tmp_path / "manifest.json", {"name": "an app"})
+    write_json(tmp_path / "map.json", [])
+    provenance.checked_inputs({"map": tmp_path / "map.json"})
+    assert provenance.verify([tmp_path / "map.json"]) == 0
+    assert "nothing here to verify against" in caplog.text
+
+
+def test_a_folder_without_checksums_is_as_good_as_one_with_them(run):
+    folder = run / "render/Town1/trajectory_1/ORI"
+    whole = provenance.folder_digests(folder)
+    lines = (folder / "checksums.sha256").read_text().splitlines(keepends=True)
+    assert provenance.digest_of(whole) == sha256_file(folder / "checksums.sha256")
+    (folder / "checksums.sha256").write_text(lines[0])
+    assert provenance.folder_digests(folder) == whole, "what it leaves out is read"
+    (folder / "checksums.sha256").unlink()
+    assert provenance.folder_digests(folder) == whole
