@@ -264,4 +264,13 @@ CASES = [
     Case("zh", FOLLOW, R, "路左边 6 米外的白色货车没有影响。", ()),
     Case("zh", FOLLOW, R, "因此最好的做法是向右偏航跟上。", (("右", "左"),)),
     Case("zh", HOLD, H, "所以建议原地悬停等待。", (("原地悬停等待", "立即爬升"),)),
+    # Another frame's value, a change's span, a multiple of two told numbers, a side that a number explains.
+    Case("en", FOLLOW, R, "t4 log: height 20.4 m, range 19.7 m.", (("19.7", "21.2"), ("20.4", "18.9"))),
+    Case("en", FOLLOW, R, "Over the window the drone has flown 5.4 m, but the net displacement is a mere 5.2 m.", (("5.2", "3.6"),)),
+    Case("en", FOLLOW, R, "Our speed is 3.4 m/s, the walker's 1.4 m/s, a ratio of 2.4.", (("2.4", "3.9"),)),
+    Case("en", FOLLOW, R, "The walker is a little to the right (52 px).", (("right", "left"), ("52", "92"))),
+    Case("zh", FOLLOW, R, "无人机自 t2 以来上升了 1.5 米。", (("1.5", "2.4"),)),
+    Case("zh", FOLLOW, R, "速度 3.4 米/秒，较 t1 的 2.0 米/秒升了约 70%。", (("70%", "30%"),)),
+    Case("zh", FOLLOW, R, "行人偏到右边（离中心 52 像素）。", (("右", "左"),)),
+    Case("zh", FOLLOW, R, "机头逐帧右转 2.0、2.5、2.5、2.6 度。", (("右", "左"),)),
 ]  # fmt: skip

@@ -65,21 +65,21 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         for language, facts, coc, errors in foreign()
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.85
-    assert caught["numbers"] >= 0.9
+    assert caught["all"] >= 0.88
+    assert caught["numbers"] >= 0.95
     assert caught["sides"] >= 0.8
 
 
 def test_the_gold_captions_pass_and_their_errors_are_caught():
-    """Bounds of what is reached, not of what is wanted: 75 % of all, 95 % of the numbers, 80 % of the sides."""
+    """Bounds of what is reached; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
     flagged, caught = measure(
         (one.language, one.facts, one.coc, [(error.kind, error.in_text(one.coc)) for error in one.errors])
         for one in read_gold_prose()
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.76
-    assert caught["numbers"] >= 0.8
-    assert caught["sides"] >= 0.76
+    assert caught["all"] >= 0.8
+    assert caught["numbers"] >= 0.86
+    assert caught["sides"] >= 0.83
 
 
 def test_the_second_set_passes_and_its_errors_are_caught():
@@ -89,8 +89,8 @@ def test_the_second_set_passes_and_its_errors_are_caught():
         for one in read_gold_prose(SECOND_SET)
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.74
-    assert caught["numbers"] >= 0.8
+    assert caught["all"] >= 0.77
+    assert caught["numbers"] >= 0.85
     assert caught["sides"] >= 0.7
 
 

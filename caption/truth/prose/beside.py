@@ -9,6 +9,8 @@ from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.statements import Hedge
 from caption.truth.prose.timing import Timing
 
+_ZH_AFTER = 2  # letters between a number and its side: "3 度(左)"
+
 
 class Beside:
     """The neighbours of one clause's numbers. used_sides: the sides that belong to a number."""
@@ -23,7 +25,11 @@ class Beside:
         """Give +1 for a number to the left or -1 to the right, and the same for above and below."""
         reach = 24 if self.language == "en" else 8
         near = [t for t in self.clause.of("side") if abs(gap(t, numeral.start, numeral.end)) <= reach]
+        if self.language == "zh":
+            near = [t for t in near if t.start < numeral.end or t.start - numeral.end <= _ZH_AFTER]
         near = [t for t in near if not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)]
+        if not self.clause.has("side") and not self.in_scene:
+            near = self._explained(numeral)
         if not near or (self.in_scene and numeral.unit != "px"):
             return 0, 0
         if self.language == "zh":  # "中心左侧 42 像素", "向左转动 10 度": the side stands before
@@ -42,6 +48,17 @@ class Beside:
         if value in ("above", "below"):
             return 0, (1 if value == "above" else -1) if numeral.unit == "px" else 0
         return (1 if value in ("left", "ccw") else -1), 0
+
+    def _explained(self, numeral: Numeral) -> list[Token]:
+        """Give the side that a number in brackets or behind a colon explains: "a hair to the left (17 px)"."""
+        before = [c for c in self.sentence.clauses if c.end <= self.clause.start]
+        marks = {"px": ("(", ":"), "deg": ("(",)}.get(numeral.unit, ())
+        if not before or before[-1].numerals or self.text[before[-1].end : self.clause.start] not in marks:
+            return []
+        if before[-1].has("who", "scene") or (numeral.unit == "deg" and self.clause.has("quantity")):
+            return []
+        sides = before[-1].of("side", "left", "right", "cw", "ccw")
+        return sides if len(sides) == 1 else []
 
     def _is_of_person(self, side: Token) -> bool:
         """ "the nose is 5 degrees left of the walker": the other way round than the walker's bearing."""

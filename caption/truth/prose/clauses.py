@@ -165,7 +165,7 @@ def _is_time_alone(text: str, start: int, end: int, tokens: list[Token], found: 
         t.kind in ("time", "link", "position") for t in inside
     )
     is_free = not any(start <= n.start < end and n.unit not in ("s", "frames") for n in found)
-    return is_time and is_free and end - start <= (22 if text.isascii() else 9)
+    return is_time and is_free and end - start <= (28 if text.isascii() else 9)
 
 
 def _cut(text: str, tokens: list[Token], found: list[Numeral], language: Language) -> list[Clause]:
@@ -207,7 +207,7 @@ def _block(clauses: list[Clause], text: str) -> None:
             if token.value == "if":
                 conditional = True
                 clause.blocked.append((clause.start, clause.end, "if"))
-            elif token.value == "may":
+            elif token.value == "may" and not text.startswith("#", token.end + 1):  # "perhaps 7 px"
                 clause.blocked.append((clause.start, clause.end, "may"))
             elif token.value in ("future", "goal"):
                 if text[token.start : token.end] == "把" and clause.has("visibility"):

@@ -189,8 +189,9 @@ class NumberJudge:
     def _matches(self, s: Statement, numeral: Numeral, value: float, step: float, name: str) -> bool:
         slack = self.slack(numeral.unit, value, step, s.hedge, numeral.factor)
         sign = numeral.sign if name in _SIGNED or name in ("pitch", "climb_rate") else 0
-        if name in _SIGNED and s.side:
-            sign = s.side * _SIGNED[name] if name != "offset_y" else s.side * -1
+        base = name.removeprefix("rate:")
+        if base in _SIGNED and s.side:
+            sign = s.side * _SIGNED[base]
         if name == "pitch" and sign > 0:
             sign = 0
         if s.mode != "change" or name == "target_turn":
@@ -201,7 +202,7 @@ class NumberJudge:
             return False
         tight = max(step, _RESOLUTION[numeral.unit]) + 1e-9
         tight += _ABOUT * value if s.hedge else 0.0
-        direction = sign if name in _SIGNED and s.side else 0 if name in ("yaw", "heading", "bearing") else s.trend
+        direction = sign if base in _SIGNED and s.side else 0 if name in ("yaw", "heading", "bearing") else s.trend
         known = [] if name.startswith("rate:") else self.measured.known(name)
         if s.hedge == "less" and known and max(known) - min(known) <= value + tight:
             return True  # "varies by less than"

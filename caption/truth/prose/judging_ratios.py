@@ -25,7 +25,7 @@ def ratio_holds(s: Statement, measured: Measured, read: dict[int, tuple[float, f
         slack = min(step, 0.1 * value) + (_HEDGED if s.hedge else _ROUGH) * value
     if s.operands is not None:
         a, b = (read[i][0] for i in s.operands)
-        if not b:
+        if not a or not b:
             return None
         return any(_is_told(value, unit * ratio, slack, s.hedge) for ratio in _of_operands(s, a / b))
     if not s.names:
@@ -56,12 +56,12 @@ def _of_operands(s: Statement, ratio: float) -> Iterator[float]:
 
     "from 20.0 m to 16.0 m, 20 percent", "peaked at 7.5 m/s and has halved to 3.7 m/s".
     """
-    if s.kind == "percent":
-        yield from (ratio, abs(ratio - 1.0))
-    elif s.mode == "value" or not ratio:
-        yield ratio
-    else:
-        yield from (ratio, abs(ratio - 1.0), 1.0 / ratio, abs(1.0 / ratio - 1.0))
+    is_change = s.mode != "value"
+    is_one_way = s.is_ordered and (s.kind == "percent" or not is_change)
+    for told in (ratio,) if is_one_way else (ratio, 1.0 / ratio):
+        yield told
+        if s.kind == "percent" or is_change:
+            yield abs(told - 1.0)
 
 
 def _with_share(s: Statement, ratio: float) -> Iterator[float]:

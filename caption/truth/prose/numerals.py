@@ -167,10 +167,11 @@ def _joined(numeral: Numeral, before: list[Numeral], text: str) -> Numeral:
         return numeral
     last = before[-1]
     match = _JOIN.fullmatch(text[last.end : numeral.start])
-    joins_units = (
-        not last.unit or last.unit == numeral.unit or (match is not None and match["join"] in ("→", "x", "-", "~"))
-    )
-    if match is None or not joins_units:
+    if match is None:
+        return replace(numeral, group=last.group + 1)
+    is_bare = not numeral.unit and match["join"] in ",、" and text.startswith((",", "、"), numeral.end)
+    joins_units = not last.unit or last.unit == numeral.unit or match["join"] in ("→", "x", "-", "~") or is_bare
+    if not joins_units:
         return replace(numeral, group=last.group + 1)
     return replace(numeral, group=last.group, joined=match["join"].replace(" ", "")[-3:])
 

@@ -29,7 +29,7 @@ _RELATED = {
 }  # fmt: skip
 _DONE = re.compile(r"了|着|已|正|在|中|持续|不断|逐")
 _TURNS = re.compile(
-    r"\b(?:is|are|has|have|keeps?|comes?|turns?|turned|turning|rotates?|rotating|swings?|in progress)\b|在|正|已|了|着|转过|持续|每秒"
+    r"\b(?:is|are|has|have|keeps?|comes?|turns?|turned|turning|rotates?|rotating|swings?|in progress|bend(?:s|ing)|curv(?:es|ing)|veer(?:s|ing))\b|在|正|已|了|着|转过|持续|每秒"
 )
 
 

@@ -66,12 +66,15 @@ def _is_plan(masked: str, clause: Clause, is_reasoning: bool, any_plan: bool) ->
     if clause.has("modality", "plan"):
         return True
     if clause.has("modality", "thus") and (clause.has("action") or not has_owner):
-        return True
+        return not _UNDER_WAY.search(masked, clause.start, clause.end)
     if any_plan and not has_owner and not clause.numerals:
         return True
     return is_reasoning and not clause.numerals and _opens_with_action(masked, clause, has_owner)
 
 
+_UNDER_WAY = re.compile(
+    r"\b(?:is|are) (?:\w+ )?(?!being)\w+ing\b|正在?[^,]{0,4}(?:转|摆)"
+)  # "so the nose is coming back"
 _BEFORE_ACTION = re.compile(
     r"(?:so|then|hence|now|and|just|simply|[-:.])*\s*(?:an?|another|some|more)?\s*(?:(?:gentle|slight|further|small|moderate|continued|continuing"
     r"|left|right|leftward|rightward|clockwise|counterclockwise|anticlockwise|short|slow|quick|gradual|mild|soft|careful|little|bit|modest|firm|brief|tight|wide|level|steady|smooth) ?)*"

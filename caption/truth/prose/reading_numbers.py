@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 
 from caption.truth.prose.beside import Beside
-from caption.truth.prose.changing import Changing
+from caption.truth.prose.changing import MORE_THAN, Changing
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     Context,
@@ -36,6 +36,7 @@ _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date)\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
+_PER = re.compile(r"\b(?:per|each|every)\b|每")
 _WAYS = {"travelled", "displacement", "target_travelled"}
 
 
@@ -222,25 +223,39 @@ class NumberReader:
         boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
         if numeral.unit == "px" and (side or vertical) and not boxed:
             names, is_cued = (("offset_x",) if side else ("offset_y",)), True
-        self.statements.append(
-            Statement(
-                kind="range" if kind == "range" else "number",
-                clause=(self.clause.start, self.clause.end),
-                names=names,
-                numbers=tuple(members),
-                frames=(sure[1] if mode == "value" and sure[1] else self._frames(numeral, mode))
-                if frames == ""
-                else frames,  # type: ignore[arg-type]
-                mode=mode,
-                hedge=self.beside.hedge(numeral),
-                side=side or vertical,
-                trend=trend,
-                word=self.beside.aggregate(numeral),
-                sure_names=sure[0],
-                sure_frames=sure[1],
-                sure_mode=sure[2],
-            )
+        found = Statement(
+            kind="range" if kind == "range" else "number",
+            clause=(self.clause.start, self.clause.end),
+            names=names,
+            numbers=tuple(members),
+            frames=(sure[1] if mode == "value" and sure[1] else self._frames(numeral, mode))
+            if frames == ""
+            else frames,  # type: ignore[arg-type]
+            mode=mode,
+            hedge=self.beside.hedge(numeral),
+            side=side or vertical,
+            trend=trend,
+            word=self.beside.aggregate(numeral),
+            sure_names=sure[0],
+            sure_frames=sure[1],
+            sure_mode=sure[2],
         )
+        self.statements.append(self._surely(found, numeral))
+
+    def _surely(self, s: Statement, numeral: Numeral) -> Statement:
+        """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""
+        more = MORE_THAN.match(self.text, numeral.end)
+        is_bare = not (self.clause.has("link", "than") or _PER.search(self.text, self.clause.start, self.clause.end))
+        is_bare = is_bare and not (more and more["than"])
+        is_length = (
+            numeral.unit == "m" and is_bare and self.clause.has("quantity") and not self.sureness.is_in_group(numeral)
+        )
+        if not s.sure_names and (s.sure_mode == "change" or is_length):
+            s = replace(s, sure_names=s.names)
+        if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
+            return s
+        is_speed = numeral.unit == "mps" and s.mode == "either" and s.sure_names and s.frames == (-2, NOW)
+        return replace(s, sure_frames=(NOW,) if is_speed else s.frames)  # a speed is that of the step before it
 
     def _frames(self, numeral: Numeral, mode: Mode) -> tuple[int, ...] | None:
         return self.timing.frames(numeral, mode, is_extreme=bool(self.beside.aggregate(numeral)))
@@ -301,7 +316,7 @@ class NumberReader:
         self.statements.append(
             Statement(
                 "list", (self.clause.start, self.clause.end), names, tuple(members), None, trend=signs.pop() if len(signs) == 1 else 0,
-                hedge=self.beside.hedge(self.sentence.numerals[members[0]]), side=self.beside.side(self.sentence.numerals[members[-1]])[0],
+                hedge=self.beside.hedge(self.sentence.numerals[members[0]]), side=self.beside.side(self.sentence.numerals[members[0 if self.language == "zh" else -1]])[0],
             )
         )  # fmt: skip
 

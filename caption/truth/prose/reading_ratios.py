@@ -6,7 +6,7 @@ import re
 
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import TREND_SERIES, Context
-from caption.truth.prose.statements import NOW, Hedge, Mode, Statement
+from caption.truth.prose.statements import NOW, Hedge, Statement
 
 _SPEED = re.compile(r"fast|quick|slow|pace|speed|swift|rapid|velocit|速|快|慢")
 _CHANGE = re.compile(r"(?:halv|doubl|tripl|trebl|quadrupl)(?:ed|es|ing)|翻|减半|加倍|只剩|剩下|降到|减到|增到")
@@ -36,110 +36,152 @@ def ratio_statement(
 
     mode "change": a share that was added or lost, "either": that or the ratio itself.
     """
-    text = sentence.text
-    part = text[clause.start : clause.end]
-    people = clause.of("who", "drone", "target")
-    before, after = [t for t in people if t.end <= start], [t for t in people if t.start >= end]
-    than = [
-        t for t in people if t.end <= start and any(0 <= t.start - link.end <= 4 for link in clause.of("link", "than"))
-    ]
-    about_speed = bool(_SPEED.search(part)) or context.cue == "speed" or any(n.unit == "mps" for n in sentence.numerals)
-    trends = [t for t in clause.of("trend", "up", "down", "pace_up", "pace_down") if abs(t.start - start) <= 40]
-    names: tuple[str, ...] = ()
-    side = 0
-    owners = {t.value for t in people} | ({context.subject} if context.subject else set())
-    both = (
-        len({t.value for t in people}) == 2
-        or (people and len(owners) == 2 and not trends)
-        or than
-        or _is_object(sentence, before, after)
-    )
-    if not people and len(set(context.people)) == 2 and text[: clause.start].endswith(")"):
-        both, side = True, 1 if context.people[0] == "drone" else -1  # "about that of the walker (1 m/s) times two"
-    is_earlier = (
-        bool(_CHANGE.search(text[start:end]))
-        or bool(_EARLIER.search(part))
-        or any(
-            t.value[0] == "t" or t.value in ("prev1", "prev2", "start") for t in clause.of("time") if t.value != "total"
-        )
-    )
-    versus = (
-        sum(n.unit == "mps" for n in sentence.numerals) == 2
-        and not people
-        and not is_earlier
-        and _AGAINST.search(text, 0, start)
-    )
-    if (
-        about_speed
-        and not is_earlier
-        and (both or versus or (clause.has("compare", "faster", "slower") and not trends))
-    ):
-        names = ("speed_ratio",)
-        side = side or _direction(sentence, before, after, context)
-    elif about_speed and people and len(owners) == 2 and all(t.value == "difference" for t in clause.of("quantity")):
-        names = ("speed_ratio", "speed", "target_speed")  # "is a third faster": than it was, or than the other
-    elif trends or is_earlier or _CHANGE.search(text[start:end]) or _CHANGE.search(part):
-        cues = [t for t in clause.of("quantity") if t.value in TREND_SERIES or t.value == "speed"]
-        cue = min(cues, key=lambda t: abs(t.start - start)).value if cues else context.cue
-        cue = "speed" if cue == "difference" else cue
-        names = ("speed", "target_speed") if cue == "speed" else TREND_SERIES.get(cue, ())
-        if "box" in "".join(names):
-            names = ("box_width", "box_height", "box_area")
-        if cue in ("altitude", "height") and context.cue in ("box", "tall", "width"):
-            names = ("altitude", "box_height")
-    if not names and about_speed:
-        is_past = is_earlier or any(t.value != "now" for c in sentence.clauses for t in c.of("time"))
-        names = ("speed_ratio", "speed", "target_speed") if is_past else ("speed_ratio",)
-    signs = {1 if t.value.endswith("up") else -1 for t in trends}
-    is_more = (
-        text[: clause.start].endswith("(")
-        or _MORE_BY.match(text, end)
-        or (sentence.language == "zh" and _ZH_MORE_BY.search(text[clause.start : start]))
-    )
-    mode: Mode = "either" if is_more or trends or _LOSS.search(part) else "value"
+    told = _Multiple(sentence, clause, context, start, end)
+    names, side = told.names_and_side()
+    signs = {1 if t.value.endswith("up") else -1 for t in told.trends}
+    is_past = clause.has("time", "past", "start", "prev1", "prev2", "window", "mean") or context.has_past
+    operands, is_ordered = _operands(sentence, start, end, numbers)
     return Statement(
         "ratio",
         (clause.start, clause.end),
         names,
         numbers,
-        None if clause.has("time", "past", "start", "prev1", "prev2", "window", "mean") or context.has_past else (NOW,),
-        mode=mode,
+        None if is_past else (NOW,),
+        mode="either" if told.may_be_change() else "value",
         hedge=_hedge(sentence, clause, start, end),
         side=side,
         trend=signs.pop() if len(signs) == 1 and "speed_ratio" not in names else 0,
         value=value,
-        operands=_operands(sentence, start, end, numbers),
-    )  # type: ignore[arg-type]
+        operands=operands,
+        is_ordered=is_ordered,
+    )
+
+
+class _Multiple:
+    """A multiple or a percentage in its clause: who is named around it, and what its clause speaks of."""
+
+    def __init__(self, sentence: Sentence, clause: Clause, context: Context, start: int, end: int) -> None:
+        self.sentence, self.clause, self.context, self.start, self.end = sentence, clause, context, start, end
+        self.text, self.part = sentence.text, sentence.text[clause.start : clause.end]
+        self.people = clause.of("who", "drone", "target")
+        self.before = [t for t in self.people if t.end <= start]
+        self.after = [t for t in self.people if t.start >= end]
+        self.owners = {t.value for t in self.people} | ({context.subject} if context.subject else set())
+        self.trends = [
+            t for t in clause.of("trend", "up", "down", "pace_up", "pace_down") if abs(t.start - start) <= 40
+        ]
+        self.is_earlier = (
+            bool(_CHANGE.search(self.text[start:end]))
+            or bool(_EARLIER.search(self.part))
+            or any(t.value[0] == "t" or t.value in ("prev1", "prev2", "start") for t in clause.of("time") if t.value != "total")
+        )  # fmt: skip
+
+    def names_and_side(self) -> tuple[tuple[str, ...], int]:
+        """Give what is compared, and for the two speeds whose is the multiple: +1 the drone's, 0 either's."""
+        numerals, context = self.sentence.numerals, self.context
+        speeds = bool(_SPEED.search(self.part)) or context.cue == "speed" or any(n.unit == "mps" for n in numerals)
+        # "about that of the walker (1 m/s) times two"
+        is_behind = not self.people and len(set(context.people)) == 2 and self.text[: self.clause.start].endswith(")")
+        if speeds and not self.is_earlier and (is_behind or self._compares_two()):
+            first = 1 if context.people and context.people[0] == "drone" else -1
+            return ("speed_ratio",), first if is_behind else _direction(self.sentence, self.before, self.after, context)
+        only_differs = all(t.value == "difference" for t in self.clause.of("quantity"))
+        if speeds and self.people and len(self.owners) == 2 and only_differs:
+            return ("speed_ratio", "speed", "target_speed"), 0  # "is a third faster": than it was, or than the other
+        names = self._changing() if self._may_change() else ()
+        if not names and speeds:
+            is_past = self.is_earlier or any(t.value != "now" for c in self.sentence.clauses for t in c.of("time"))
+            names = ("speed_ratio", "speed", "target_speed") if is_past else ("speed_ratio",)
+        return names, 0
+
+    def _compares_two(self) -> bool:
+        """Tell whether the drone and the target are named, or a word compares one with the other."""
+        thans = self.clause.of("link", "than")
+        return bool(
+            len({t.value for t in self.people}) == 2
+            or (self.people and len(self.owners) == 2 and not self.trends)
+            or any(0 <= t.start - link.end <= 4 for t in self.before for link in thans)
+            or _is_object(self.sentence, self.before, self.after)
+            or self._is_versus()
+            or (self.clause.has("compare", "faster", "slower") and not self.trends)
+        )
+
+    def _is_versus(self) -> bool:
+        two = sum(n.unit == "mps" for n in self.sentence.numerals) == 2
+        return two and not self.people and _AGAINST.search(self.text, 0, self.start) is not None
+
+    def _may_change(self) -> bool:
+        changes = _CHANGE.search(self.text[self.start : self.end]) or _CHANGE.search(self.part)
+        return bool(self.trends or self.is_earlier or changes)
+
+    def _changing(self) -> tuple[str, ...]:
+        """Give the series that is compared with itself at another moment."""
+        cues = [t for t in self.clause.of("quantity") if t.value in TREND_SERIES or t.value == "speed"]
+        cue = min(cues, key=lambda t: abs(t.start - self.start)).value if cues else self.context.cue
+        if cue in ("speed", "difference"):
+            return ("speed", "target_speed")
+        if cue in ("altitude", "height") and self.context.cue in ("box", "tall", "width"):
+            return ("altitude", "box_height")
+        names = TREND_SERIES.get(cue, ())
+        return ("box_width", "box_height", "box_area") if "box" in "".join(names) else names
+
+    def may_be_change(self) -> bool:
+        """Tell whether a share that was added or lost may be told, not the multiple itself."""
+        zh = self.sentence.language == "zh" and _ZH_MORE_BY.search(self.text[self.clause.start : self.start])
+        is_more = self.text[: self.clause.start].endswith("(") or _MORE_BY.match(self.text, self.end) or zh
+        return bool(is_more or self.trends or _LOSS.search(self.part))
 
 
 _ZH_MORE_BY = re.compile(r"(?:快|慢|高|低|多|少|大|小|长|短)(?:了|出)?(?:约|大约|近|将近|差不多)?\s*$")
 _LOSS = re.compile(r"\b(?:drop|loss|gain|growth|rise|increase|decrease|reduction|deficit|cut|down|up)\b|幅")
-_COURSE = re.compile(
-    r"(?:\bfrom\s+(?:about )?|[从由自](?:[^#]{0,8}的)?\s*)(?P<first>)#[^#]*(?:\.#)?[^#]*(?:\bto\b|到|至)[^#]*$"
-)
+# Between a number and the multiple that is told of it: "2.4 m/s 的三倍", "from 1.19 to 0.49 m/s (59 % less)".
 _DIVISOR = re.compile(r"\s*\)?的\s*(?:约|大约|近)?\s*")
+_AT_ONCE = re.compile(r"[\s,(]*(?:about |roughly |some |an? (?:drop|loss|gain|growth|rise) of )*|[\s,(]*约?\s*")
+_PARTED = re.compile(r"[,;]")
 
 
-def _operands(sentence: Sentence, start: int, end: int, numbers: tuple[int, ...]) -> tuple[int, int] | None:
-    """Give the two numbers of which a ratio is told: "8.0 m/s, 3.4 times the walker's 2.4 m/s", "8.0 米/秒,是行人 2.4 米/秒的三倍"."""
-    told = [i for i, n in enumerate(sentence.numerals) if n.unit in ("m", "mps", "px") and i not in numbers]
+def _operands(
+    sentence: Sentence, start: int, end: int, numbers: tuple[int, ...]
+) -> tuple[tuple[int, int] | None, bool]:
+    """Give the two numbers of which a ratio is told, and whether it is the first one's of the second: "8.0 m/s, 3.4 times the walker's
+    2.4 m/s", "8.0 米/秒,是行人 2.4 米/秒的三倍", but "8.0 m/s and 2.4 m/s, a ratio of 3.4".
+    """
+    text, since = sentence.text, sentence.text.rfind(";", 0, start) + 1
+    told = [
+        i
+        for i, n in enumerate(sentence.numerals)
+        if n.unit in ("m", "mps", "px") and i not in numbers and n.start >= since
+    ]
     before = [i for i in told if sentence.numerals[i].end <= start]
-    if len(told) == 2 == len(before) and (
-        course := _COURSE.search(sentence.text, 0, sentence.numerals[before[1]].start)
+    after = next((i for i in told if sentence.numerals[i].start >= end), None)
+    if not before:
+        return None, False
+    last = sentence.numerals[before[-1]]
+    if (
+        sentence.language == "en"
+        and after is not None
+        and sentence.numerals[after].unit == last.unit
+        and not _PARTED.search(text, end, sentence.numerals[after].start)
     ):
-        first, last = (sentence.numerals[i] for i in before)
-        return (before[1], before[0]) if course.end("first") == first.start and first.unit == last.unit else None
-    if sentence.language == "zh":
-        if len(before) == 2 == len(told) and _DIVISOR.fullmatch(sentence.text, sentence.numerals[before[1]].end, start):
-            return (
-                (before[0], before[1])
-                if sentence.numerals[before[0]].unit == sentence.numerals[before[1]].unit
-                else None
-            )
-        return None
-    if len(told) == 2 and len(before) == 1 and sentence.numerals[told[0]].unit == sentence.numerals[told[1]].unit:
-        return told[0], told[1]
-    return None
+        return (before[-1], after), True
+    pair = before[-2:]
+    if len(pair) < 2 or sentence.numerals[pair[0]].unit != last.unit or last.joined in ("x", "*", "by", "乘"):
+        return None, False
+    if _DIVISOR.fullmatch(text, last.end, start):
+        return (pair[0], pair[1]), True
+    is_course = last.group == sentence.numerals[pair[0]].group and _AT_ONCE.fullmatch(text, last.end, start)
+    if is_course or (len(before) == 2 and not _names_person(sentence, last.end, end)):
+        return (pair[0], pair[1]), False
+    return None, False
+
+
+def _names_person(sentence: Sentence, start: int, end: int) -> bool:
+    """Tell whether somebody is named between two places or in the rest of their clause."""
+    return any(
+        start <= t.start and (t.start < end or c.start < end <= c.end)
+        for c in sentence.clauses
+        for t in c.of("who", "drone", "target")
+    )
 
 
 def _is_object(sentence: Sentence, before: list, after: list) -> bool:

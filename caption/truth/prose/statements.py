@@ -37,7 +37,7 @@ class Statement:
     side: +1 left (or above), -1 right (or below). trend: +1 up, -1 down. word: of a visibility, state, comparison or an aggregate.
     is_sure: False for a word that may not contradict, because it is not plain.
     sure_names, sure_frames, sure_mode: of a number, what the words leave no doubt of (sureness.py); empty where they leave it open.
-    operands: the numbers whose ratio is told. span: frames between which a change is told. negated: the opposite is stated. clause: for the message.
+    operands: the numbers whose ratio is told; is_ordered: that of the first to the second, else either way. span: frames between which a change is told. negated: the opposite is stated. clause: for the message.
     """
 
     kind: Kind
@@ -58,6 +58,7 @@ class Statement:
     sure_frames: tuple[int, ...] | None = None
     sure_mode: Mode = "either"
     operands: tuple[int, int] | None = None
+    is_ordered: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,17 +10,18 @@ from functools import cached_property
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import GOES_TO, Context, names_of, times_of
+from caption.truth.prose.cues import GOES_TO, Context, names_of
 from caption.truth.prose.lexicon import Token
+from caption.truth.prose.moments import Moments
 from caption.truth.prose.numerals import Numeral
-from caption.truth.prose.statements import NOW, Mode
+from caption.truth.prose.statements import Mode
 from caption.truth.prose.versus import pairs_of_speeds
 
 _LINK = {
     "en": re.compile(r"(?:[\s:=]|\bat t\d|\(t\d\)|is|was|are|of|at|now|currently|today|reads|stands|sits|holds|remains|stays|keeps|just|only|near|a mere|merely|still|a|an|steady|unchanged|constant|to (?:the )?(?:target|walker|subject|pedestrian|person|him|her|them)\b|(?:about|roughly|around|approximately|some|almost|nearly|exactly|again|back|down|up|to)\b)*"),
     "zh": re.compile(r"(?:[\s:=]|t\d时?|为|是|仅|现|约|大约|只有|还有|仍有|目前|当前|现在|已|稳定|保持|维持|恒定|在|仍|有|达|到|回|升|降|至|了)*"),
 }  # fmt: skip
-_BEHIND = re.compile(r"\s*of (?:the |our )?")  # "20.5 m of ground distance"
+_BEHIND = re.compile(r"\s*(?:of (?:the |our )?)?")  # "20.5 m of ground distance", "16 m flown"
 _OFF_TO = re.compile(
     r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er))\b"
 )
@@ -41,28 +42,10 @@ _SUBJECT = {
     "en": re.compile(r"[\s,]*(?:(?:and|while|but|the|our|a|an|now|so|then|meanwhile|as|at t\d|given|because|since|that|with|whereas)\b[\s,]*)*"),
     "zh": re.compile(r"[\s,]*(?:此刻|当前|目前|现在|而|且|但|同时|因为|由于|t\d\s*时?|最后一步|末步|,)*"),
 }  # fmt: skip
-# Of another moment, or of a part of the window.
-_ELSEWHERE = {
-    "en": re.compile(
-        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|used to|did)\b|\|"
-    ),
-    "zh": re.compile(
-        r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每|比|较|差|再|随|还|了|升到|降到|增|减|\|"
-    ),
-}
-_LATER = {
-    "en": re.compile(
-        r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since)\b|\|"
-    ),
-    "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每|比|较|差|再|随|起|\|"),
-}
 _CLOSING = re.compile(
     r"\b(?:clos(?:ing|ure)|approach\w*|opening|relative|vertical\w*|climb\w*|sink\w*|descen\w*|surplus|margin|lead|deficit|wind)\b|接近|靠近|逼近|远离|相对|垂直|爬升|升降|下降|富余|风"
 )
 _MISSING = re.compile(r"\b(?:short of|remain\w*|left over|to go|missing)\b|还差|相差|差了|仍差")
-_PAST = re.compile(
-    r"(?<!has )(?<!have )(?<!been )(?<!is )(?<!are )\b\w{2,}ed\b|\b(?:went|came|rose|fell|flew|ran|shot|made|took)\b|了"
-)
 _OTHER = {
     "en": re.compile(r"\b(?:than|against|versus|vs|over|past|round|around|behind|to|toward\w*|compared)\b"),
     "zh": re.compile(r"比|较|于|与|和|对"),
@@ -90,6 +73,7 @@ class Sureness:
         self.sentence, self.clause, self.context = sentence, clause, context
         self.text, self.language = sentence.text, sentence.language
         self.people = {t.value for t in clause.of("who", "drone", "target")}
+        self.moments = Moments(sentence, clause)
 
     @cached_property
     def pairs(self) -> list[tuple[Numeral, Numeral]]:
@@ -100,7 +84,7 @@ class Sureness:
 
     def names(self, numeral: Numeral, told: tuple[str, ...] = ()) -> tuple[str, ...]:
         """Give the series of which a number surely is. told: those of the word for its change."""
-        if self._is_in_group(numeral) or (numeral.unit == "mps" and self._may_differ(numeral)):
+        if self.is_in_group(numeral) or (numeral.unit == "mps" and self._may_differ(numeral)):
             return ()
         if _MISSING.search(self.text, self.clause.start, self.clause.end):
             return ()
@@ -114,6 +98,8 @@ class Sureness:
         cues = cues or self._gone_on_about(numeral)
         named = _NAMED.get(numeral.unit, {})
         found = {named[cue] or self._owned(cue, numeral) for cue in cues}
+        if numeral.unit == "px" and cues & {"width", "tall", "height"} and self.clause.has("position", "frame"):
+            found = {(*names, "picture") for names in found}  # "in a picture 1280 px wide"
         if len(found) > 1 and numeral.unit == "px":
             found.discard(("box_width", "box_height"))  # "box height", "框子高"
         return found.pop() if len(found) == 1 else () if cues else told
@@ -142,7 +128,7 @@ class Sureness:
             return set()  # "the person is left of the nose, 3 degrees"
         return told if len(told) == 1 and not self.text[: self.clause.start].endswith(("(", ":")) else set()
 
-    def _is_in_group(self, numeral: Numeral) -> bool:
+    def is_in_group(self, numeral: Numeral) -> bool:
         """Tell whether numbers stand in a row, whose quantities may stand in one too: "height and range: 20 m and 21 m"."""
         row = [n for n in self.sentence.numerals if n.group == numeral.group]
         after = MORE_THAN.match(self.text, row[-1].end) if self.language == "en" and len(row) == 2 else None
@@ -250,79 +236,18 @@ class Sureness:
                 at = time.end
         return _SUBJECT[self.language].fullmatch(self.text, at, who.start) is not None
 
-    # --- when --------------------------------------------------------------------------------------------------------
-
     def frames(self, numeral: Numeral) -> tuple[int, ...] | None:
-        if self._is_in_group(numeral):
+        """Give the frame of which a number surely is, or the two between which it is a change."""
+        if self.is_in_group(numeral):
             return None
-        if self.mode(numeral) == "change":
-            return self._span()
-        frame = self._beside_moment(numeral)
-        if frame is None:
-            frame = self._only_moment()
-        if frame is not None:
-            return (frame,)
-        following = [n.start for n in self._measured() if n.start > numeral.start]
-        after = following[0] if following else self.clause.end
-        if _ELSEWHERE[self.language].search(self._without_todays(numeral)):
-            return None
-        if _LATER[self.language].search(self.text, numeral.end, after):
-            return None
-        for time in self.clause.of("time"):
-            if time.value == "until" and 0 <= numeral.start - time.end <= 1:
-                continue  # "已降到 17.8 米"
-            is_next = (bool(following) and time.end >= after - 2) or (
-                time.start >= numeral.end and time.value in ("since", "past")
-            )
-            if time.start < after and not is_next and time.value not in self._todays(numeral):
-                return None
-        return (NOW,) if self._is_told_of_now(numeral) else None
-
-    def _without_todays(self, numeral: Numeral) -> str:
-        """Give what stands before a number in its clause, without the words for its own moment."""
-        part, at = "", self.clause.start
-        for time in self.clause.of("time", *self._todays(numeral)):
-            if at <= time.start and time.end <= numeral.start:
-                part, at = part + self.text[at : time.start], time.end
-        return part + self.text[at : numeral.start]
-
-    def _measured(self) -> list[Numeral]:
-        numerals = [self.sentence.numerals[i] for i in self.clause.numerals]
-        return [n for n in numerals if n.unit not in ("s", "frames")]
-
-    @staticmethod
-    def _todays(numeral: Numeral) -> tuple[str, ...]:
-        return ("now", "last_step") if numeral.unit == "mps" else ("now",)  # a speed is that of the step before it
-
-    def _is_told_of_now(self, numeral: Numeral) -> bool:
-        """Tell whether a clause without a time speaks of now: it names its own quantity or owner, or nothing before it was of another time."""
-        since = self.text.rfind(";", 0, self.clause.start) + 1
-        before = [c for c in self.sentence.clauses if since <= c.start and c.end <= self.clause.start]
-        is_own = self.clause.has("quantity") and self.mode(numeral) == "value"
-        told = "" if is_own else self.text[since : self.clause.start]
-        return not any(t.value != "now" for c in before for t in c.of("time")) and not _PAST.search(told)
-
-    def _beside_moment(self, numeral: Numeral) -> int | None:
-        match = _MOMENT_AFTER[self.language].match(self.text, numeral.end)
-        match = match or _MOMENT_BEFORE[self.language].search(self.text, max(0, numeral.start - _REACH), numeral.start)
-        if match is None:
-            return None
-        return NOW if match["frame"] is None else int(match["frame"])
-
-    def _only_moment(self) -> int | None:
-        """Give the one frame of a clause with one number: "at t1 the range still read 21.2 m"."""
-        times = times_of(self.clause)
-        if len(times) != 1 or len(times[0][1]) != 1 or len(self._measured()) != 1:
-            return None
-        if self.clause.has("time", *_SPANNING) or self.clause.has("link", "than", "from", "between"):
-            return None
-        return times[0][1][0]
+        mode = self.mode(numeral)
+        return self.moments.span() if mode == "change" else self.moments.frames(numeral, is_value=mode == "value")
 
     # --- value or change ---------------------------------------------------------------------------------------------
 
     def mode(self, numeral: Numeral) -> Mode:
         if numeral.unit == "deg" and not self.clause.has("quantity", "pitch", "depression", "bearing"):
-            return "value" if numeral.sign and self._beside_moment(numeral) is not None else "either"
+            return "value" if numeral.sign and self.moments.beside(numeral) is not None else "either"
         if self._is_changed(numeral):
             return "change"
         if numeral.sign > 0:
@@ -369,31 +294,8 @@ class Sureness:
             return bool(thans) and not any(thans[0].start <= t.start for t in self.clause.of("who", "target", "drone"))
         return self._follows_trend(numeral)
 
-    def _span(self) -> tuple[int, int] | None:
-        """Give the two frames between which a clause tells of a change."""
-        spans = [_SPANS[t.value] for t in self.clause.of("time", *_SPANS)]
-        named = [
-            (t, frames[0])
-            for t, frames in times_of(self.clause)
-            if len(frames) == 1 and frames != (NOW,) and t.value not in _SPANS
-        ]
-        before = [t.end for t in (*self.clause.of("time", "since"), *self.clause.of("link", "than"))]
-        spans += [(frame, NOW) for t, frame in named if any(0 <= t.start - end <= 6 for end in before)]
-        return spans[0] if len(set(spans)) == 1 and len(named) <= 1 else None
 
-
-_SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}
 _CHANGES_BY = {
     "en": re.compile(r"\s*(?:by|of|another|a further|about|roughly|some|almost|nearly|just|only|exactly|a mere|\s)*"),
     "zh": re.compile(r"\s*(?:了|约|大约|近|将近|仅|又|只)*\s*"),
 }
-_MOMENT_BEFORE = {
-    "en": re.compile(r"(?:\bt(?P<frame>\d)|\b(?P<now>now|currently))\s*(?::|=|at|is|was|of|stands at|stood at|reads|read|about|only|just|a)*\s*$"),
-    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
-}  # fmt: skip
-_MOMENT_AFTER = {
-    "en": re.compile(r"\s*(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|to\b|and\b|~|→|,? ?t\d))|(?P<now>now|at present|currently)\b(?! than))"),
-    "zh": re.compile(r"\s*\(\s*t(?P<frame>\d)\s*时?\s*\)"),
-}  # fmt: skip
-_REACH = 30  # letters before a number in which its frame stands
-_SPANNING = ("since", "until", "window", "last_step", "last_second", "max", "min", "mean")

@@ -1,0 +1,150 @@
+"""When: the frames that the words leave no doubt of."""
+
+from __future__ import annotations
+
+import re
+
+from caption.truth.prose.clauses import Clause, Sentence
+from caption.truth.prose.cues import times_of
+from caption.truth.prose.numerals import Numeral
+from caption.truth.prose.statements import NOW
+
+# Of another moment, or of a part of the window.
+_ELSEWHERE = {
+    "en": re.compile(
+        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|used to|did)\b|\|"
+    ),
+    "zh": re.compile(
+        r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每|比|较|差|再|随|还|(?<![到至])了|(?<![已现])(?:升到|降到)(?!了)|增|减|\|"
+    ),
+}
+_LATER = {
+    "en": re.compile(
+        r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since)\b|\|"
+    ),
+    "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每|比|较|差|再|随|起|\|"),
+}
+_PAST = re.compile(
+    r"(?<!has )(?<!have )(?<!been )(?<!is )(?<!are )\b(?!cent(?:re|ere)d|occluded|\w*speed|need|indeed|exceed)\w{2,}ed\b|\b(?:went|came|rose|fell|flew|ran|shot|made|took)\b|了"
+)
+
+
+class Moments:
+    """The certain moments of one clause."""
+
+    def __init__(self, sentence: Sentence, clause: Clause) -> None:
+        self.sentence, self.clause = sentence, clause
+        self.text, self.language = sentence.text, sentence.language
+
+    def frames(self, numeral: Numeral, *, is_value: bool) -> tuple[int, ...] | None:
+        """Give the frame of which a number surely is. is_value: it is no change, whatever else it may be."""
+        frame = self.beside(numeral)
+        if frame is None:
+            frame = self._only_moment()
+        if frame is None and not self.clause.of("time"):
+            frame = self._headed_moment()
+        if frame is not None:
+            return (frame,)
+        following = [n.start for n in self._measured() if n.start > numeral.start]
+        after = following[0] if following else self.clause.end
+        if _ELSEWHERE[self.language].search(self._without_todays(numeral)):
+            return None
+        if _LATER[self.language].search(self.text, numeral.end, after):
+            return None
+        for time in self.clause.of("time"):
+            if time.value == "until" and 0 <= numeral.start - time.end <= 1:
+                continue  # "已降到 17.8 米"
+            is_next = (bool(following) and time.end >= after - 2) or (
+                time.start >= numeral.end and time.value in ("since", "past")
+            )
+            if time.start < after and not is_next and time.value not in self._todays(numeral):
+                return None
+        return (NOW,) if self._is_told_of_now(numeral, is_value=is_value) else None
+
+    def _without_todays(self, numeral: Numeral) -> str:
+        """Give what stands before a number in its clause, without the words for its own moment."""
+        part, at = "", self.clause.start
+        for time in self.clause.of("time", *self._todays(numeral)):
+            if at <= time.start and time.end <= numeral.start:
+                part, at = part + self.text[at : time.start], time.end
+        return part + self.text[at : numeral.start]
+
+    def _measured(self) -> list[Numeral]:
+        numerals = [self.sentence.numerals[i] for i in self.clause.numerals]
+        return [n for n in numerals if n.unit not in ("s", "frames")]
+
+    @staticmethod
+    def _todays(numeral: Numeral) -> tuple[str, ...]:
+        return ("now", "last_step") if numeral.unit == "mps" else ("now",)  # a speed is that of the step before it
+
+    def _is_told_of_now(self, numeral: Numeral, *, is_value: bool) -> bool:
+        """Tell whether a clause without a time speaks of now: it names its own quantity or owner, or nothing before it was of another time."""
+        since = self.text.rfind(";", 0, self.clause.start) + 1
+        before = [c for c in self.sentence.clauses if since <= c.start and c.end <= self.clause.start]
+        if self.clause.has("time", *self._todays(numeral)):
+            return True
+        is_own = is_value and self.clause.has("quantity")
+        told = "" if is_own else self.text[since : self.clause.start]
+        return all(_reaches_now(c) for c in before) and not _PAST.search(told)
+
+    def beside(self, numeral: Numeral) -> int | None:
+        match = _MOMENT_AFTER[self.language].match(self.text, numeral.end)
+        match = match or _MOMENT_BEFORE[self.language].search(self.text, max(0, numeral.start - _REACH), numeral.start)
+        if match is None:
+            return None
+        return NOW if match["frame"] is None else int(match["frame"])
+
+    def _only_moment(self) -> int | None:
+        """Give the one frame of a clause with one number: "at t1 the range still read 21.2 m"."""
+        times = times_of(self.clause)
+        if len(times) != 1 or len(times[0][1]) != 1 or len(self._measured()) != 1:
+            return None
+        if self.clause.has("time", *_SPANNING) or self.clause.has("link", "than", "from", "between"):
+            return None
+        return times[0][1][0]
+
+    def _headed_moment(self) -> int | None:
+        """Give the frame under which a sentence stands: "t4 log: height 18.3 m, range 22.5 m"."""
+        head = self.sentence.clauses[0]
+        times = times_of(head)
+        if head.numerals or len(times) != 1 or len(times[0][1]) != 1 or not self.text.startswith(":", head.end):
+            return None
+        return times[0][1][0]
+
+    def span(self) -> tuple[int, int] | None:
+        """Give the two frames between which a clause tells of a change."""
+        spans = [_SPANS[t.value] for t in self.clause.of("time", *_SPANS)]
+        named = [
+            (t, frames[0])
+            for t, frames in times_of(self.clause)
+            if len(frames) == 1 and frames != (NOW,) and t.value not in _SPANS
+        ]
+        before = [t.end for t in (*self.clause.of("time", "since"), *self.clause.of("link", "than"))]
+        spans += [(frame, NOW) for t, frame in named if any(0 <= t.start - end <= 6 for end in before)]
+        return spans[0] if len(set(spans)) == 1 and len(named) <= 1 else None
+
+
+def _reaches_now(clause: Clause) -> bool:
+    """Tell whether a clause names no time that ends before now."""
+    since = [t.end for t in clause.of("time", "since")]
+    return all(
+        t.value.partition(":")[0] in _TODAY
+        or (t.value[0] == "t" and any(0 <= t.start - end <= 2 for end in since))
+        or t.value == "since"
+        for t in clause.of("time")
+    )
+
+
+# Times that reach up to now: what goes on after them without a time is told of now.
+_TODAY = ("now", "window", "last_step", "last_second", "last", "last_s", "mean")
+_SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}
+_MOMENT_BEFORE = {
+    "en": re.compile(r"(?:\bt(?P<frame>\d)|\b(?P<now>now|currently))\s*(?::|=|at|is|was|of|stands at|stood at|reads|read|about|only|just|a)*\s*$"),
+    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
+}  # fmt: skip
+_MOMENT_AFTER = {
+    "en": re.compile(r"\s*(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|to\b|and\b|~|→|,? ?t\d))|(?P<now>now|at present|currently)\b(?! than))"),
+    "zh": re.compile(r"\s*\(\s*t(?P<frame>\d)\s*时?\s*\)"),
+}  # fmt: skip
+_REACH = 30  # letters before a number in which its frame stands
+_SPANNING = ("since", "until", "window", "last_step", "last_second", "max", "min", "mean")
