@@ -20,6 +20,7 @@ from cosfly.maps.cityjson_file import read_model, rule_of
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
 from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
 from cosfly.maps.stage import MapsConfig, load_map, run
+from cosfly.maps.synthetic import PRESETS
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -109,6 +110,55 @@ def test_towns_of_other_sizes(size_m, num_blocks):
     low, high = town.bounds()
     np.testing.assert_allclose((high - low)[:2], size_m)
     assert "Buildings" in town.counts()
+
+
+OTHER_TOWNS = sorted(set(PRESETS) - {"small_town", "town10"})
+HIGHEST_M = {"village": (5, 15), "park": (5, 15), "market": (9, 22), "old_town": (10, 20), "towers": (60, 125)}
+
+
+@pytest.mark.parametrize("preset", OTHER_TOWNS)
+def test_a_preset_is_a_town_to_walk_in(preset):
+    town = load_map(build(MapsConfig, {"synthetic": {"preset": preset}}, "x"), seed=1)
+    houses = boxes_of(town, "Buildings")
+    low_m, high_m = HIGHEST_M.get(preset, (12, 40))
+    assert low_m < houses.maxs[:, 2].max() < high_m
+    shapes = united([footprint(houses, row) for row in range(len(houses))])
+    vehicles = boxes_of(town, "Car", "Truck")
+    assert not any(footprint(vehicles, row).intersects(shapes) for row in range(len(vehicles)))
+    result = simplify(town, SimplifyConfig())
+    walkable = cross_validate(town, result.box_map)
+    assert walkable["simplified_largest_part_m2"] > 0.9 * walkable["simplified_walkable_m2"]  # a river has bridges
+    assert walkable["simplified_largest_part_m2"] > 20_000
+
+
+def test_presets_differ_in_plan_density_and_height():
+    shares, heights = {}, {}
+    for preset in OTHER_TOWNS:
+        town = load_map(build(MapsConfig, {"synthetic": {"preset": preset}}, "x"), seed=1)
+        houses = boxes_of(town, "Buildings")
+        built_m2 = united([footprint(houses, row) for row in range(len(houses))]).area
+        low, high = town.bounds()
+        shares[preset], heights[preset] = built_m2 / np.prod((high - low)[:2]), houses.maxs[:, 2].max()
+    assert max(shares.values()) > 4 * min(shares.values())
+    assert max(heights.values()) > 4 * min(heights.values())
+    assert len({round(share, 2) for share in shares.values()}) >= len(OTHER_TOWNS) - 2
+
+
+def test_what_is_given_wins_over_the_preset():
+    cfg = build(MapsConfig, {"synthetic": {"preset": "river", "river_m": 30, "num_blocks": 3}}, "x").synthetic
+    assert (cfg.river_m, cfg.num_blocks, cfg.street_m) == (30, 3, PRESETS["river"]["street_m"])
+    assert build(MapsConfig, {"synthetic": cfg.model_dump(mode="json")}, "x").synthetic == cfg  # as `run.yaml` is read
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"preset": "rivers"}, "did you mean 'river'"), ({"blocks": {"markt": 1}}, "did you mean 'market'"),
+     ({"blocks": {"park": -1, "market": 2}}, "negative"), ({"blocks": {"park": 0}}, "more than 0"),
+     ({"preset": ["park"]}, "valid string"), ({"num_blocks": 4, "unevenness": 0.5}, "raise size_m")],
+)  # fmt: skip
+def test_a_wrong_town_is_a_config_error(given, words):
+    with pytest.raises(ConfigError, match=words):
+        build(MapsConfig, {"synthetic": given}, "x")
 
 
 # --- simworld ---------------------------------------------------------------------------------------------------------

@@ -179,4 +179,135 @@ def _towers(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
         tree(boxes, low + size * place, rng.uniform(3.2, 4.4), rng.uniform(6.0, 9.0), rng, in_parts=rng.random() < 0.5)
 
 
-BLOCKS = {"park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers}
+def _lanes(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Terraces of narrow old houses of unlike heights, with paved lanes between them."""
+    _ground(boxes, "Sidewalks", low, high)
+    lane, depth = 5.6, 8.5
+    rows = max(2, int((high[1] - low[1] + lane) // (depth + lane)))
+    depth = (high[1] - low[1] - (rows - 1) * lane) / rows
+    gap_row = rng.integers(rows)
+    for row in range(rows):
+        base, at = low[1] + row * (depth + lane), low[0]
+        passage = rng.uniform(0.35, 0.65) * (high[0] - low[0]) + low[0]  # a way through the terrace
+        while at < high[0] - 4.0:
+            width = min(rng.uniform(5.5, 9.0), high[0] - at)
+            height, ridge = rng.uniform(6.5, 13.0), rng.uniform(1.6, 2.6)
+            is_passage = at <= passage < at + width
+            if not is_passage:
+                _between(boxes, (at, base), (at + width, base + depth), -1.0, height)
+                _between(
+                    boxes,
+                    (at + 0.2, base + depth * 0.28),
+                    (at + width - 0.2, base + depth * 0.72),
+                    height,
+                    height + ridge,
+                )
+            at += width if not is_passage else lane
+        if row == gap_row:
+            bench(boxes, 0, passage, base - lane / 2 if row else base + depth + lane / 2, rng)
+
+
+def _skyscrapers(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Three towers of unlike height on a plaza, with a colonnade of trees."""
+    _ground(boxes, "Sidewalks", low, high)
+    size = high - low
+    for place in ((0.25, 0.27), (0.74, 0.34), (0.42, 0.76)):
+        center, foot = low + size * place, size * rng.uniform(0.24, 0.32, 2)
+        height, yaw = rng.uniform(40.0, 110.0), float(rng.choice([0.0, 0.0, 20.0, -30.0]))
+        boxes.add("Buildings", center, foot, -2.0, height * 0.6, yaw)
+        boxes.add("Buildings", center, foot * 0.75, height * 0.6, height, yaw)
+        boxes.add("Poles", center, (0.6, 0.6), height, height + 9.0)
+        boxes.add("Buildings", center, (4.0, 4.0), 0.5, height * 0.55, yaw)  # the lift shaft, inside
+    for along in np.arange(low[0] + 5.0, high[0] - 4.0, 9.0):
+        tree(boxes, (along, high[1] - 3.5), rng.uniform(3.0, 4.0), rng.uniform(6.0, 9.0), rng)
+    bench(boxes, 0, low[0] + size[0] * 0.75, low[1] + size[1] * 0.75, rng)
+
+
+def _campus(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Two long halls and a library round a lawn, with paths from door to door."""
+    _ground(boxes, "Terrain", low, high)
+    size, middle = high - low, (low + high) / 2
+    for y in (low[1] + size[1] * 0.14, high[1] - size[1] * 0.14):
+        long = np.array([size[0] * rng.uniform(0.62, 0.8), size[1] * 0.17])
+        height = rng.uniform(8.0, 15.0)
+        boxes.add("Buildings", (middle[0], y), long, -1.0, height)
+        boxes.add("Buildings", (middle[0], y), (long[0] * 0.3, long[1] * 0.6), height, height + 2.8)
+        boxes.add(
+            "Buildings", (middle[0], y), (long[0] * 0.9, long[1] * 0.5), 0.2, height - 1.0
+        )  # lecture rooms inside
+    library = (high[0] - size[0] * 0.14, middle[1])
+    boxes.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
+    for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):
+        boxes.add_span("Sidewalks", (low[0], y - 1.5), (high[0] - size[0] * 0.28, y + 1.5), -SLAB_M, PAVEMENT_TOP_M)
+        bench(boxes, 0, low[0] + size[0] * 0.3, y + 2.4, rng)
+    for _ in range(6):
+        place = rng.uniform(low + size * (0.06, 0.3), low + size * (0.66, 0.7))
+        tree(boxes, place, rng.uniform(4.0, 6.0), rng.uniform(7.0, 12.0), rng, in_parts=rng.random() < 0.5)
+
+
+def _farm(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """A farmhouse and a barn at a yard, an orchard in rows, a field behind a dry wall."""
+    _ground(boxes, "Terrain", low, high)
+    size = high - low
+    yaw = rng.uniform(-10.0, 10.0)
+    house, barn = low + size * (0.24, 0.2), low + size * (0.3, 0.62)
+    boxes.add("Buildings", house, (12.0, 8.5), -0.5, 5.6, yaw)
+    boxes.add("Buildings", house, (11.0, 4.4), 5.6, 7.8, yaw)
+    boxes.add("Buildings", barn, (17.0, 10.0), -0.3, 6.2, yaw + 90.0)
+    boxes.add("Buildings", barn, (16.0, 5.0), 6.2, 8.6, yaw + 90.0)
+    boxes.add("Static", low + size * (0.44, 0.4), (2.6, 1.6), 0.0, 1.2, yaw)  # a cart
+    for x in np.arange(low[0] + size[0] * 0.56, high[0] - 3.0, 6.5):
+        for y in np.arange(low[1] + 4.0, low[1] + size[1] * 0.55, 6.5):
+            if rng.random() < 0.9:
+                tree(
+                    boxes,
+                    np.array([x, y]) + rng.uniform(-0.5, 0.5, 2),
+                    rng.uniform(2.4, 3.4),
+                    rng.uniform(3.5, 5.0),
+                    rng,
+                )
+    wall = low[1] + size[1] * 0.66
+    for a, b in ((0.52, 0.72), (0.8, 1.0)):  # with a gate
+        boxes.add_span("Walls", (low[0] + size[0] * a, wall - 0.3), (low[0] + size[0] * b, wall + 0.3), -0.2, 1.0)
+    tree(boxes, low + size * (0.12, 0.42), rng.uniform(5.0, 7.0), rng.uniform(9.0, 13.0), rng, in_parts=True)
+
+
+def _market(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Rows of stalls with awnings round a market hall."""
+    _ground(boxes, "Sidewalks", low, high)
+    size, middle = high - low, (low + high) / 2
+    hall = size * (0.34, 0.26)
+    boxes.add("Buildings", middle, hall, -0.5, 7.0)
+    boxes.add("Buildings", middle, hall * (0.9, 0.4), 7.0, 9.5)
+    for y in np.arange(low[1] + 4.0, high[1] - 3.0, 7.0):
+        for x in np.arange(low[0] + 4.0, high[0] - 3.0, 5.2):
+            clear = (np.abs(np.array([x, y]) - middle) > hall / 2 + 3.5).any()
+            if clear and rng.random() < 0.7:
+                yaw = rng.uniform(-6.0, 6.0)
+                boxes.add("Static", (x, y), (2.6, 1.6), 0.0, 1.0, yaw)
+                boxes.add("Static", (x, y), (3.2, 2.4), 2.3, 2.5, yaw)  # the awning
+                boxes.add("Poles", (x - 1.2, y), (0.1, 0.1), 0.0, 2.3)
+                boxes.add("Poles", (x + 1.2, y), (0.1, 0.1), 0.0, 2.3)
+    for x in (low[0] + 2.5, high[0] - 2.5):
+        tree(boxes, (x, middle[1]), rng.uniform(3.5, 4.5), rng.uniform(7.0, 9.0), rng, in_parts=True)
+
+
+def _meadow(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """Open grass with a path along it, two groves and a pavilion: room for a drone to circle."""
+    _ground(boxes, "Terrain", low, high)
+    size, middle = high - low, (low + high) / 2
+    boxes.add_span("Sidewalks", (low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5), -SLAB_M, PAVEMENT_TOP_M)
+    for corner in (low + size * (0.18, 0.2), low + size * (0.8, 0.8)):
+        for _ in range(4):
+            tree(boxes, corner + rng.uniform(-5.0, 5.0, 2), rng.uniform(4.0, 6.0), rng.uniform(7.0, 12.0), rng)
+    boxes.add("Static", low + size * (0.78, 0.24), (5.0, 5.0), 2.7, 3.4)
+    for dx in (-2.2, 2.2):
+        for dy in (-2.2, 2.2):
+            boxes.add("Poles", low + size * (0.78, 0.24) + (dx, dy), (0.2, 0.2), 0.0, 2.7)
+    bench(boxes, 0, middle[0], middle[1] + 2.4, rng)
+
+
+BLOCKS = {
+    "park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers, "lanes": _lanes,
+    "skyscrapers": _skyscrapers, "campus": _campus, "farm": _farm, "market": _market, "meadow": _meadow,
+}  # fmt: skip
