@@ -26,7 +26,7 @@ import release.package
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
-from cosfly.settings import RunConfig, num_workers
+from cosfly.settings import RunConfig, manner_of_work
 from cosfly.stage_folder import Manifest, Resume, read_manifest
 from cosfly.store import read_json, refuse_link, write_bytes, write_json
 from release.sources import Source, choose_licence
@@ -54,7 +54,7 @@ class StageResult:
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
     """Give the stages of a run in order; each works in the folder of its name."""
-    seed, workers = cfg.seed, num_workers(cfg.workers)
+    seed, working = cfg.seed, manner_of_work(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
     inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
@@ -67,12 +67,12 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
     return [
         stage("maps", boxes, cosfly.maps.stage.run, seed=seed),
         stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
-        stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, workers=workers),
-        stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, workers=workers),
-        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, workers=workers),
-        stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, workers=workers),
-        stage("caption", captions, caption.run.stage.run, tree, seed=seed, workers=workers),
-        stage("release", out / "release/dataset", release.package.run, whole, workers=workers),
+        stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **working),
+        stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, **working),
+        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, **working),
+        stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
+        stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
+        stage("release", out / "release/dataset", release.package.run, whole, **working),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Items to work, on this machine: a process pool with resume, progress, a tally that adds up and a record per failure.
+"""Items to work, on this machine: worker processes with resume, progress, a tally that adds up and a record per failure.
 
 `run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and `make_worker`, a
 module-level function that is called once in each worker process with `worker_args` and returns the function that does one
@@ -9,42 +9,22 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import logging.handlers
-import multiprocessing
-import signal
-import time
-import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 
-from cosfly.console import progress_bar, set_levels
-from cosfly.errors import CosflyError, EnvironmentMissing
+from cosfly.console import progress_bar
+from cosfly.errors import EnvironmentMissing
+from cosfly.items import Item, Outcome, Work, advance, attempt, counted_steps
+from cosfly.stage_events import EventLog
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
+from cosfly.store import remove_partials
+from cosfly.worker_pool import Watch, WorkerPool
+
+__all__ = ["Finished", "Item", "Outcome", "Watch", "Work", "advance", "run_items"]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Item:
-    """One unit of work. `item_id` is unique within the stage and stable between runs."""
-
-    item_id: str
-    payload: Any = None
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of an item that did not fail: `result` is JSON-able, `drop_reason` is None for a kept item."""
-
-    result: dict = field(default_factory=dict)
-    drop_reason: str | None = None
-
-
-Work = Callable[[Item], Outcome]
 
 
 @dataclass(frozen=True)
@@ -65,45 +45,53 @@ def run_items(
     make_worker: Callable[..., Work],
     worker_args: tuple = (),
     *,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     label: str | None = None,
 ) -> Finished:
     """Do all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage, and
-    what was finished stays. A worker that dies (out of memory, kill) costs only its items, which get one more try each, alone; if one
-    dies again, the other items are finished first and the stage then stops, unfinished.
+    what was finished stays. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two more tries, the
+    last one alone. An item that stalls again has failed; if one's worker dies again, the others are finished first and the
+    stage then stops, unfinished.
     On a later run kept and dropped items are taken from the journal and failed ones are tried again.
 
     Args:
         make_worker: module-level function; `make_worker(*worker_args)` returns the work function, once in each process.
-        workers: processes; 1 works in this process.
+        workers: processes; 0 works in this process, where nothing can end an item that hangs.
+        watch: when a worker counts as stalled.
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
     """
     ids = [item.item_id for item in items]
     assert len(set(ids)) == len(ids), "item ids must be unique"
-    with stage.journal as journal:
-        known = set(ids)
-        records: dict[str, ItemRecord] = {}
-        records |= {r.id: r for r in stage.items() if r.id in known and not isinstance(r, Failed)}
-        todo = [item for item in items if item.item_id not in records]
-        if records:
-            log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
-        with progress_bar(label or stage.stage, total=len(items), done=len(records)) as advance:
-            for record in _outcomes(todo, make_worker, worker_args, workers):
-                records[record.id] = record
-                journal.append(record.model_dump())
-                if isinstance(record, Failed):
-                    named = "" if record.id in record.message else f"{record.id}: "
-                    log.error("%s: %s%s", stage.stage, named, record.message)
-                advance(1)
+    known = set(ids)
+    records: dict[str, ItemRecord] = {}
+    records |= {r.id: r for r in stage.items() if r.id in known and not isinstance(r, Failed)}
+    todo = [item for item in items if item.item_id not in records]
+    if records:
+        log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
+    progress = _Progress(items, records.keys())
+    if workers and todo:
+        outcomes = _in_processes(stage, todo, (make_worker, worker_args), workers, watch, progress.move)
+    else:
+        outcomes = _in_this_process(todo, (make_worker, worker_args), progress.move)
+    # Closed at once, also while an error is on its way: no worker goes on behind it.
+    with stage.journal as journal, progress.shown(label or stage.stage), contextlib.closing(outcomes):
+        for record in outcomes:
+            records[record.id] = record
+            journal.append(record.model_dump())
+            if isinstance(record, Failed):
+                named = "" if record.id in record.message else f"{record.id}: "
+                log.error("%s: %s%s", stage.stage, named, record.message)
+            progress.finish(record.id)
     ordered = [records[item_id] for item_id in ids]
     tally = _tally(stage, ordered)
     if "worker_died" in tally.failed:
         # That is the machine's doing, not the item's: it must not become a result. The stage stays open.
         raise EnvironmentMissing(
-            "worker processes were killed, twice for the same item",
+            "worker processes were killed, three times for the same item",
             where=stage.path,
             got=f"{tally.failed['worker_died']} of {len(ordered)} items without an outcome",
             fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
@@ -119,111 +107,63 @@ def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:
     return Tally(input=len(records), kept=kept, dropped=dropped, failed=Counter(failure.code for failure in failures))
 
 
-def _outcomes(items: list[Item], make_worker: Callable, worker_args: tuple, workers: int) -> Iterator[ItemRecord]:
-    if workers <= 1 or len(items) <= 1:
-        work = make_worker(*worker_args) if items else None
-        for item in items:
-            yield _attempt(work, item)
+_Start = tuple[Callable[..., Work], tuple]  # make_worker, worker_args
+
+
+def _in_this_process(
+    items: Sequence[Item], start: _Start, on_steps: Callable[[str, int], None]
+) -> Generator[ItemRecord, None, None]:
+    if not items:
         return
-    suspects: list[Item] = []  # in flight when a worker died: each gets one more try, alone
-    yield from _pooled(items, make_worker, worker_args, workers, suspects)
-    for item in suspects:
-        again: list[Item] = []
-        yield from _pooled([item], make_worker, worker_args, 1, again)
-        if again:
-            message = f"{item.item_id}: its worker process died twice; it may need more memory than there is"
-            yield Failed(id=item.item_id, code="worker_died", message=message)
+    make_worker, worker_args = start
+    work = make_worker(*worker_args)
+    for item in items:
+        with counted_steps(partial(on_steps, item.item_id)):
+            record = attempt(work, item)
+        yield record
 
 
-def _pooled(
-    items: list[Item], make_worker: Callable, worker_args: tuple, workers: int, suspects: list[Item]
-) -> Iterator[ItemRecord]:
-    """Run items on a pool; those in flight when a worker died are put into `suspects`, the others run on a new pool."""
-    context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
-    waiting = list(reversed(items))
-    logs = context.Queue()
-    listener = logging.handlers.QueueListener(logs, *logging.getLogger().handlers, respect_handler_level=True)
-    listener.start()
+def _in_processes(
+    stage: StageFolder,
+    items: Sequence[Item],
+    start: _Start,
+    workers: int,
+    watch: Watch,
+    on_steps: Callable[[str, int], None],
+) -> Generator[ItemRecord, None, None]:
+    events = EventLog(stage.path)
+    pool = WorkerPool(*start, min(workers, len(items)), watch, events, on_steps)
     try:
-        while waiting:
-            pool = ProcessPoolExecutor(
-                min(workers, len(waiting)),
-                context,
-                _start_worker,
-                (make_worker, worker_args, logs, logging.getLogger().level),
-            )
-            running: dict[Future, Item] = {}
-            try:
-                while waiting or running:
-                    while waiting and len(running) < 2 * workers:  # a short queue keeps every worker fed
-                        with _no_interrupt():  # a worker that starts here inherits the mask
-                            running[pool.submit(_attempt_in_worker, waiting[-1])] = waiting[-1]
-                        waiting.pop()
-                    done, _ = wait(running, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        record = future.result()  # raises a fatal CosflyError, or BrokenProcessPool
-                        del running[future]
-                        yield record
-            except BrokenProcessPool:
-                suspects.extend(running.values())
-                log.warning("a worker process died; its items get one more try")
-            except KeyboardInterrupt:
-                for process in multiprocessing.active_children():
-                    process.terminate()  # what they had in hand is done again by the next run
-                raise
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
+        yield from pool.outcomes(items)
     finally:
-        listener.stop()
+        events.close()
+    if pool.num_lost:
+        remove_partials(stage.path)  # what the lost workers had in hand
 
 
-@contextlib.contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Hold back Ctrl-C: it would hit a starting worker in the middle of an import, which prints a traceback."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+class _Progress:
+    """How far a stage is: in steps, as frames, where every item says how many it has, else in items."""
 
+    def __init__(self, items: Sequence[Item], done: Collection[str]) -> None:
+        sizes = {item.item_id: item.num_steps for item in items}
+        self._in_steps = all(sizes.values())
+        self._sizes = {item_id: size or 1 if self._in_steps else 1 for item_id, size in sizes.items()}
+        self._at = {item_id: self._sizes[item_id] for item_id in done}
+        self._advance: Callable[[int], None] = lambda count: None
 
-_work: Work | None = None  # this worker process's function
-_start_error: Exception | None = None
+    @contextlib.contextmanager
+    def shown(self, label: str) -> Iterator[None]:
+        with progress_bar(label, total=sum(self._sizes.values()), done=sum(self._at.values())) as self._advance:
+            yield
 
+    def move(self, item_id: str, num_steps: int) -> None:
+        """Note how many steps of an item are done; fewer than before where it is begun again."""
+        if self._in_steps:
+            self._set(item_id, min(num_steps, self._sizes[item_id]))
 
-def _start_worker(make_worker: Callable, worker_args: tuple, logs: Any, level: int) -> None:
-    global _work, _start_error
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker at once; only the main process speaks of it
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    root = logging.getLogger()
-    root.handlers = [logging.handlers.QueueHandler(logs)]
-    set_levels(level)
-    try:
-        _work = make_worker(*worker_args)
-    except Exception as error:
-        _start_error = error  # raised by the first item: in an initializer it would pass for a worker that was killed
+    def finish(self, item_id: str) -> None:
+        self._set(item_id, self._sizes[item_id])
 
-
-def _attempt_in_worker(item: Item) -> ItemRecord:
-    if _start_error is not None:
-        raise _start_error
-    return _attempt(_work, item)
-
-
-def _attempt(work: Work | None, item: Item) -> ItemRecord:
-    """Do one item and give its record. Only a fatal error gets out."""
-    assert work is not None
-    start_s = time.monotonic()
-    try:
-        outcome = work(item)
-    except CosflyError as error:
-        if error.fatal:
-            raise
-        return Failed(id=item.item_id, code=error.code, message=str(error))
-    except Exception as error:  # the item boundary: a bug in one item must not lose the others
-        log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
-        return Failed(id=item.item_id, code="bug", message=f"{type(error).__name__}: {error}")
-    seconds = round(time.monotonic() - start_s, 3)
-    if outcome.drop_reason is None:
-        return Kept(id=item.item_id, result=outcome.result, seconds=seconds)
-    return Dropped(id=item.item_id, result=outcome.result, reason=outcome.drop_reason, seconds=seconds)
+    def _set(self, item_id: str, count: int) -> None:
+        self._advance(count - self._at.get(item_id, 0))
+        self._at[item_id] = count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -15,6 +16,7 @@ from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.stage import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
+from cosfly.worker_pool import Watch
 from distill.dataset import PrepareConfig
 from distill.evaluate import EvaluateConfig
 from distill.infer import InferConfig
@@ -39,6 +41,12 @@ class RunConfig(Config):
     )
     seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
     workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
+    item_limit_s: float | None = Field(
+        None,
+        ge=0,
+        description="seconds that an item may take without getting on (a flight: without a new frame), then its worker is ended and the "
+        "item tried again, twice; null for 600 or 20 times what items take, whichever is more; 0 for no limit",
+    )
     max_failed: int = Field(
         0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
     )
@@ -56,5 +64,6 @@ class RunConfig(Config):
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 
 
-def num_workers(setting: int) -> int:
-    return setting or len(os.sched_getaffinity(0))
+def manner_of_work(cfg: RunConfig) -> dict[str, Any]:
+    """Give the arguments that all stages with items take: processes, and when one counts as stalled."""
+    return {"workers": cfg.workers or len(os.sched_getaffinity(0)), "watch": Watch(item_limit_s=cfg.item_limit_s)}

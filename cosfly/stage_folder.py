@@ -48,7 +48,8 @@ log = logging.getLogger(__name__)
 
 Resume = Literal["never", "if-same", "force"]
 
-BEGUN = ("stage.json", "items.jsonl", "failures.jsonl")  # what stands in a folder before anything is finished
+# What stands in a folder before anything is finished.
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", "events.jsonl")
 
 
 # --- what became of the items -----------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.playback import read_flight
-from cosfly.runner import Finished, Item, Outcome, Work, run_items
+from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_file, write_bytes, write_checksums
 from release import columns
@@ -115,6 +115,7 @@ def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[lis
     batch: list[dict[str, Any]] = []
     num_bytes = 0
     for row in rows:
+        advance()
         batch.append(row)
         for file in cfg.modalities:
             value = row[columns.PICTURES[file].name]
@@ -200,7 +201,15 @@ def make_worker(cfg: ReleaseConfig, parts: Path) -> Work:
     return work
 
 
-def run(cfg: ReleaseConfig, sources: list[Source], out: Path, *, workers: int = 1, resume: Resume = "if-same") -> Path:
+def run(
+    cfg: ReleaseConfig,
+    sources: list[Source],
+    out: Path,
+    *,
+    workers: int = 0,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
+) -> Path:
     """Read the playback tree, the captions and the inspection of each run; write `dataset/` and give its path."""
     inputs = {
         f"{number}.{name}" if len(sources) > 1 else name: getattr(source, name)
@@ -219,7 +228,7 @@ def run(cfg: ReleaseConfig, sources: list[Source], out: Path, *, workers: int = 
     maps = [(shown.town, shown.licence) for shown in material.maps]
     licence = choose_licence(cfg.licence, maps)  # before the work, not after it
     items = [Item(chosen.name, chosen) for chosen in material.chosen]
-    finished = run_items(stage, items, make_worker, (cfg, parts), workers=workers, label="release")
+    finished = run_items(stage, items, make_worker, (cfg, parts), workers=workers, watch=watch, label="release")
     results = {record.id: record.result for record in finished.kept}
     if not results:
         raise stage.nothing_kept(finished.tally)

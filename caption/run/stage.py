@@ -28,7 +28,7 @@ from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.products.playback import flight_of
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest
 from cosfly.store import write_json
 
@@ -45,7 +45,8 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
     retry_failed: bool = False,
 ) -> Path:
@@ -75,7 +76,7 @@ def run(
     allotted, is_cut = allot(named_flights(data), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
-        asked = Asked(_run_embedded(stage, allotted, cfg, seed, workers))
+        asked = Asked(_run_embedded(stage, allotted, cfg, seed, workers, watch))
     else:
         if retry_failed:
             _take_back(stage, allotted)
@@ -173,10 +174,12 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
 # --- embedded teachers ------------------------------------------------------------------------------------------------
 
 
-def _run_embedded(stage: StageFolder, allotted: list[Allotted], cfg: CaptionConfig, seed: int, workers: int) -> Tally:
+def _run_embedded(
+    stage: StageFolder, allotted: list[Allotted], cfg: CaptionConfig, seed: int, workers: int, watch: Watch
+) -> Tally:
     items = [Item(flight.item_id, flight) for flight in allotted]
     args = (cfg, stage.path, seed)
-    return run_items(stage, items, make_worker, args, workers=workers, label="caption").tally
+    return run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption").tally
 
 
 def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
@@ -194,7 +197,10 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 
 
 async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path) -> int:
-    captions = [await caption_window(window, teacher, cfg) for window in flight.windows(cfg)]
+    captions = []
+    for window in flight.windows(cfg):
+        captions.append(await caption_window(window, teacher, cfg))
+        advance()
     if captions:
         write_captions(flight.part(stage_path), captions)
     return len(captions)

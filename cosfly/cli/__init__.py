@@ -5,6 +5,7 @@ Nothing heavy is imported before a command runs, so that `cosfly --help` is inst
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import Annotated
 
@@ -18,7 +19,8 @@ from cosfly.cli.run import app as run_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.errors import CosflyError
 
-INTERRUPTED = 130  # the exit code of Ctrl-C: Typer makes it of a KeyboardInterrupt, without a word
+# The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
+ENDED = {130: "interrupted", 143: "terminated"}
 
 app = typer.Typer(
     help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
@@ -47,14 +49,17 @@ def _root(
 
 def main() -> None:
     """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
+    signal.signal(
+        signal.SIGTERM, lambda number, frame: sys.exit(128 + number)
+    )  # as Ctrl-C: workers end, locks are let go
     try:
         app()
     except CosflyError as error:
         _fail(str(error), 1)
     except SystemExit as end:
-        if end.code != INTERRUPTED:
+        if end.code not in ENDED:
             raise
-        _fail("interrupted; finished work is kept: run the same command again to continue", INTERRUPTED)
+        _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
 
 
 def _fail(message: str, status: int) -> None:

@@ -65,9 +65,9 @@ def _config_path(config: Path | None) -> Path | None:
 
 def manner(cfg: RunConfig, resume: Resume) -> dict[str, Any]:
     """How a stage works, whatever it makes: arguments that all stages with workers take."""
-    from cosfly.settings import num_workers
+    from cosfly.settings import manner_of_work
 
-    return {"workers": num_workers(cfg.workers), "resume": resume}
+    return manner_of_work(cfg) | {"resume": resume}
 
 
 def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:

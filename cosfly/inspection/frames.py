@@ -31,6 +31,7 @@ from cosfly.products.frames import (
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.runner import advance
 from cosfly.store import CHECKSUMS, read_checksums, sha256_file
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -102,6 +103,7 @@ def check_files(flight: Flight, report: Report) -> list[int]:
             "note", "not_in_this_tree", f"{FRAMES_DIR}/*/{name}", "no such file", "one a frame, in cosfly's trees"
         )
     for i in range(len(flight)):
+        advance()
         problems_before = len(report.issues)
         for name in names:
             path, where = flight.frame_folder(i) / name, f"{frame_name(i)}/{name}"
@@ -161,6 +163,7 @@ def check_checksums(flight: Flight, report: Report) -> None:
         report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
         return
     for name, digest in digests.items():
+        advance()
         path = flight.folder / name
         if not path.is_file():
             report.error("missing_file", name, "no such file", f"a file, listed in {CHECKSUMS}")
@@ -185,6 +188,7 @@ def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float,
     numbers = FrameNumbers()
     previous: tuple[int, np.ndarray] | None = None
     for i in indices:
+        advance()
         frame, where = flight.frame_folder(i), frame_name(i)
         broken = False
         for name in ("rgb.png", "instance.png"):

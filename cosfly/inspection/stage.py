@@ -24,7 +24,7 @@ from cosfly.products.inspection import (
 )
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.runner import Finished, Item, Outcome, Work, run_items
+from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder
 from cosfly.store import validation_errors
 
@@ -53,7 +53,8 @@ def run(
     data: Path,
     out: Path,
     *,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
     """Read the simplified map, the plans and the playback tree, write `inspect.json` and `report.html`; give the former's path.
@@ -73,7 +74,7 @@ def run(
     planned = None if traces is None else read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_flights(data)]
     items, arguments = [Item(name, name) for name in names], (cfg, simplified, traces, data)
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, label="inspect")
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect")
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
     write_report(out / "report.html", inspection, views)

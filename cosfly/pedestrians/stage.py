@@ -37,7 +37,7 @@ from cosfly.pedestrians.walking import arrival_times, menger_curvature, resample
 from cosfly.products.boxes import read_boxes
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, write_paths
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import write_bytes, write_json
 
@@ -179,7 +179,8 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
     roi: Path | None = None,
 ) -> Path:
@@ -206,7 +207,7 @@ def run(
     items = [Item(f"path_{k:05d}") for k in range(cfg.num_paths)]
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, label="walks")
+    finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, watch=watch, label="walks")
     if not finished.kept:
         raise stage.nothing_kept(finished.tally)
     results = [record.result for record in finished.kept]

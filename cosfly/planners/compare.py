@@ -23,7 +23,7 @@ from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
 from cosfly.store import read_json, write_bytes, write_json
 
@@ -187,7 +187,8 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
     """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and three pictures; gives the first.
@@ -208,7 +209,7 @@ def run(
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
     check_ids(walks, paths)
     items = [Item(walk.path_id, walk) for walk in walks]
-    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
+    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
     shared = finished.kept
     if not shared:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")

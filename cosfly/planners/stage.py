@@ -20,7 +20,7 @@ from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
 from cosfly.store import write_bytes
 
@@ -155,7 +155,8 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
     """Reads a simplified map and `path.json`, writes `drone_trace.json` and `plan.png`; gives the former's path.
@@ -176,7 +177,7 @@ def run(
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
     check_ids(walks, paths)
     items = [Item(walk.path_id, walk) for walk in walks]
-    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers)
+    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
     planned = [record for record in finished.records if not isinstance(record, Failed)]
     if not planned:
         raise stage.nothing_kept(finished.tally)

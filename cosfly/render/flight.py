@@ -21,6 +21,7 @@ from cosfly.render.camera import TargetView, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Gait
 from cosfly.render.perturbation import HIDDEN, Perturbed, Poses
+from cosfly.runner import advance
 from cosfly.store import sha256_bytes, sha256_file, storage_errors, write_checksums, write_json
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
@@ -97,6 +98,7 @@ def render_flight(
             visibility.append(seen.visibility)
             annotations.append(_annotation(script, i, seen))
             pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, annotations[i], writing))
+            advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
                 digests.update(pending.pop(0).result())
         for future in pending:

@@ -16,7 +16,7 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, XYZ, read_meta
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.playback import find_flights, read_flight
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import (
     CHECKSUMS,
@@ -35,7 +35,7 @@ class ConvertConfig(Config):
     """Nothing to set."""
 
 
-def run(data: Path, out: Path, *, workers: int = 1, resume: Resume = "if-same") -> Path:
+def run(data: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resume: Resume = "if-same") -> Path:
     """Reads an older playback tree `data`; writes the same flights into `out`, a new tree, and gives it.
 
     A kill loses the flights in work; run again to continue.
@@ -66,7 +66,7 @@ def run(data: Path, out: Path, *, workers: int = 1, resume: Resume = "if-same") 
     if stage.is_complete:
         return out
     items = [Item(folder.as_posix(), folder) for folder in folders]
-    finished = run_items(stage, items, make_worker, (data, out), workers=workers, label="convert-tree")
+    finished = run_items(stage, items, make_worker, (data, out), workers=workers, watch=watch, label="convert-tree")
     outputs = [out / _renamed(Path(record.id)) / "trajectory.json" for record in finished.kept]
     for town in towns:
         outputs += link_files(data / town, out / town_folder(town))

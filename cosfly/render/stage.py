@@ -29,7 +29,7 @@ from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, 
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
-from cosfly.runner import Item, Outcome, Work, run_items
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Kept, Resume, StageFolder, Tally
 from cosfly.store import CHECKSUMS, atomic_folder, dump_json, sha256_bytes, write_json
 
@@ -169,7 +169,8 @@ def run(
     out: Path,
     *,
     seed: int = 0,
-    workers: int = 1,
+    workers: int = 0,
+    watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
     """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance) and `drone_trace.json`; writes the playback tree.
@@ -196,10 +197,12 @@ def run(
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp})
     items = [
-        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track)) for number, trace in passed for track in cfg.tracks
+        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
+        for number, trace in passed
+        for track in cfg.tracks
     ]
     arguments = (cfg, boxes, simplified, traces, out, town, seed, min(workers, len(items)))
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, label="render")
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)

@@ -1,0 +1,123 @@
+"""`events.jsonl`: what happened to the workers of a stage, for people and `cosfly bench`. No product: nothing is decided by it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from cosfly.journal import Journal
+
+EVENTS = "events.jsonl"
+PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
+MEBIBYTE = 2**20
+
+Kind = Literal[
+    "began",  # workers: how many
+    "worker_started",
+    "restarted",
+    "item_done",  # status, seconds, steps
+    "heartbeat_lost",
+    "timed_out",
+    "worker_died",
+    "retried",  # attempt; steps: how many were lost
+    "given_up",
+    "probe",
+    "ended",
+]
+
+
+class Event(BaseModel):
+    """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it.
+
+    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    at_s: float
+    event: Kind
+    workers: int | None = None
+    worker: int | None = None
+    pid: int | None = None
+    item: str | None = None
+    status: str | None = None
+    seconds: float | None = None
+    steps: int | None = None
+    attempt: int | None = None
+    rss_mib: dict[int, float] | None = None
+    cores_used: float | None = None
+    disk_free_mib: float | None = None
+
+
+class EventLog:
+    """Adds to a stage's `events.jsonl`. A kill costs the line in hand."""
+
+    def __init__(self, folder: Path) -> None:
+        self._journal, self._folder = Journal(folder / EVENTS), folder
+        self._num_probes, self._pace, self._probed_s = 0, 1, time.monotonic()
+        self._peaks_mib: dict[int, float] = {}
+        self._cpu_s: dict[int, float] = {}  # by pid, at the probe before
+        self._used_s = 0.0  # by all workers since the last line
+
+    def tell(self, event: Kind, **fields: object) -> None:
+        line = Event.model_validate({"at_s": round(time.time(), 3), "event": event, **fields})
+        self._journal.append(line.model_dump(exclude_none=True), sync=False)
+
+    def probe(self, pids: Mapping[int, int]) -> None:
+        """Look at memory and processor time of the workers (place -> process id) and at the disk; not every look is written."""
+        for worker, pid in pids.items():
+            self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), rss_mib(pid))
+            cpu_s = cpu_seconds(pid)
+            self._used_s += max(0.0, cpu_s - self._cpu_s.get(pid, 0.0))
+            self._cpu_s[pid] = cpu_s
+        self._num_probes += 1
+        if self._num_probes % self._pace:
+            return
+        elapsed_s = time.monotonic() - self._probed_s
+        cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
+        free = shutil.disk_usage(self._folder).free / MEBIBYTE
+        self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1))
+        self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
+        if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
+            self._num_probes, self._pace = 0, 2 * self._pace
+
+    def close(self) -> None:
+        self._journal.close()
+
+
+def read_events(folder: Path) -> list[Event]:
+    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
+    events = []
+    for line in Journal(folder / EVENTS).read():
+        try:
+            events.append(Event.model_validate(line))
+        except ValidationError:
+            continue
+    return events
+
+
+# --- what the system says of a process --------------------------------------------------------------------------------
+
+
+def cpu_seconds(pid: int) -> float:
+    """Give the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime: proc(5)
+
+
+def rss_mib(pid: int) -> float:
+    """Give the resident memory of a process, MiB; 0 where the system does not tell, or it is gone."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
+    except OSError:
+        return 0.0
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1)

@@ -1,0 +1,143 @@
+"""A worker process: does the items that come through its pipe, tells that it lives, and ends when its parent does.
+
+`worker_pool` is the other end of the pipe.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import logging.handlers
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+from cosfly.console import set_levels
+from cosfly.errors import CosflyError
+from cosfly.items import Item, Work, attempt, counted_steps
+from cosfly.stage_folder import ItemRecord
+
+LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
+PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+@dataclass(frozen=True)
+class Sign:
+    """The process lives, and so many steps of the item in hand are done; item_id None: it is not at work on one."""
+
+    item_id: str | None
+    num_steps: int
+
+
+@dataclass(frozen=True)
+class Broken:
+    """The stage cannot go on: a fatal error, or the worker cannot be made."""
+
+    error: Exception
+
+
+Message = Sign | Broken | logging.LogRecord | ItemRecord
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a worker needs to begin; `make_worker` is a module-level function."""
+
+    make_worker: Callable[..., Work]
+    worker_args: tuple
+    heartbeat_s: float
+    log_level: int
+    parent_pid: int
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Hold back Ctrl-C and its like; a worker that starts here inherits that, or they would hit it in the middle of an import."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def work_through(connection: Connection, start: Start) -> None:
+    """Do items until None comes. Everything that is to be said goes back through the pipe."""
+    _end_with_parent(start.parent_pid)
+    for number in LEFT_TO_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
+    voice = _Voice(connection)
+    logging.getLogger().handlers = [voice]
+    set_levels(start.log_level)
+    threading.Thread(target=voice.tell_life, args=(start.heartbeat_s,), daemon=True).start()
+    try:
+        work = start.make_worker(*start.worker_args)
+        while (item := _next_item(connection)) is not None:
+            voice.begin(item)
+            with counted_steps(voice.count):
+                record = attempt(work, item)
+            voice.finish(record)
+    except Exception as error:
+        if not isinstance(error, CosflyError):
+            error.add_note(traceback.format_exc())  # a bug keeps its traceback, which does not cross the pipe
+        voice.send(Broken(error))
+
+
+def _next_item(connection: Connection) -> Item | None:
+    try:
+        return connection.recv()
+    except EOFError:
+        return None
+
+
+def _end_with_parent(parent_pid: int) -> None:
+    """Have the system kill this process with its parent; elsewhere than on Linux the pipe tells, at the next sign of life."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent_pid:  # it died before we asked
+            os._exit(1)
+
+
+class _Voice(logging.handlers.QueueHandler):
+    """Sends what a worker has to say, from whichever thread."""
+
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(None)  # type: ignore[arg-type]  # there is no queue: `enqueue` sends
+        self._connection, self._sending = connection, threading.Lock()
+        self._item_id: str | None = None
+        self._num_steps, self._is_busy = 0, True
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        self.send(record)
+
+    def send(self, message: Message) -> None:
+        try:
+            with self._sending:
+                self._connection.send(message)
+        except OSError:
+            os._exit(1)  # the parent is gone
+
+    def begin(self, item: Item) -> None:
+        self._item_id, self._num_steps, self._is_busy = item.item_id, 0, True
+        self.send(Sign(item.item_id, 0))
+
+    def count(self, num_steps: int) -> None:
+        self._num_steps = num_steps
+
+    def finish(self, record: ItemRecord) -> None:
+        self._is_busy = False
+        self.send(Sign(record.id, self._num_steps))
+        self.send(record)
+
+    def tell_life(self, heartbeat_s: float) -> None:
+        while True:
+            time.sleep(heartbeat_s)
+            if self._is_busy:
+                self.send(Sign(self._item_id, self._num_steps))

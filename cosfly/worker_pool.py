@@ -1,0 +1,304 @@
+"""Worker processes that are watched: one that dies, stalls or takes for ever is replaced, and its item tried again.
+
+All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a worker
+does or leaves undone holds up the stage. `worker` is the other end of the pipe.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import multiprocessing
+import os
+import queue
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any, Literal
+
+from cosfly.errors import EnvironmentMissing
+from cosfly.items import Item, Work
+from cosfly.stage_events import EventLog, cpu_seconds
+from cosfly.stage_folder import Failed, ItemRecord
+from cosfly.worker import Broken, Message, Sign, Start, signals_held_back, work_through
+
+log = logging.getLogger(__name__)
+
+LEAST_LIMIT_S, TYPICAL_ITEMS = 600.0, 20.0  # of the default limit: at least so long, and so many times what items take
+ITEMS_REMEMBERED = 1000  # for what items take
+PATIENCE_S = 5.0  # for a worker that has no more to do to end by itself
+
+
+@dataclass(frozen=True)
+class Watch:
+    """When a worker counts as stalled, and what is done then; the times are those of the paper (sec:dataset_watchdog).
+
+    item_limit_s: how long an item may go without getting on (no step of it is told of); 0: for ever; None: ten minutes or 20 times
+    what items take, whichever is more, and with each new attempt twice as long, as for the start of a worker.
+    """
+
+    item_limit_s: float | None = None
+    heartbeat_s: float = 2.0
+    check_s: float = 5.0
+    probe_s: float = 1.5
+    failed_checks: int = 3  # in a row: neither a heartbeat nor any processor time
+    retries: int = 2  # of an item
+    restarts: int = 20  # of workers, beyond one for each item that was done: after that the machine is not fit
+
+
+def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: bool) -> float:
+    """Give how long an item may go without getting on.
+
+    Args:
+        seconds: what items took that are done.
+        attempt: 0 for the first.
+        has_begun: False while the worker still reads maps and compiles, which a limit that somebody set was not meant for.
+    """
+    if watch.item_limit_s == 0:
+        return math.inf
+    if watch.item_limit_s is not None and has_begun:
+        return watch.item_limit_s
+    typical_s = statistics.median(seconds) if seconds else 0.0
+    return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
+
+
+Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
+WORDS: dict[Loss, str] = {
+    "heartbeat_lost": "its worker stood still",
+    "timed_out": "it did not get on within its time limit",
+    "worker_died": "its worker process died; it may need more memory than there is",
+}
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    item: Item
+    number: int = 0
+
+
+@dataclass(eq=False)
+class _Worker:
+    """One process, and what is known of it."""
+
+    place: int
+    process: Any
+    inbox: queue.SimpleQueue[Item | None]
+    attempt: _Attempt | None = None
+    num_steps: int = 0
+    has_begun: bool = False  # the item; before that, a new worker reads maps and compiles
+    begun_s: float = 0.0
+    has_told: bool = False  # since the last check
+    cpu_s: float = 0.0  # at the last check
+    failed_checks: int = 0
+    quiet_s: float = 0.0  # since the item got on
+
+    def give(self, attempt: _Attempt) -> None:
+        self.attempt, self.num_steps, self.has_begun = attempt, 0, False
+        self.has_told, self.failed_checks, self.quiet_s = True, 0, 0.0
+        self.inbox.put(attempt.item)
+
+
+@dataclass
+class WorkerPool:
+    """Does items in `num_workers` processes. on_steps(item_id, n) hears how many steps of an item in hand are done."""
+
+    make_worker: Callable[..., Work]
+    worker_args: tuple
+    num_workers: int
+    watch: Watch
+    events: EventLog
+    on_steps: Callable[[str, int], None]
+    num_lost: int = 0
+    _num_done: int = 0
+    _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
+    _waiting: deque[_Attempt] = field(default_factory=deque)
+    _workers: dict[int, _Worker] = field(default_factory=dict)
+    _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
+    _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
+
+    def outcomes(self, items: Sequence[Item]) -> Iterator[ItemRecord]:
+        """Yield the record of each item as it is done.
+
+        Raises:
+            CosflyError: a fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
+        """
+        self.events.tell("began", workers=self.num_workers)
+        self._waiting.extend(_Attempt(item) for item in items)
+        next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
+        try:
+            while self._waiting or self._busy():
+                self._hand_out()
+                try:
+                    worker, message = self._messages.get(
+                        timeout=max(0.0, min(next_check_s, next_probe_s) - time.monotonic())
+                    )
+                    if self._workers.get(worker.place) is worker:  # and not one that was given up
+                        yield from self._hear(worker, message)
+                except queue.Empty:
+                    pass
+                if (now_s := time.monotonic()) >= next_probe_s:
+                    next_probe_s = now_s + self.watch.probe_s
+                    self.events.probe({w.place: w.process.pid for w in self._workers.values()})
+                if now_s >= next_check_s:
+                    next_check_s = now_s + self.watch.check_s
+                    yield from self._check()
+        except BaseException:
+            self._end(patience_s=0.0)
+            raise
+        self._end(patience_s=PATIENCE_S)
+        self.events.tell("ended")
+
+    # --- giving work ------------------------------------------------------------------------------------------------------
+
+    def _busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers.values() if worker.attempt is not None]
+
+    def _hand_out(self) -> None:
+        """Give every free worker an item, and start those that are missing."""
+        for place in range(self.num_workers):
+            worker = self._workers.get(place)
+            if (worker is None or worker.attempt is None) and (attempt := self._next_attempt()) is not None:
+                worker = self._workers.get(place) or self._start(place)
+                worker.give(attempt)
+
+    def _next_attempt(self) -> _Attempt | None:
+        """Take what is to be done next. A last attempt is made alone: there may not be the memory for two."""
+        for k, attempt in enumerate(self._waiting):
+            if attempt.number < self.watch.retries or attempt.number == 0:
+                del self._waiting[k]
+                return attempt
+        if self._waiting and not self._busy():
+            for worker in list(self._workers.values()):
+                self._stop(worker, PATIENCE_S)
+            return self._waiting.popleft()
+        return None
+
+    def _start(self, place: int) -> _Worker:
+        context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
+        here, there = context.Pipe()
+        level = logging.getLogger().level
+        start = Start(self.make_worker, self.worker_args, self.watch.heartbeat_s, level, os.getpid())
+        process = context.Process(target=work_through, args=(there, start), daemon=True)
+        with signals_held_back():
+            process.start()
+        there.close()
+        worker = self._workers[place] = _Worker(place, process, queue.SimpleQueue())
+        threading.Thread(target=_attend, args=(worker, here, self._messages), daemon=True).start()
+        self.events.tell("restarted" if place in self._lost else "worker_started", worker=place, pid=process.pid)
+        self._lost.discard(place)
+        return worker
+
+    # --- hearing what comes of it -----------------------------------------------------------------------------------------
+
+    def _hear(self, worker: _Worker, message: Message | None) -> Iterator[ItemRecord]:
+        if message is None:
+            yield from self._lose(worker, "worker_died")
+        elif isinstance(message, Broken):
+            raise message.error
+        elif isinstance(message, logging.LogRecord):
+            logging.getLogger(message.name).handle(message)
+        elif isinstance(message, Sign):
+            attempt = worker.attempt
+            if attempt is None or message.item_id != attempt.item.item_id:
+                return
+            if not worker.has_begun:
+                worker.has_begun, worker.begun_s, worker.quiet_s = True, time.monotonic(), 0.0
+            elif message.num_steps != worker.num_steps:
+                worker.num_steps, worker.quiet_s = message.num_steps, 0.0
+                self.on_steps(message.item_id, message.num_steps)
+        else:
+            seconds = time.monotonic() - worker.begun_s
+            self._seconds.append(seconds)
+            self._num_done += 1
+            worker.attempt = None
+            about = {"status": message.status, "seconds": round(seconds, 3), "steps": worker.num_steps}
+            self.events.tell("item_done", worker=worker.place, item=message.id, **about)
+            yield message
+
+    def _check(self) -> Iterator[ItemRecord]:
+        """Look for workers that neither tell that they live nor compute, and for items that do not get on.
+
+        Time counts here by checks: while this process itself was stopped, nobody could tell us anything.
+        """
+        for worker in self._busy():
+            assert worker.attempt is not None
+            cpu_s = cpu_seconds(worker.process.pid)
+            lives = worker.has_told or cpu_s != worker.cpu_s
+            worker.failed_checks = 0 if lives else worker.failed_checks + 1
+            worker.has_told, worker.cpu_s = False, cpu_s
+            worker.quiet_s += self.watch.check_s
+            if not worker.process.is_alive():
+                yield from self._lose(worker, "worker_died")
+            elif worker.failed_checks >= self.watch.failed_checks:
+                yield from self._lose(worker, "heartbeat_lost")
+            elif worker.quiet_s > limit_s(self.watch, self._seconds, worker.attempt.number, worker.has_begun):
+                yield from self._lose(worker, "timed_out")
+
+    # --- losing a worker --------------------------------------------------------------------------------------------------
+
+    def _lose(self, worker: _Worker, loss: Loss) -> Iterator[ItemRecord]:
+        """End a worker that is of no use any more; its item is tried again, or has failed."""
+        self._stop(worker, 0.0)
+        self._lost.add(worker.place)
+        attempt, self.num_lost = worker.attempt, self.num_lost + 1
+        if attempt is None:  # it had nothing in hand
+            self.events.tell(loss, worker=worker.place, pid=worker.process.pid)
+            return
+        item = attempt.item
+        about = {"worker": worker.place, "item": item.item_id, "steps": worker.num_steps}
+        self.events.tell(loss, pid=worker.process.pid, **about)
+        self.on_steps(item.item_id, 0)
+        if self.num_lost > self.watch.restarts + self._num_done:
+            raise EnvironmentMissing(
+                "workers die or stall all the time",
+                where=item.item_id,
+                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {WORDS[loss]}",
+                fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same command "
+                "again: finished items are kept",
+            )
+        if attempt.number < self.watch.retries:
+            log.warning("%s: %s; it is tried again", item.item_id, WORDS[loss])
+            self._waiting.append(_Attempt(item, attempt.number + 1))
+            self.events.tell("retried", item=item.item_id, attempt=attempt.number + 1)
+            return
+        self.events.tell("given_up", item=item.item_id)
+        message = f"{item.item_id}: {WORDS[loss]}, {attempt.number + 1} times"
+        yield Failed(id=item.item_id, code="worker_died" if loss == "worker_died" else "timed_out", message=message)
+
+    def _stop(self, worker: _Worker, patience_s: float) -> None:
+        """End a worker: by itself, if it can within the time given."""
+        del self._workers[worker.place]
+        worker.inbox.put(None)
+        if patience_s:
+            worker.process.join(patience_s)
+        worker.process.kill()
+        worker.process.join()
+
+    def _end(self, patience_s: float) -> None:
+        for worker in self._workers.values():
+            worker.inbox.put(None)  # all at once
+        for worker in list(self._workers.values()):
+            self._stop(worker, patience_s)
+
+
+def _attend(worker: _Worker, connection: Connection, messages: queue.SimpleQueue) -> None:
+    """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is gone."""
+    try:
+        with connection:
+            while (item := worker.inbox.get()) is not None:
+                connection.send(item)
+                while True:
+                    message = connection.recv()
+                    worker.has_told = True
+                    messages.put((worker, message))
+                    if isinstance(message, Broken | ItemRecord):
+                        break
+            connection.send(None)
+    except (EOFError, OSError):
+        messages.put((worker, None))
+    except Exception as error:  # an item that does not pickle, a message that does not unpickle
+        messages.put((worker, Broken(error)))

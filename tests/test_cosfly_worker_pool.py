@@ -1,0 +1,199 @@
+"""Workers that die, stall or never end, and what the stage makes of it."""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from toy_workers import make_counting_worker, make_talking_worker, make_worker, stage_in
+
+from cosfly.errors import EnvironmentMissing
+from cosfly.journal import Journal
+from cosfly.runner import Item, Watch, run_items
+from cosfly.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, read_events
+from cosfly.stage_folder import Failed
+from cosfly.worker_pool import WORDS, limit_s
+
+QUICK = Watch(item_limit_s=1.5, heartbeat_s=0.1, check_s=0.4, probe_s=0.3)  # stalled after 1.2 s
+
+
+def items_of(*kinds: str) -> list[Item]:
+    return [Item(f"i{k}", (kind, bytes(1_000_000))) for k, kind in enumerate(kinds)]  # more than a pipe holds
+
+
+def work_on(path: Path, kinds: list[str], workers: int, watch: Watch = QUICK):
+    return run_items(stage_in(path), items_of(*kinds), make_worker, (path / "s",), workers=workers, watch=watch)
+
+
+@pytest.mark.parametrize(
+    ("workers", "lost"),
+    [(1, {"i0": "heartbeat_lost"}), (2, {"i0": "heartbeat_lost", "i1": "worker_died", "i2": "timed_out"})],
+)
+def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, workers, lost):
+    kinds = ["once-stop", "once-die", "once-sleep"][: len(lost)] + ["nothing"] * 2
+    finished = work_on(tmp_path, kinds, workers)
+    assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
+    found = {event.item: event.event for event in read_events(tmp_path / "s") if event.event in WORDS}
+    assert found == found | lost
+    assert not list((tmp_path / "s").glob(".*.partial"))
+    assert all((tmp_path / "s" / record.id / "frame").read_text() == record.id for record in finished.kept)
+
+
+def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, caplog):
+    finished = work_on(tmp_path, ["loop", "slow", "nothing"], workers=2)
+    assert [record.id for record in finished.kept] == ["i1", "i2"]
+    assert finished.tally.model_dump()["failed"] == {"timed_out": 1}
+    failure = next(record for record in finished.records if isinstance(record, Failed))
+    assert "did not get on within its time limit, 3 times" in failure.message
+    assert caplog.text.count("it is tried again") >= 2
+    assert not list((tmp_path / "s").glob(".*.partial"))
+
+
+def test_the_limit_of_an_item():
+    nothing_set, set_s = Watch(), Watch(item_limit_s=7.0)
+    assert limit_s(nothing_set, [], 0, True) == 600
+    assert limit_s(nothing_set, [1.0, 50.0, 90.0], 0, True) == 1000
+    assert limit_s(nothing_set, [1.0], 2, True) == 2400, "with each attempt twice as long"
+    assert limit_s(set_s, [50.0], 2, True) == 7
+    assert limit_s(set_s, [], 0, False) == 600, "a worker that still starts"
+    assert limit_s(Watch(item_limit_s=0), [1.0], 0, True) == float("inf")
+
+
+def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
+    kinds = ["nothing"] + ["die"] * 30
+    with pytest.raises(EnvironmentMissing, match=r"die or stall all the time.*3 lost, 1 items done.*item_limit_s"):
+        work_on(tmp_path, kinds, workers=1, watch=Watch(restarts=1))
+    assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]
+    # The machine is fit again.
+    assert len(work_on(tmp_path, ["nothing"] * 31, workers=1).kept) == 31
+
+
+# --- what the parent's end leaves behind ------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys; sys.path.insert(0, {tests!r})
+from pathlib import Path
+from toy_workers import make_idle_worker, stage_in
+from cosfly import cli
+from cosfly.runner import Item, run_items
+
+if __name__ == "__main__":
+    @cli.app.command()
+    def work(folder: Path) -> None:
+        run_items(stage_in(folder), [Item(str(k)) for k in range(4)], make_idle_worker, (folder,), workers=2)
+    sys.argv = ["cosfly", "work", {folder!r}]
+    cli.main()
+"""
+
+
+def start_program(folder: Path, **options) -> subprocess.Popen:
+    """Start a command whose two workers hang, and wait until they do."""
+    program = folder / "program.py"
+    program.write_text(PROGRAM.format(tests=str(Path(__file__).parent), folder=str(folder)))
+    parent = subprocess.Popen([sys.executable, str(program)], **options)
+    wait_for(lambda: all((folder / name).exists() for name in ("0.pid", "1.pid")))
+    return parent
+
+
+def wait_for(what, seconds: float = 60.0) -> None:
+    deadline_s = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    parent = start_program(tmp_path)
+    pids = [int((tmp_path / name).read_text()) for name in ("0.pid", "1.pid")]
+    assert all(map(is_running, pids))
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not any(map(is_running, pids)), 10.0)
+    assert not stage_in(tmp_path).is_complete  # and nobody holds the folder
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_sigterm_ends_a_command_in_one_line(tmp_path):
+    process = start_program(
+        tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    os.killpg(process.pid, signal.SIGTERM)  # what a service manager does
+    text, _ = process.communicate(timeout=20)
+    assert process.returncode == 143
+    assert text.splitlines() == ["error: terminated; finished work is kept: run the same command again to continue"]
+
+
+# --- telling how far it is --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(("sizes", "expected"), [((5, 7, 9), 21), ((5, None, 9), 3)], ids=["frames", "items"])
+def test_progress_is_told_in_steps_where_all_items_know_theirs(tmp_path, monkeypatch, workers, sizes, expected):
+    bars = []
+
+    @contextlib.contextmanager
+    def bar(label, total, done):
+        moves: list[int] = []
+        bars.append((total, done, moves))
+        yield moves.append
+
+    monkeypatch.setattr("cosfly.runner.progress_bar", bar)
+    payload = "once-die" if workers and expected == 21 else None
+    items = [Item(f"i{k}", payload if k == 1 else None, size) for k, size in enumerate(sizes)]
+    run_items(stage_in(tmp_path), items[:1], make_counting_worker, (tmp_path,))
+    run_items(stage_in(tmp_path), items, make_counting_worker, (tmp_path,), workers=workers, watch=QUICK)
+    _, (total, done, moves) = bars
+    assert total == expected
+    assert done == (5 if expected == 21 else 1)
+    assert done + sum(moves) == total
+    if workers and expected == 21:
+        assert -7 in moves, "begun again"
+
+
+# --- events -----------------------------------------------------------------------------------------------------------
+
+
+def test_events_tell_what_happened_and_a_damaged_line_is_no_harm(tmp_path):
+    work_on(tmp_path, ["nothing", "once-die"], workers=1, watch=Watch(probe_s=0.3))
+    path = tmp_path / "s" / EVENTS
+    kinds = [event.event for event in read_events(tmp_path / "s") if event.event != "probe"]
+    assert kinds == [
+        "began", "worker_started", "item_done", "worker_died", "retried", "restarted", "item_done", "ended",
+    ]  # fmt: skip
+    events = read_events(tmp_path / "s")
+    probes = [event for event in events if event.event == "probe"]
+    assert probes
+    assert all(event.disk_free_mib > 0 for event in probes)
+    assert any(rss > 10 for event in probes for rss in event.rss_mib.values())
+    with Journal(path) as journal:
+        journal.append({"at_s": 1.0, "event": "of a later cosfly"})
+    path.write_bytes(path.read_bytes() + b"cut sho")
+    assert read_events(tmp_path / "s") == events
+
+
+def test_a_week_of_probes_stays_small(tmp_path):
+    log = EventLog(tmp_path)
+    for _ in range(20 * PROBES_OF_ONE_PACE):
+        log.probe({})
+    log.close()
+    assert len(read_events(tmp_path)) < 5 * PROBES_OF_ONE_PACE
+
+
+def test_a_workers_log_lines_reach_the_stages_log(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    run_items(stage_in(tmp_path), [Item("a")], make_talking_worker, workers=1)
+    assert "a speaks of 7" in caplog.text
+    assert "not this" not in caplog.text
