@@ -28,7 +28,7 @@ from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Request, started
 from cosfly.chat.throttle import Throttle
 from cosfly.cli import app
-from cosfly.errors import TeacherError
+from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -255,6 +255,16 @@ def test_a_retry_that_is_refused_again_changes_nothing(tree, tmp_path, whole):
     assert quarantine(out) == held
     assert len(held) == 2
     assert (out / "manifest.json").exists()
+
+
+def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(tree, tmp_path, whole):
+    out = tmp_path / "out"
+    with hovering(Picky(400, FILTERED, whole.seeds[:1])) as server:
+        run(settings(server.url), tree, out)
+        before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+        with pytest.raises(ResumeError, match="more windows than the limit allows"):
+            run(settings(server.url, limit=3), tree, out, retry_failed=True)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
 def test_a_server_that_answers_no_trial_prompt_leaves_it_open_whose_fault_it_was(tree, tmp_path):

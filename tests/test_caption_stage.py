@@ -195,3 +195,16 @@ def test_a_glossary_without_an_action_is_refused(tmp_path):
     (tmp_path / "glossary.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match="not the closed set; got hover"):
         load_glossary(tmp_path / "glossary.yaml")
+
+
+def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 14)
+    clean = next(tree.rglob("ORI")) / "trajectory.json"
+    whole = clean.read_bytes()
+    clean.write_bytes(whole[:100])
+    out = tmp_path / "out"
+    with pytest.raises(NothingKept):
+        run(CaptionConfig(), tree, out)
+    clean.write_bytes(whole)
+    found = list(read_captions(run(CaptionConfig(), tree, out, resume="force")))
+    assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}

@@ -47,7 +47,7 @@ class Allotted:
         """Yield its windows in order of time.
 
         Raises:
-            InputError: it cannot be read.
+            InputError: it, or the clean flight beside it, cannot be read.
         """
         flight = replace(read_flight(self.folder, strict=False), given_id=self.name)
         for number, window in enumerate(cut_windows(flight, cfg.window, cfg.label, _twin_of(flight))):
@@ -64,10 +64,14 @@ class Allotted:
 
 
 def _twin_of(flight: Flight) -> Flight | None:
-    """Read the clean flight beside a perturbed one; one that cannot be used is left out, and the log says why."""
+    """Read the clean flight beside a perturbed one; one of other frames is left out, and the log says why.
+
+    Raises:
+        InputError: it cannot be read. Labels without it would stay when it is mended; a failure is done again.
+    """
     try:
         return read_twin(flight)
-    except (InputError, VerifyError) as error:
+    except VerifyError as error:
         log.warning("caption: %s: labels without its clean twin: %s", flight.flight_id, error)
         return None
 

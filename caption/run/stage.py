@@ -71,7 +71,7 @@ def run(
     foreign = None if cfg.caption_file is None else given_samples(cfg.caption_file, cfg.teacher_kind)
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)
-    if was_whole and not (retry_failed and _has_refused(stage)):
+    if was_whole and not (retry_failed and _has_refused(stage, cfg)):
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)
@@ -130,10 +130,21 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
     return True
 
 
-def _has_refused(stage: StageFolder) -> bool:
-    """Tell whether the server refused windows of a complete folder; it is then open again."""
+def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
+    """Tell whether the server refused windows of a complete folder; it is then open again.
+
+    Raises:
+        ResumeError: it holds more windows than the limit now allows; it stays complete.
+    """
     if not read_quarantine(stage.path):
         return False
+    num_windows = read_manifest(stage.path).counts.input
+    if cfg.limit is not None and cfg.limit < num_windows:
+        raise ResumeError(
+            "the folder holds more windows than the limit allows, so it stays as it is", where=stage.path,
+            got=f"{num_windows} windows", expected=f"at most {cfg.limit} (caption.limit)",
+            fix="leave --limit out, or raise it",
+        )  # fmt: skip
     refuse_one_file(stage.path / ANSWERS)
     stage.reopen()
     return True
