@@ -114,6 +114,14 @@ def folder_digests(folder: Path) -> dict[str, str]:
     return listed | {name: sha256_file(folder / name) for name in found if name not in (*listed, CHECKSUMS)}
 
 
+def recorded_digests(folder: Path) -> dict[str, str]:
+    """Give the sha256 of a finished stage's products by their paths in its folder; empty where there is no manifest of ours."""
+    if not _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
+        return {}
+    made = read_model(folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
+    return {output.path: output.sha256 for output in made.outputs}
+
+
 def digest_of(digests: Mapping[str, str]) -> str:
     """Give one digest for the files of a folder."""
     return sha256_bytes(checksum_lines(digests).encode())
@@ -154,12 +162,6 @@ def _has_record(folder: Path, name: str, schema: str) -> bool:
     return isinstance(value, dict) and value.get("schema") == schema
 
 
-def _outputs(folder: Path) -> dict[str, Output]:
-    """Read what a finished stage's manifest lists, by the paths in its folder."""
-    made = read_model(folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
-    return {output.path: output for output in made.outputs}
-
-
 def _check_finished(path: Path) -> None:
     """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
     folder = _stage_folder(path)
@@ -172,11 +174,11 @@ def _check_finished(path: Path) -> None:
                 got=f"no {name} in {folder}", expected=f"{name} of that stage",
                 fix="run that stage again; to use what is there as it is, copy it to a folder of its own",
             )  # fmt: skip
-    outputs = _outputs(folder)
+    digests = recorded_digests(folder)
     if path.is_file():
         name = path.absolute().relative_to(folder.absolute()).as_posix()
-        outputs = {name: outputs[name]} if name in outputs else {}
-    wrong = [*_changed(folder, {name: output.sha256 for name, output in outputs.items()}), *_strangers(folder, outputs)]
+        digests = {name: digests[name]} if name in digests else {}
+    wrong = [*_changed(folder, digests), *_strangers(folder, digests)]
     if wrong:
         raise _not_as_recorded(folder, wrong)
 
@@ -185,21 +187,21 @@ def _changed(folder: Path, digests: Mapping[str, str]) -> Iterator[str]:
     for name, digest in digests.items():
         path = inside(folder, name)
         if not path.is_file():
-            yield f"{name} is missing"
+            yield f"{path} is missing"
         elif sha256_file(path) != digest:
-            yield f"{name} has other bytes"
+            yield f"{path} has other bytes"
 
 
-def _strangers(folder: Path, outputs: Mapping[str, Output]) -> Iterator[str]:
+def _strangers(folder: Path, listed: Collection[str]) -> Iterator[str]:
     """Find the flights in a tree that its manifest does not know."""
-    if not any(name.endswith(f"/{FLIGHT}") for name in outputs):
+    if not any(name.endswith(f"/{FLIGHT}") for name in listed):
         return
     for place, folders, files in os.walk(folder):
         if FLIGHT in files:
             folders.clear()  # frames
-            name = (Path(place) / FLIGHT).relative_to(folder).as_posix()
-            if name not in outputs:
-                yield f"{name} is no flight of this tree"
+            path = Path(place, FLIGHT)
+            if path.relative_to(folder).as_posix() not in listed:
+                yield f"{path} is no flight of this tree"
         folders[:] = [inner for inner in folders if not inner.startswith(".")]
 
 
@@ -234,6 +236,22 @@ def _role(name: str) -> str:
     return ROLES.get(role, role)
 
 
+def warn_unbound(paths: Iterable[Path]) -> None:
+    """Tell of products that no record binds to the tree they were made of."""
+    for path in paths:
+        if _stage_folder(path) is None:
+            log.warning("%s: no record says of which tree this was made", path)
+
+
+def was_made_of(product: Path, name: str) -> str | None:
+    """Give the fingerprint that an input of a product's stage had; None where there is no record of it."""
+    folder = _stage_folder(product)
+    if folder is None or not _has_record(folder, "stage.json", STAGE_SCHEMA):
+        return None
+    found = read_stage_record(folder).inputs.get(name)
+    return None if found is None else found.sha256
+
+
 def _lineage(path: Path, digest: str) -> set[str]:
     """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
     record = read_stage_record(path) if _has_record(path, "stage.json", STAGE_SCHEMA) else None
@@ -249,57 +267,44 @@ def verify(paths: Iterable[Path]) -> int:
     """Hash every file of the stages that made some products, pictures and shards included; gives how many.
 
     Args:
-        paths: files or folders; those without any record are told in the log.
+        paths: files or folders; where there is no record of one, the log says so.
     Raises:
         VerifyError: names the files that are missing, have other bytes, or are in no record.
     """
     start_s, num_bytes, wrong = time.monotonic(), 0, []
     digests: dict[Path, str] = {}
-    folders = list(dict.fromkeys(_stage_folder(path) or (path if path.is_dir() else path.parent) for path in paths))
+    folders = list(dict.fromkeys(_stage_folder(path) or path for path in paths))
     for folder in folders:
-        listed = _recorded_files(folder)
+        listed = _recorded_files(folder) if folder.is_dir() else {}
         if not listed:
-            log.warning("verify: %s: nothing here to verify against: no manifest, no %s", folder, CHECKSUMS)
+            log.warning("verify: %s: there is no record to hold it against", folder)
+            continue
         digests |= listed
-        wrong += [f"{path} is in no record" for path in _unrecorded(folder, listed)]
-        if _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
-            wrong += [f"{folder}: {stranger}" for stranger in _strangers(folder, _outputs(folder))]
+        wrong += [*_unrecorded(folder, listed), *_strangers(folder, recorded_digests(folder))]
     with progress_bar("verify", total=len(digests)) as advance:
         for path, digest in digests.items():
-            if not path.is_file():
-                wrong.append(f"{path} is missing")
-            elif sha256_file(path) != digest:
-                wrong.append(f"{path} has other bytes")
-            else:
-                num_bytes += path.stat().st_size
+            wrong += _changed(path.parent, {path.name: digest})
+            num_bytes += path.stat().st_size if path.is_file() else 0
             advance(1)
     if wrong:
         raise _not_as_recorded(Path(os.path.commonpath(folders)), wrong)
     seconds = time.monotonic() - start_s
-    log.info(
-        "verify: %d files, %.0f MB, %.1f s, %.0f MB/s",
-        len(digests),
-        num_bytes / 1e6,
-        seconds,
-        num_bytes / 1e6 / seconds,
-    )
+    log.info("verify: %d files, %.0f MB in %.1f s", len(digests), num_bytes / 1e6, seconds)
     return len(digests)
 
 
 def _recorded_files(folder: Path) -> dict[Path, str]:
     """Give the sha256 of every file that a stage folder or tree has on record."""
-    is_finished = _has_record(folder, "manifest.json", MANIFEST_SCHEMA)
-    found = {
-        inside(folder, output.path): output.sha256 for output in (_outputs(folder) if is_finished else {}).values()
-    }
+    found = {inside(folder, name): digest for name, digest in recorded_digests(folder).items()}
     for lists in sorted(folder.rglob(CHECKSUMS)):
         found |= {lists.parent.resolve() / name: digest for name, digest in read_checksums(lists.parent).items()}
     return found
 
 
-def _unrecorded(folder: Path, listed: Collection[Path]) -> Iterator[Path]:
+def _unrecorded(folder: Path, listed: Collection[Path]) -> Iterator[str]:
     """Find the files beside a checksum file that it does not list; what begins with a dot is others'."""
     for lists in sorted(folder.rglob(CHECKSUMS)):
-        for path in sorted(lists.parent.rglob("[!.]*")):
-            if path.is_file() and path != lists and path.resolve() not in listed:
-                yield path
+        for path in sorted(lists.parent.rglob("*")):
+            is_ours = not any(part.startswith(".") for part in path.relative_to(lists.parent).parts)
+            if is_ours and path.is_file() and path != lists and path.resolve() not in listed:
+                yield f"{path} is in no record"

@@ -22,6 +22,7 @@ from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, parse_answer, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.products.places import stand
+from cosfly.provenance import warn_unbound
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_file, dump_json
 from distill.schema import SPLITS, Sample, Split, read_split, split_path
@@ -236,6 +237,7 @@ def run(
     stage = StageFolder.open(out, "distill.prepare", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
+    warn_unbound([captions])
     excluded = Counter[str]()
     groups = set()
     # Two passes: the splits must be known before the first line is written.

@@ -7,7 +7,7 @@ list and no nested list stands in a row except the caption's window and picture 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,6 +116,8 @@ PICTURES: dict[FrameFile, Column] = {
     "depth": Column("depth", "binary", lambda f, i, _: _read(f, i, "depth")),
     "instance": Column("instance", "image", _picture("instance")),
 }
+
+
 SCALARS = (  # everything but pictures and depth
     Column("sample_id", "string", lambda f, i, _: sample_id(f.flight_id, i)),
     Column("run", "string", lambda f, i, _: f.run),
@@ -181,6 +183,12 @@ def row(flight: Flight, i: int, files: Collection[FrameFile], caption: ReleasedC
         InputError: a file of the frame cannot be read.
     """
     return {column.name: column.cell(flight, i, caption) for column in columns_of(files)}
+
+
+def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:
+    """Give the bytes of a picture in a row."""
+    value = row[PICTURES[file].name]
+    return value if file == "depth" else value["bytes"]
 
 
 def _read(flight: Flight, i: int, file: FrameFile) -> bytes:

@@ -21,11 +21,12 @@ import cosfly
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.boxes import LicenceId
-from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.products.playback import read_flight
+from cosfly.provenance import digest_of, folder_digests
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_file, write_bytes, write_checksums
+from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, sha256_file, write_bytes, write_checksums
 from release import columns
 from release.card import compute_numbers, render_card
 from release.record import (
@@ -44,6 +45,7 @@ from release.subsample import RULE, select_frames
 
 MB = 1024 * 1024
 DATASET, PARTS = "dataset", "parts"
+ANEW = "put the file back, or inspect and caption the tree as it is now"
 
 
 class ReleaseConfig(Config):
@@ -87,8 +89,10 @@ def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> dict[str, int]
 
     Raises:
         InputError: the flight or a file of it cannot be read, or a caption belongs to no frame of it.
+        VerifyError: a file is not the one that was inspected.
     """
     folder, captions = chosen.folder, chosen.captions
+    digests = _digests(chosen)
     flight = replace(read_flight(folder), run=chosen.place.run, given_id=chosen.flight_id)
     beyond = [index for index in captions if not 0 <= index < len(flight)]
     if beyond:
@@ -96,7 +100,7 @@ def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> dict[str, int]
         raise InputError("a caption belongs to no frame", where=folder, got=f"frame {beyond[0]}", expected=expected)
     selected = select_frames(len(flight), cfg.num_frames).tolist()
     schema = columns.schema(cfg.modalities)
-    rows = (columns.row(flight, i, cfg.modalities, captions.get(i)) for i in selected)
+    rows = (_checked(columns.row(flight, i, cfg.modalities, captions.get(i)), folder, digests, cfg) for i in selected)
     with atomic_file(path) as file, open_writer(file, schema) as writer:
         for batch in _batches(rows, cfg):
             writer.write_table(pa.Table.from_pylist(batch, schema=schema), row_group_size=len(batch))
@@ -110,6 +114,36 @@ def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> dict[str, int]
     }
 
 
+def _digests(chosen: Chosen) -> dict[str, str]:
+    """Give the sha256 of each file of a flight, once it is clear that they are those that were inspected.
+
+    Raises:
+        VerifyError: they are not.
+    """
+    digests = folder_digests(chosen.folder)
+    if chosen.sha256 not in (None, digest_of(digests)):
+        got, expected = digest_of(digests), f"{chosen.sha256}, as in the inspection"
+        raise VerifyError(
+            "the flight is not the one that was inspected", where=chosen.folder, got=got, expected=expected, fix=ANEW
+        )
+    name = "trajectory.json"
+    _compare(chosen.folder / name, sha256_file(chosen.folder / name), digests.get(name))
+    return digests
+
+
+def _compare(path: Path, got: str, expected: str | None) -> None:
+    if got != expected:
+        raise VerifyError("a file is not the one that was inspected", where=path, got=got, expected=expected, fix=ANEW)
+
+
+def _checked(row: dict[str, Any], folder: Path, digests: dict[str, str], cfg: ReleaseConfig) -> dict[str, Any]:
+    """Give a row whose pictures are those of the digests."""
+    for file in cfg.modalities:
+        name = f"{frame_name(row['frame_index'])}/{FILE_NAMES[file]}"
+        _compare(folder / name, sha256_bytes(columns.picture_bytes(row, file)), digests.get(name))
+    return row
+
+
 def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[list[dict[str, Any]]]:
     """Cut rows into groups of about `row_group_mb`."""
     batch: list[dict[str, Any]] = []
@@ -118,8 +152,7 @@ def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[lis
         advance()
         batch.append(row)
         for file in cfg.modalities:
-            value = row[columns.PICTURES[file].name]
-            num_bytes += len(value if file == "depth" else value["bytes"])
+            num_bytes += len(columns.picture_bytes(row, file))
         if num_bytes >= cfg.row_group_mb * MB:
             yield batch
             batch, num_bytes = [], 0
@@ -240,7 +273,8 @@ def run(
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
     stage.finish(outputs, finished.tally, history=history.model_dump(mode="json"))
-    shutil.rmtree(parts, ignore_errors=True)
+    if not finished.tally.failed:  # or the next run, which does the failed flights again, would miss the others' parts
+        shutil.rmtree(parts, ignore_errors=True)
     return dataset
 
 

@@ -12,6 +12,7 @@ from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel, read_inspection
 from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.town import read_town_map
+from cosfly.provenance import fingerprint, warn_unbound, was_made_of
 from release.captions import ByFlight, load_captions
 from release.columns import ReleasedCaption
 from release.record import ReleasedMap
@@ -50,10 +51,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A flight to release: where it stands, what it is called, and its captions by frame."""
+    """A flight to release: where it stands, what it is called, and its captions by frame.
+
+    sha256: of its files as they were inspected; None where the inspection does not say, or saw the tree in its older form.
+    """
 
     place: Place
     folder: Path
+    sha256: str | None
     flight_id: str
     captions: dict[int, ReleasedCaption]
 
@@ -89,6 +94,8 @@ def gather(sources: list[Source], tracks: tuple[Track, ...], *, include_review: 
     chosen, by_source, maps = list[Chosen](), list[ByFlight](), list[ReleasedMap]()
     left_out, dropped = Counter[str](), Counter[str]()
     for source, inspection, group in zip(sources, inspections, places, strict=True):
+        warn_unbound([source.captions, source.inspect])
+        saw_older = was_made_of(source.inspect, "data") not in (None, fingerprint(source.data))
         captions, dropped_here = load_captions(source.captions)
         by_source.append(captions)
         dropped += dropped_here
@@ -100,7 +107,8 @@ def gather(sources: list[Source], tracks: tuple[Track, ...], *, include_review: 
             else:
                 folder = stand(source.data, flight.folder)
                 own = captions.get((town_folder(flight.town), flight.trajectory, flight.variant), {})
-                chosen.append(Chosen(place, folder, ids[place], own))
+                sha256 = None if saw_older else flight.sha256
+                chosen.append(Chosen(place, folder, sha256, ids[place], own))
                 shown = ReleasedMap(town=place.town, **dict(read_town_map(folder.parent.parent)))
                 if shown not in maps:
                     maps.append(shown)
@@ -119,7 +127,16 @@ def _place(source: Source, flight: FlightInspection) -> Place:
     """Tell a flight's place from where it stands now: its tree may have been converted since the inspection.
 
     Folders above the town, in a tree of several, count as part of the run's name.
+
+    Raises:
+        InputError: the record of one flight has the folder of another.
     """
+    parts = Path(flight.folder).parts[-2:]
+    if parts != (flight.trajectory, flight.variant)[2 - len(parts) :]:
+        raise InputError(
+            "the record of one flight has the folder of another", where=source.inspect, got=flight.folder,
+            expected=f"a folder that ends in {flight.trajectory}/{flight.variant}", fix="run cosfly inspect again",
+        )  # fmt: skip
     town = stand(source.data, flight.folder).parent.parent.name
     return Place("_".join((source.run, *Path(flight.folder).parts[:-3])), town, flight.trajectory, flight.variant)
 

@@ -140,7 +140,7 @@ def test_records_of_others_are_not_ours(tmp_path, caplog):
     write_json(tmp_path / "map.json", [])
     provenance.checked_inputs({"map": tmp_path / "map.json"})
     assert provenance.verify([tmp_path / "map.json"]) == 0
-    assert "nothing here to verify against" in caplog.text
+    assert "there is no record to hold it against" in caplog.text
 
 
 def test_a_folder_without_checksums_is_as_good_as_one_with_them(run):

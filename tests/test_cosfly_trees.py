@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from specimens_foreign import NOBODY, write_foreign_tree
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.errors import InputError, VerifyError
+from cosfly.errors import InputError, NothingKept, VerifyError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.products.captions import read_captions
@@ -30,7 +30,8 @@ from cosfly.products.inspection import read_inspection
 from cosfly.products.places import Place, flight_ids, stand, town_folder
 from cosfly.products.playback import find_flights, read_flight, read_twin, write_flight
 from cosfly.render import older_trees
-from cosfly.store import read_checksums, sha256_file, write_checksums
+from cosfly.stage_folder import read_failures
+from cosfly.store import read_checksums, read_json, sha256_file, write_checksums, write_json
 from distill import dataset
 from distill.dataset import PrepareConfig
 from distill.schema import SPLITS, read_split
@@ -452,3 +453,44 @@ def test_a_tree_of_pictures_alone_is_released_without_depth(tmp_path):
     one.write_bytes(b"")  # one frame has it now, so the others lack it
     found = read_inspection(inspection.run(InspectConfig(), None, None, tree, tmp_path / "again"))
     assert sorted(flight.result for flight in found.flights) == ["accepted", "rejected"]
+
+
+def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_path):
+    tree = write_foreign_tree(tmp_path / "tree", num_points=11, files=("rgb.png",))
+    inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
+    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
+    alone = tmp_path / "alone"  # inspections travel without the records of their stage
+    alone.mkdir()
+    cfg, clean = ReleaseConfig(licence="mit", modalities=("rgb",)), find_flights(tree)[0]
+
+    def failed(out: str, source: Source) -> list[str]:
+        package.run(cfg, [source], tmp_path / out)
+        return [
+            f.message.split(";")[0].rpartition("trajectory_1777083733/")[2]
+            for f in read_failures(tmp_path / out / "failures.jsonl")
+        ]
+
+    picture = clean / "frames_playback/frame_00003/rgb.png"
+    before = picture.read_bytes()
+    picture.write_bytes((clean / "frames_playback/frame_00004/rgb.png").read_bytes())
+    source = Source("theirs", tree, captions, inspected)
+    assert failed("a", source) == ["ORI: the flight is not the one that was inspected"]
+    picture.write_bytes(before)
+    assert failed("a", source) == []
+    value = read_json(inspected)
+    one, two = value["flights"]
+    one["sha256"], two["sha256"] = two["sha256"], one["sha256"]
+    write_json(alone / "inspect.json", value)
+    with pytest.raises(NothingKept, match="verify 2"):
+        failed("b", replace(source, inspect=alone / "inspect.json"))
+    one["folder"], two["folder"] = two["folder"], one["folder"]
+    write_json(alone / "inspect.json", value)
+    with pytest.raises(InputError, match="the record of one flight has the folder of another"):
+        failed("c", replace(source, inspect=alone / "inspect.json"))
+
+
+def test_trajectories_of_one_name_in_several_runs_are_several(tmp_path):
+    for run in ("one", "two"):
+        write_foreign_tree(tmp_path / "tree" / run, num_points=11)
+    found = read_inspection(inspection.run(InspectConfig(), None, None, tmp_path / "tree", tmp_path / "inspect"))
+    assert (found.funnel.trajectories.planned, found.funnel.trajectories.accepted) == (2, 2)

@@ -54,6 +54,7 @@ def caption(
     check: Annotated[
         bool, typer.Option(help="Before the first request of a folder, try what the endpoint can do.")
     ] = True,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
@@ -68,6 +69,7 @@ def caption(
     cfg = options.resolve(config, overrides, chosen)
     tree = options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
+    options.verify_first(verify, tree, target)
     if check and cfg.caption.teacher_kind == "endpoint" and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption, [cfg.caption.writing])
     if plan_only:

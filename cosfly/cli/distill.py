@@ -32,12 +32,14 @@ def distill_prepare(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Captions to a training set with splits that share no trajectory."""
     from distill import dataset
 
     cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
+    options.verify_first(verify, captions, tree, out)
     typer.echo(dataset.run(cfg.distill.prepare, captions, tree, out, seed=cfg.seed, resume=resume))
 
 
@@ -50,12 +52,14 @@ def distill_train(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Train LoRA adapters; continues from its last checkpoint."""
     from distill import train
 
     cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
+    options.verify_first(verify, dataset, tree, out)
     typer.echo(train.run(cfg.distill.train, dataset, tree, model, out, seed=cfg.seed, resume=resume))
 
 
@@ -71,12 +75,14 @@ def distill_infer(
     data: options.Data = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Let the student answer a split; continues where it stopped."""
     from distill import infer
 
     cfg, tree = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folder(data)
+    options.verify_first(verify, dataset, tree, adapter, out)
     typer.echo(infer.run(cfg.distill.infer, dataset, tree, model, out, adapter=adapter, resume=resume))
 
 
@@ -91,11 +97,13 @@ def distill_evaluate(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """JSON parse rate, decision accuracy beside the majority floor, BERTScore beside a shuffled floor."""
     from distill import evaluate
 
     cfg = options.resolve(config, overrides, {"seed": seed})
+    options.verify_first(verify, predictions, dataset, out)
     given: Any = {"bertscore_model": bertscore_model, "seed": cfg.seed, "resume": resume}
     typer.echo(evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))

@@ -31,6 +31,10 @@ Resume = Annotated[
         help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
     ),
 ]
+Verify = Annotated[
+    bool,
+    typer.Option("--verify", help="First read every file of the finished stages that are used and compare its sha256."),
+]
 Out = Annotated[Path, typer.Option(help="Output folder.")]
 Map = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
 Data = Annotated[
@@ -101,6 +105,14 @@ def data_folder(data: Path | None) -> Path:
     raise InputError(
         "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
     )
+
+
+def verify_first(is_wanted: bool, *paths: Path | None) -> None:
+    """Hold inputs, and an output folder that holds something already, against their records before anything is done."""
+    from cosfly import provenance
+
+    if is_wanted:
+        provenance.verify(path for path in paths if path is not None and path.exists())
 
 
 def plain_table(title: str | None, rows: Iterable[Sequence[str | Text]]) -> Table:

@@ -25,6 +25,7 @@ def run(
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again to continue."""
@@ -32,6 +33,7 @@ def run(
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
+    options.verify_first(verify, *sorted(path.parent for path in out.glob("*/manifest.json")))
     results = pipeline.run(cfg, out, resume=resume)
     _closing_table(results, out)
     options.check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)

@@ -36,12 +36,14 @@ def simplify(
     out: options.Out,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
     from cosfly.simplify import stage
 
     cfg = options.resolve(config, overrides)
+    options.verify_first(verify, map_, out)
     typer.echo(stage.run(cfg.simplify, map_, out, resume=resume))
 
 
@@ -54,12 +56,14 @@ def pedestrians(
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
     from cosfly.pedestrians import stage
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.verify_first(verify, map_, roi, out)
     given = options.manner(cfg, resume) | {"seed": cfg.seed, "roi": roi or cfg.roi}
     options.tell_product(stage.run(cfg.pedestrians, map_, out, **given), out, cfg)
 
@@ -78,6 +82,7 @@ def plan(
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 4: a drone flight for every walk, drone_trace.json."""
@@ -87,6 +92,7 @@ def plan(
 
     box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.verify_first(verify, box_map, walks, folder)
     product = stage.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **options.manner(cfg, resume))
     options.tell_product(product, folder, cfg)
 
@@ -111,6 +117,7 @@ def plan_compare(
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
@@ -123,6 +130,7 @@ def plan_compare(
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     settings = cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
+    options.verify_first(verify, map_, paths, out)
     product = compare.run(compared, map_, paths, out, seed=cfg.seed, **options.manner(cfg, resume))
     for text in compare.text_tables(product):
         table = Table(title=text.title, title_justify="left")
@@ -144,12 +152,14 @@ def render(
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
     from cosfly.render import stage
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.verify_first(verify, map_, simplified, traces, out)
     product = stage.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)
 
@@ -173,12 +183,14 @@ def convert_tree(
     data: Annotated[Path, typer.Option(help="Playback tree of an earlier cosfly; it stays as it is.")],
     out: Annotated[Path, typer.Option(help="Folder of the converted tree.")],
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """An older playback tree to one that public readers of CosFly-Track take; pictures are linked, not copied."""
     from cosfly.render import older_trees
 
     cfg = options.resolve(None, None, {"workers": workers})
+    options.verify_first(verify, data, out)
     options.tell_product(older_trees.run(data, out, **options.manner(cfg, resume)), out, cfg)
 
 
@@ -196,11 +208,13 @@ def inspect(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     workers: options.Workers = None,
+    verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
     from cosfly.inspection import stage
 
-    cfg = options.resolve(config, overrides, {"workers": workers})
-    product = stage.run(cfg.inspect, map_, traces, options.data_folder(data), out, **options.manner(cfg, resume))
+    cfg, tree = options.resolve(config, overrides, {"workers": workers}), options.data_folder(data)
+    options.verify_first(verify, map_, traces, tree, out)
+    product = stage.run(cfg.inspect, map_, traces, tree, out, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)

@@ -5,6 +5,7 @@ The poses that were drawn are measured against the map themselves: a perturbed f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -26,7 +27,15 @@ from cosfly.flight_metrics import (
     smoothness_score,
 )
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
-from cosfly.inspection.frames import FrameNumbers, check_checksums, check_files, check_pixels, choose_frames, target_box
+from cosfly.inspection.frames import (
+    FrameNumbers,
+    check_checksums,
+    check_files,
+    check_pixels,
+    check_recorded,
+    choose_frames,
+    target_box,
+)
 from cosfly.inspection.report import FlightView, draw_flight
 from cosfly.issues import Report
 from cosfly.products.inspection import FlightInspection
@@ -34,6 +43,7 @@ from cosfly.products.inspection import Result as FlightResult
 from cosfly.products.playback import Flight, read_flight, read_twin
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.provenance import digest_of, folder_digests
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
@@ -99,13 +109,19 @@ class Inspected(BaseModel):
 
 
 def inspect_flight(
-    folder: Path, root: Path, traces: dict[str, DroneTrace] | None, obstacles: BoxIndex | None, cfg: InspectConfig
+    folder: Path,
+    root: Path,
+    traces: dict[str, DroneTrace] | None,
+    obstacles: BoxIndex | None,
+    cfg: InspectConfig,
+    recorded: Mapping[str, str],
 ) -> Inspected:
     """Check one flight folder.
 
     Args:
         traces: the plans by id; None where nobody here planned the flight.
         obstacles: of the map; None where there is none.
+        recorded: sha256 by path of what the tree's manifest lists; empty where it has none.
     Raises:
         InputError: `trajectory.json`, or that of the clean flight beside it, cannot be read at all; names the file and the field.
     """
@@ -124,6 +140,7 @@ def inspect_flight(
     check_shifts(flight, report, metrics)
     check_motion(flight, cfg, report)
     check_projection(flight, cfg, report)
+    check_recorded(flight, root, recorded, report)
     frames = _check_frames(flight, cfg, report)
     _rendered_metrics(flight, frames, cfg, report, metrics)
     issues = report.merged()
@@ -134,12 +151,21 @@ def inspect_flight(
         variant=flight.variant,
         is_original=flight.is_original,
         folder=folder.relative_to(root).as_posix(),
+        sha256=_digest(folder),
         trace_id=trace.path_id if trace else None,
         result=result,
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
     return Inspected(record=record, view=draw_flight(flight, _heights_m(flight), cfg.thumbnail_px))
+
+
+def _digest(folder: Path) -> str | None:
+    """Give the digest of a flight's files; None where its checksums cannot be read, which `check_checksums` reports."""
+    try:
+        return digest_of(folder_digests(folder))
+    except InputError:
+        return None
 
 
 def trace_id(flight: Flight) -> str:

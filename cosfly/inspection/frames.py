@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -169,6 +170,20 @@ def check_checksums(flight: Flight, report: Report) -> None:
             report.error("missing_file", name, "no such file", f"a file, listed in {CHECKSUMS}")
         elif sha256_file(path) != digest:
             report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
+
+
+def check_recorded(flight: Flight, root: Path, recorded: Mapping[str, str], report: Report) -> None:
+    """Compare a flight's own records with the manifest of its tree, `recorded`: path in the tree -> sha256; empty without one."""
+    assert flight.folder is not None
+    for name in ("trajectory.json", CHECKSUMS) if recorded else ():
+        path = flight.folder / name
+        digest = recorded.get(path.relative_to(root).as_posix())
+        if digest is None and name == "trajectory.json":
+            report.error(
+                "not_of_this_tree", name, "no such entry in the tree's manifest", "a flight that was made with it"
+            )
+        elif digest is not None and path.is_file() and sha256_file(path) != digest:
+            report.error("checksum", name, "other bytes", "the digest in the tree's manifest")
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from cosfly.products.inspection import (
 )
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.provenance import recorded_digests
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder
 from cosfly.store import validation_errors
@@ -35,9 +36,10 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
 
     obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
+    recorded = recorded_digests(data)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_flight(data / item.payload, data, by_id, obstacles, cfg)
+        inspected = inspect_flight(data / item.payload, data, by_id, obstacles, cfg, recorded)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None
@@ -124,9 +126,9 @@ def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
 
 def _with_twins_trace(flights: list[FlightInspection]) -> list[FlightInspection]:
     """Give an unreadable flight the trace of its twin in the same trajectory folder, so that the funnel counts it there."""
-    known = {(flight.town, flight.trajectory): flight.trace_id for flight in flights if flight.trace_id is not None}
+    known = {Path(flight.folder).parent: flight.trace_id for flight in flights if flight.trace_id is not None}
     return [
-        flight.model_copy(update={"trace_id": flight.trace_id or known.get((flight.town, flight.trajectory))})
+        flight.model_copy(update={"trace_id": flight.trace_id or known.get(Path(flight.folder).parent)})
         for flight in flights
     ]
 
@@ -138,7 +140,8 @@ def _trajectory_funnel(flights: list[FlightInspection], planned: list[DroneTrace
     """
     results: dict[str, set[str]] = {}
     for flight in flights:
-        name = f"{flight.town}/{flight.trajectory}" if planned is None else flight.trace_id
+        # Of several runs below one folder, trajectories of one name are several.
+        name = str(Path(flight.folder).parent) if planned is None else flight.trace_id
         if name is not None:
             results.setdefault(name, set()).add(flight.result)
     num_planned, planned = len(results) if planned is None else len(planned), planned or []

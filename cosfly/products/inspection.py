@@ -22,13 +22,17 @@ class _Strict(BaseModel):
 
 
 class FlightInspection(_Strict):
-    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown."""
+    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown.
+
+    sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one inspected.
+    """
 
     town: str
     trajectory: str
     variant: str
     is_original: bool | None = None  # None where nobody said: in inspections of before, and of what cannot be read
     folder: str
+    sha256: str | None = None  # None in inspections of before, and of what cannot be read
     trace_id: str | None
     result: Result
     issues: list[Issue]

@@ -67,7 +67,8 @@ def run(data: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resu
         return out
     items = [Item(folder.as_posix(), folder) for folder in folders]
     finished = run_items(stage, items, make_worker, (data, out), workers=workers, watch=watch, label="convert-tree")
-    outputs = [out / _renamed(Path(record.id)) / "trajectory.json" for record in finished.kept]
+    flights = [out / _renamed(Path(record.id)) for record in finished.kept]
+    outputs = [path for flight in flights for path in (flight / "trajectory.json", flight / CHECKSUMS) if path.exists()]
     for town in towns:
         outputs += link_files(data / town, out / town_folder(town))
     stage.finish(outputs, finished.tally)
