@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import platform
 import resource
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,51 +73,83 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
         stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, **working),
         stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
         stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
-        stage("release", out / "release/dataset", release.package.run, whole, **working),
+        _release(cfg, whole, out, resume),
     ]
 
 
+def _release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
+    work = partial(release.package.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg))
+    return Stage("release", out / "release/dataset", work)
+
+
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
-    """Make a data set: reads what the configuration names, writes one folder per stage below `out`.
+    """Make a data set: reads what the configuration names, writes one folder per stage below `out`; of several towns one run
+    folder for each, and `release`.
 
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
-    and `summary.json` in the run folder.
+    and `summary.json` in the run folder, in that of each town where there are several.
     """
-    choose_licence(cfg.release.licence, [(cfg.maps.source, cfg.maps.licence)])  # the last stage would ask for it
-    todo = stages(cfg, out, resume=resume)
-    for stage in todo:
-        refuse_link(out / stage.name)
+    towns = {name: cfg.of_town(name) for name in cfg.towns}
+    maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
+    choose_licence(cfg.release.licence, maps)  # the last stage would ask for it
+    if not towns:
+        return _run_town(cfg, out, stages(cfg, out, resume=resume))
+    for name in (*towns, "release"):
+        refuse_link(out / name)
+    with _run_folder(cfg, out):
+        results = []
+        for number, (name, town) in enumerate(towns.items(), 1):
+            log.info("town %d of %d: %s", number, len(towns), name)
+            own = stages(town, out / name, resume=resume)[:-1]  # the release is made of all
+            made = _run_town(town, out / name, own)
+            results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
+        joint = _release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
+        results.append(_do(joint, out, "all towns"))
+        _save_summary(results, out)
+    return results
+
+
+@contextlib.contextmanager
+def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
+    """Hold a run folder, and keep `run.yaml` in it: other settings replace it when every stage has taken them, not before."""
     with hold_folder(out):
         is_new = not (out / "run.yaml").exists()
         if is_new:
             _save_run(cfg, out)
-        results = _work(cfg, out, todo)
+        yield
+        if not is_new:
+            _save_run(cfg, out)
+
+
+def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
+    """Do the stages of one town."""
+    for stage in todo:
+        refuse_link(out / stage.name)
+    with _run_folder(cfg, out):
+        to_plan = not (out / "plan/manifest.json").exists()
+        results = []
+        with compiled_ahead(cfg.plan.planner, needed=to_plan) as wait_for_compiled:
+            for number, stage in enumerate(todo, 1):
+                if stage.name == "plan" and to_plan:
+                    wait_for_compiled()
+                results.append(_do(stage, out, f"{number}/{len(todo)}"))
         tree = out / "render"
         if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
             contact_sheet(tree, out / "contact_sheet.png")
             preview_gif(tree, out / "preview.gif")
         _save_summary(results, out)
-        if not is_new:
-            _save_run(cfg, out)  # not before every stage has taken these settings
     return results
 
 
-def _work(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
-    """Do the stages that are not complete."""
-    results = []
-    to_plan = not (out / "plan/manifest.json").exists()
-    with compiled_ahead(cfg.plan.planner, needed=to_plan) as wait_for_compiled:
-        for number, stage in enumerate(todo, 1):
-            was_complete = (out / stage.name / "manifest.json").exists()
-            if not was_complete:
-                log.info("[%d/%d] %s", number, len(todo), stage.name)
-            if stage.name == "plan" and not was_complete:
-                wait_for_compiled()
-            stage.work()  # refuses work of other settings, also where it is complete
-            if was_complete:
-                log.info("[%d/%d] %s: already complete", number, len(todo), stage.name)
-            results.append(StageResult(stage, read_manifest(out / stage.name), was_complete))
-    return results
+def _do(stage: Stage, out: Path, place: str) -> StageResult:
+    """Do a stage that is not complete; one that is refuses other settings."""
+    was_complete = (out / stage.name / "manifest.json").exists()
+    if not was_complete:
+        log.info("[%s] %s", place, stage.name)
+    stage.work()
+    if was_complete:
+        log.info("[%s] %s: already complete", place, stage.name)
+    return StageResult(stage, read_manifest(out / stage.name), was_complete)
 
 
 def _save_run(cfg: RunConfig, out: Path) -> None:

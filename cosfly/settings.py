@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from caption.schema import CaptionConfig
-from cosfly.config import Config
+from cosfly.chance import rng_for
+from cosfly.config import Config, build
+from cosfly.errors import ConfigError
 from cosfly.inspection.flight import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
@@ -22,6 +25,8 @@ from distill.evaluate import EvaluateConfig
 from distill.infer import InferConfig
 from distill.train import TrainConfig
 from release.package import ReleaseConfig
+
+TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 
 
 class DistillConfig(Config):
@@ -53,6 +58,11 @@ class RunConfig(Config):
     roi: Path | None = Field(
         None, description="region of interest for the pedestrians (a roi_polygon.json of yours); none: the whole map"
     )
+    towns: dict[str, dict[str, Any]] = Field(
+        {},
+        description="towns of one data set: name -> the settings that differ there; each is a run in a folder of its name, and one "
+        "release is made of all. `maps` of a town stands for itself. None: one town, as the settings below say",
+    )
     maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
     simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
     pedestrians: PedestriansConfig = Field(default_factory=PedestriansConfig, description="step 3")
@@ -62,6 +72,46 @@ class RunConfig(Config):
     caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
     release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
+
+    @model_validator(mode="after")
+    def _towns_can_be(self) -> RunConfig:
+        for name in self.towns:
+            if not TOWN_NAME.fullmatch(name) or name == "release":
+                raise ValueError(f"a town cannot be called {name!r}: letters, digits, _ and -, and not 'release'")
+            self.of_town(name)
+        return self
+
+    def of_town(self, name: str) -> RunConfig:
+        """Give the settings of one town's run. Its seed derives from the run's and its name, its map is called as it is.
+
+        Raises:
+            ConfigError: what is set for it cannot be; names the town and the setting.
+        """
+        changes = self.towns[name]
+        if "towns" in changes:
+            raise ConfigError("a town has no towns", where=f"towns.{name}.towns", fix="list them side by side")
+        maps = {"source": "synthetic"} | _mapping(changes.get("maps", {}), f"towns.{name}.maps")
+        source = str(maps["source"])
+        maps[source] = {"name": name} | _mapping(maps.get(source, {}), f"towns.{name}.maps.{source}")
+        shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {
+            "name": name, "seed": int(rng_for(self.seed, "run", name).integers(2**31)),
+        }  # fmt: skip
+        return build(RunConfig, _merged(shared, changes) | {"maps": maps}, f"towns.{name}")
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError("not a group of settings", where=where, got=repr(value)[:80])
+    return value
+
+
+def _merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Give the settings with the changes in them, group by group."""
+    merged = dict(settings)
+    for name, value in changes.items():
+        before = settings.get(name)
+        merged[name] = _merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
+    return merged
 
 
 def manner_of_work(cfg: RunConfig) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cosfly import pipeline
@@ -15,8 +16,10 @@ from cosfly.errors import ConfigError, ResumeError, StorageError
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.walks import read_paths as read_walks
 from cosfly.settings import RunConfig
 from cosfly.store import read_json
+from release.validate import verify
 
 TINY = [
     "pedestrians.num_paths=2",
@@ -247,3 +250,60 @@ def test_a_half_written_flight_is_a_counted_failure_that_can_be_mended(base, tmp
     work(tiny(), out, "inspect")
     assert read_json(out / "inspect/manifest.json")["counts"]["kept"] == 4
     assert products(out / "inspect") == products(base / "inspect")
+
+
+# --- several towns ----------------------------------------------------------------------------------------------------
+
+TOWNS = """
+towns={
+  one: {maps: {synthetic: {size_m: 150, num_blocks: 1}}},
+  two: {maps: {synthetic: {size_m: 160, num_blocks: 1, parked_share: 0.0}}, pedestrians: {num_paths: 1}},
+}"""
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory):
+    out = tmp_path_factory.mktemp("towns") / "run"
+    pipeline.run(load(RunConfig, None, [*TINY, TOWNS.strip()]), out)
+    return out
+
+
+def test_several_towns_are_runs_of_their_own_and_one_release(towns):
+    assert sorted(path.name for path in towns.iterdir()) == ["one", "release", "run.yaml", "summary.json", "two"]
+    for town, paths in (("one", 2), ("two", 1)):
+        assert read_json(towns / town / "pedestrians/manifest.json")["counts"]["input"] == paths
+        assert not (towns / town / "release").exists()
+        assert (towns / town / "contact_sheet.png").exists()
+    numbers = read_json(towns / "release/dataset/release.json")["numbers"]
+    assert set(numbers["frames_by"]["town"]) == {"Town_one", "Town_two"}
+    assert verify(towns / "release/dataset").is_ok
+    stages = [row["stage"] for row in read_json(towns / "summary.json")["stages"]]
+    assert stages == [*(f"one/{name}" for name in STAGES[:-1]), *(f"two/{name}" for name in STAGES[:-1]), "release"]
+
+
+def test_towns_differ_in_more_than_their_maps(towns):
+    """The same walk ids in both; were their seed the same, so were their draws."""
+    first = [read_walks(towns / town / "pedestrians/path.json")[0].positions_m for town in ("one", "two")]
+    assert first[0].shape != first[1].shape or not np.allclose(first[0], first[1])
+    seeds = [read_json(towns / town / "plan/stage.json")["seed"] for town in ("one", "two")]
+    assert seeds[0] != seeds[1]
+
+
+def test_a_run_of_towns_goes_on_from_its_own_run_yaml(towns):
+    before = {path: path.stat().st_mtime_ns for path in towns.rglob("manifest.json")}
+    again = pipeline.run(load(RunConfig, towns / "run.yaml"), towns)
+    assert all(result.was_complete for result in again)
+    assert len(again) == 15
+    assert {path: path.stat().st_mtime_ns for path in towns.rglob("manifest.json")} == before
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [("towns={release: {}}", "cannot be called 'release'"), ("towns={../x: {}}", "cannot be called"),
+     ("towns={a: {plan: {plannner: muco}}}", "towns.a.*plannner.*did you mean 'planner'"),
+     ("towns={a: {maps: 3}}", "towns.a.maps"), ("towns={a: {maps: {source: synthetic, synthetic: []}}}", "not a group"),
+     ("towns={a: {towns: {b: {}}}}", "a town has no towns"), ("towns=[a]", "valid dictionary")],
+)  # fmt: skip
+def test_a_town_that_cannot_be_is_refused(given, words):
+    with pytest.raises(ConfigError, match=words):
+        load(RunConfig, None, [given])

@@ -19,7 +19,7 @@ app = typer.Typer()
 @app.command()
 def run(
     config: Annotated[
-        Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, simworld, delft.")
+        Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, diverse, simworld, delft.")
     ],
     out: Annotated[Path | None, typer.Option(help="Run folder; by default runs/<name>.")] = None,
     overrides: options.Overrides = None,
@@ -57,7 +57,8 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
         table.add_row(result.stage.name, f"{counts.kept} of {counts.input}", dropped, failed, seconds, product)
     console.print(table)
     for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
-        console.print(f"  look at  {os.path.relpath(out / name)}", soft_wrap=True)
+        if (out / name).exists():  # of several towns only the release is here
+            console.print(f"  look at  {os.path.relpath(out / name)}", soft_wrap=True)
 
 
 config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
