@@ -14,7 +14,7 @@ LONGEST_LOG = 20_000  # of one log record, which may be the traceback of a bug
 # What a terminal obeys instead of printing (C0, DEL, C1), and what turns the order of letters round (bidirectional controls).
 # Line feed and tab are harmless; whoever wants one line splits and joins before.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_MARKDOWN = re.compile(r"([\\`*_\[\]|~#])")
+_MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  # within a word, _ means itself
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
