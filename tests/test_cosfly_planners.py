@@ -88,13 +88,15 @@ def plain_terms(points, problem, obstacles):
             terms["safety"] += weights[3] * 0.5 * (8.0 - gap) ** 2
         window = [p] + [p + sign * 0.5 * axis for axis in np.eye(3) for sign in (1, -1)]
         seen = kernels.visibility(obstacles, np.array(window), np.repeat(x[None], 7, axis=0)).mean()
-        terms["visibility"] += weights[4] * (1 - seen) ** 2
+        terms["visibility"] += weights[4] * (1 - seen) ** 2 * problem.keeps_sight[i]
         pitch, yaw = look_at(p, x)
         turn = np.angle(np.exp(1j * (yaw - problem.views_rad[i])))
-        terms["view_angle"] += weights[5] * ((-pitch - problem.pitches_rad[i, 1]) ** 2 + turn**2)
+        terms["view_angle"] += weights[5] * ((-pitch - problem.pitches_rad[i, 1]) ** 2)
+        terms["view_angle"] += problem.bearing_weight * turn**2
         outside = max(problem.pitches_rad[i, 0] + pitch, 0) + max(-pitch - problem.pitches_rad[i, 2], 0)
         terms["pitch"] += 20 * outside**2
         terms["altitude"] += 50 * max(problem.altitudes[i, 0] - p[2], 0) ** 2
+        terms["altitude"] += problem.altitude_weights[3] * max(problem.altitudes[i, 1] - p[2], 0) ** 2
         terms["altitude"] += 20 * max(p[2] - problem.altitudes[i, 1], 0) ** 2
     terms["smoothness"] = weights[1] * (np.diff(points, n=2, axis=0) ** 2).sum()
     terms["jerk"] = weights[2] * (np.diff(points, n=3, axis=0) ** 2).sum()
@@ -132,9 +134,8 @@ def test_the_wish_of_each_waypoint_reaches_the_loss():
     paper = muco.make_problem(scenario, CFG)
     np.testing.assert_array_equal(paper.pitches_rad, np.tile(np.radians([30, 45, 60]), (num, 1)))
     np.testing.assert_array_equal(paper.altitudes, np.tile([20.0, 20.0, 100.0], (num, 1)))
-    np.testing.assert_array_equal(
-        paper.views_rad, scenario.wish.heading_rad
-    )  # behind looks the way that the walker goes
+    assert (paper.bearing_weight, paper.altitude_weights[3]) == (1.0, 0.0)
+    np.testing.assert_array_equal(paper.views_rad, scenario.wish.heading_rad)  # the way that the walker goes
     wished = Wish(
         heading_rad=scenario.wish.heading_rad,
         bearing_rad=np.linspace(-3.0, 3.0, num),
@@ -144,6 +145,7 @@ def test_the_wish_of_each_waypoint_reaches_the_loss():
         altitude_m=np.linspace(8.0, 50.0, num),
         altitude_min_m=np.linspace(6.0, 40.0, num),
         altitude_max_m=np.full(num, 90.0),
+        keeps_sight=np.arange(num) % 2 == 0,
     )
     problem = muco.make_problem(replace(scenario, wish=wished), CFG)
     points = wished.places_m(scenario.targets_m, scenario.ground_m)
@@ -192,7 +194,8 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
     quadratic = problem._replace(
         weights=problem.weights * np.array([0, 1, 1, 0, 0, 0, 0]),
         pitch_weight=0.0,
-        altitude_weights=np.array([0, 0, 8.0]),
+        bearing_weight=0.0,
+        altitude_weights=np.array([0, 0, 8.0, 0]),
     )
     state, unmasked = loss.make_state(len(points), 0), np.zeros(len(points), dtype=bool)
 
@@ -212,7 +215,7 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
 def test_masked_waypoints_have_no_visibility_or_view_gradient():
     points, problem, obstacles = shaken("tower_behind")
     only = problem._replace(
-        weights=problem.weights * np.array([0, 0, 0, 0, 1, 1, 0]), pitch_weight=0.0, altitude_weights=np.zeros(3)
+        weights=problem.weights * np.array([0, 0, 0, 0, 1, 1, 0]), pitch_weight=0.0, altitude_weights=np.zeros(4)
     )
     state = loss.make_state(len(points), len(obstacles.rows))
     free = loss.evaluate(points, only, obstacles, np.zeros(len(points), dtype=bool), state)

@@ -72,6 +72,12 @@ class MucoConfig(Config):
     weight_below: float = Field(50.0, ge=0, description="weight of squared altitude below altitude_min_m")
     weight_above: float = Field(20.0, ge=0, description="weight of squared altitude above altitude_preferred_m")
     weight_oscillation: float = Field(8.0, ge=0, description="weight of the squared change of altitude per step")
+    weight_bearing: float = Field(
+        20.0, ge=0, description="weight of squared azimuth deviation of styles other than follow, per rad^2"
+    )
+    weight_beneath: float = Field(
+        2.0, ge=0, description="weight of squared altitude beneath the wished one of styles other than follow"
+    )
     weight_pitch: float = Field(
         20.0, ge=0, description="weight of squared pitch outside pitch_band_deg, per rad^2 (the paper names none)"
     )
@@ -189,7 +195,8 @@ class Wish:
     counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point; ground_distance_m: in
     the plane. pitch_rad: downward pitch of the view. Two of the three would do, but the paper's do not agree with each other.
     altitude_m: above the ground under the walker; altitude_min_m and altitude_max_m are bounds, which a flight keeps.
-    any_bearing: a search may stand anywhere round the walker for the sake of sight and begins at the bearing.
+    keeps_sight: bool, whether the walker is to be seen; elsewhere a planner gives up nothing for it. any_bearing: the paper's way,
+    to whose planners the bearing is a beginning and a weak wish; elsewhere the bearing and the altitude are what the flight is for.
     """
 
     heading_rad: np.ndarray
@@ -200,6 +207,7 @@ class Wish:
     altitude_m: np.ndarray
     altitude_min_m: np.ndarray
     altitude_max_m: np.ndarray
+    keeps_sight: np.ndarray
     any_bearing: bool = False
 
     @property

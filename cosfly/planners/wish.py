@@ -25,6 +25,7 @@ def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Wish:
         altitude_m=np.full(num, cfg.altitude_preferred_m),
         altitude_min_m=np.full(num, cfg.altitude_min_m),
         altitude_max_m=np.full(num, cfg.altitude_max_m),
+        keeps_sight=np.ones(num, dtype=bool),
         any_bearing=True,
     )
 

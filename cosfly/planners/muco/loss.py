@@ -22,7 +22,7 @@ TERM_NAMES = (
 TRACKING, SMOOTHNESS, JERK, SAFETY, VISIBILITY, VIEW_ANGLE, PATH_LENGTH, ALTITUDE, PITCH = range(9)
 LEAST, PREFERRED, GREATEST = range(3)  # altitudes
 LOW_PITCH, WISHED_PITCH, HIGH_PITCH = range(3)
-BELOW, ABOVE, SWING = range(3)  # altitude weights; the swing is the oscillation
+BELOW, ABOVE, SWING, BENEATH = range(4)  # altitude weights; the swing is the oscillation
 BAND_ROWS = 10  # jerk couples x_i with x_{i+3}, nine places on in x_0 y_0 z_0 x_1 ...
 
 SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
@@ -34,7 +34,8 @@ class Problem(NamedTuple):
 
     targets: (n, 3) m, hip points. views_rad: (n,) wished azimuth of the view. distances: (n,) m, wished. weights: (7,) in the order
     of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m. pitches_rad: (n, 3) lower edge of the
-    band, wished, upper edge. altitude_weights: (3,) below, above, oscillation.
+    band, wished, upper edge. keeps_sight: (n,) bool, whether a waypoint has a visibility term. bearing_weight: of the view's azimuth.
+    altitude_weights: (4,) below the least, above the preferred, oscillation, beneath the preferred.
     """
 
     targets: np.ndarray
@@ -42,6 +43,8 @@ class Problem(NamedTuple):
     distances: np.ndarray
     weights: np.ndarray
     altitudes: np.ndarray
+    keeps_sight: np.ndarray
+    bearing_weight: float
     altitude_weights: np.ndarray
     pitches_rad: np.ndarray
     influence_m: float
@@ -142,6 +145,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
     anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
     targets, views, weights = problem.targets, problem.views_rad, problem.weights
     distances, pitches = problem.distances, problem.pitches_rad
+    bearing_weight, beneath = problem.bearing_weight, problem.altitude_weights[BENEATH]
     influence, half_safety = problem.influence_m, 0.5 * weights[SAFETY]
     below, above = problem.altitude_weights[BELOW], problem.altitude_weights[ABOVE]
     for i in range(begin, end):
@@ -176,7 +180,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
         turn = np.arctan2(-dy, -dx) - views[i]
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
         tx, ty = -dy / flat / flat, dx / flat / flat
-        _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], turn, tx, ty, 0.0, is_free)
+        _add_square(terms, gradient, band, VIEW_ANGLE, i, bearing_weight, turn, tx, ty, 0.0, is_free)
         outside = min(pitch - pitches[i, LOW_PITCH], 0.0) + max(pitch - pitches[i, HIGH_PITCH], 0.0)
         if outside != 0.0:
             _add_square(terms, gradient, band, PITCH, i, problem.pitch_weight, outside, px, py, pz, True)
@@ -185,6 +189,8 @@ def point_terms(points, begin, end, problem, index, masked, state):
             _add_square(terms, gradient, band, ALTITUDE, i, below, low - z, 0.0, 0.0, -1.0, True)
         if z > high:
             _add_square(terms, gradient, band, ALTITUDE, i, above, z - high, 0.0, 0.0, 1.0, True)
+        elif beneath > 0.0:
+            _add_square(terms, gradient, band, ALTITUDE, i, beneath, high - z, 0.0, 0.0, -1.0, True)
 
 
 @njit(cache=True)
@@ -202,6 +208,8 @@ def visibility_terms(points, problem, index, masked, state):
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         visible[i] = 1.0
+        if not problem.keeps_sight[i]:
+            continue
         tx, ty, tz = targets[i, 0], targets[i, 1], targets[i, 2]
         count = known(anchors, num_on_view, i, x, y, z)
         if count > 0:

@@ -49,7 +49,11 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
         distances=wish.distance_m,
         weights=weights,
         altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1),
-        altitude_weights=np.array([muco.weight_below, muco.weight_above, muco.weight_oscillation]),
+        keeps_sight=wish.keeps_sight,
+        bearing_weight=muco.weight_view_angle if wish.any_bearing else muco.weight_bearing,
+        altitude_weights=np.array(
+            [muco.weight_below, muco.weight_above, muco.weight_oscillation, 0.0 if wish.any_bearing else muco.weight_beneath]
+        ),
         pitches_rad=np.stack([low, wish.pitch_rad, high], axis=1),
         influence_m=muco.influence_m,
         difference_m=muco.difference_m,
@@ -76,7 +80,8 @@ def start_trajectory(
     targets = problem.targets
     plain = scenario.wish.places_m(targets, scenario.ground_m)
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
-    if plain_is_free and visibility(obstacles, plain, targets).mean() >= cfg.muco.start_visibility:
+    seen = np.where(problem.keeps_sight, visibility(obstacles, plain, targets), 1.0)
+    if plain_is_free and seen.mean() >= cfg.muco.start_visibility:
         return plain, "behind"
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):

@@ -25,6 +25,7 @@ BETWEEN_KEYS_S = 3.0
 
 # Costs of the search, in units of "the target fully hidden for one key frame" = 1.
 TURN_COST = 0.5  # looking from the side opposite to the wished one
+TURN_COST_OF_STYLES = 8.0  # where the bearing is what the flight is for: 64 degrees are as dear as the hidden target
 CLIMB_COST = 0.6  # each preferred altitude more
 STEEP_COST = 0.1  # a ring other than the normal one
 MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
@@ -57,8 +58,10 @@ def search_start(
     places = np.stack([x, y, z], axis=-1).reshape(len(keys), -1, 3)
     turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
-    extra = TURN_COST * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, index, clearance_m, cfg.speed_max_mps)
+    turn_cost = TURN_COST if wish.any_bearing else TURN_COST_OF_STYLES
+    extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
+    sight = wish.keeps_sight[keys]
+    chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, sight, index, clearance_m, cfg.speed_max_mps)
     if chosen[0] < 0:
         return None
     path = places[np.arange(len(keys)), chosen]
@@ -78,11 +81,11 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 
 
 @njit(cache=True)
-def _search(places, targets, times, extra, index, clearance_m, speed_max_mps):
+def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_mps):
     """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place whatever
-    is seen from it.
+    is seen from it. sight: (m,) bool, whether what is seen counts.
     """
     num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
     blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
@@ -94,8 +97,10 @@ def _search(places, targets, times, extra, index, clearance_m, speed_max_mps):
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
             own[c] = np.inf
             if gap >= clearance_m:
-                count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
-                seen = free_rays(index, blockers, count, p[0], p[1], p[2], x)
+                seen = 1.0
+                if sight[key]:
+                    count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
+                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], x)
                 own[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
         if key == 0:
             for c in range(num_places):

@@ -61,12 +61,13 @@ class Costs(NamedTuple):
     """Weights and lengths of the search; weights: (5,), places below.
 
     ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at each layer, NaN
-    where any on the ring will do. start: (3,).
+    where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
     """
 
     weights: np.ndarray
     ring_m: np.ndarray
     wished: np.ndarray
+    sight: np.ndarray
     least_z: np.ndarray
     preferred_z: np.ndarray
     greatest_z: np.ndarray
@@ -123,6 +124,7 @@ def search_flight(
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
         ring_m=wish.ground_distance_m[frames], wished=np.full_like(places, np.nan) if wish.any_bearing else places,
+        sight=settings.weight_visibility * wish.keeps_sight[frames],
         least_z=highest(wish.altitude_min_m), preferred_z=preferred_z,
         greatest_z=minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames],
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
@@ -332,13 +334,13 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
     for k in range(len(touched)):  # those that would stay if all saw everything
         if bounds[k] <= limit:
-            total[k] = bounds[k] + costs.weights[VISIBILITY] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
     if num < len(touched):
         limit = np.partition(total, beam - 1)[beam - 1]
     for k in range(len(touched)):  # and those that are cheaper than what has turned out to be hidden
         if total[k] == np.inf and bounds[k] < limit:
-            total[k] = bounds[k] + costs.weights[VISIBILITY] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
             if num % 256 == 0:
                 limit = np.partition(total, beam - 1)[beam - 1]
