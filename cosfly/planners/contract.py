@@ -29,6 +29,7 @@ from cosfly.flight_metrics import (
     SAFETY_DISTANCE_M,
 )
 from cosfly.geometry import DT_S
+from cosfly.planners.styles.table import FOLLOW, NAMES
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
@@ -170,10 +171,33 @@ class PlanConfig(Config):
         ACCEL_RMS_MAX_MPS2, gt=0, description="drop a flight of greater RMS acceleration, m/s^2"
     )
     jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="drop a flight of greater RMS jerk, m/s^3")
+    styles: dict[str, float] = Field(
+        {FOLLOW: 1.0},
+        description="shares of the styles that flights are drawn from, by name; they need not add up to one",
+    )
+    segment_s: float = Field(
+        0.0, ge=0, description="length of the parts of a flight that draw a style each, about, s; 0: one style a flight"
+    )
+    styles_fallback: Literal["drop", "follow"] = Field(
+        "drop",
+        description="a style that the map cannot hold: drop the flight, or fly follow instead; counted either way",
+    )
     muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
     track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
 
     _is_known = field_validator("planner")(known_planner)
+
+    @field_validator("styles")
+    @classmethod
+    def _are_shares(cls, shares: dict[str, float]) -> dict[str, float]:
+        for name, share in shares.items():
+            if name not in NAMES:
+                raise ValueError(f"there is no style {name!r}{nearest(name, NAMES)}; there are {', '.join(NAMES)}")
+            if share < 0:
+                raise ValueError(f"the share of {name} must not be negative, got {share}")
+        if sum(shares.values()) <= 0:
+            raise ValueError("the shares of the styles must add up to more than 0")
+        return shares
 
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:

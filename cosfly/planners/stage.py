@@ -7,6 +7,7 @@ Compiled code is imported by the functions that need it: `cosfly --help` goes wi
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,9 @@ import numpy as np
 from cosfly.chance import rng_for
 from cosfly.errors import InputError, NoPathError
 from cosfly.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
-from cosfly.geometry import DT_S, look_at, step_s
+from cosfly.geometry import DT_S, step_s
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
+from cosfly.planners.styles.table import FOLLOW
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
@@ -26,6 +28,7 @@ from cosfly.store import write_bytes
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
+    from cosfly.planners.styles.drawing import Intent
 
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
@@ -69,14 +72,41 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
 
 
 def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
-    """Plan, measure and check one flight.
+    """Plan, measure and check one flight in a style drawn for it; in that of the paper instead where it fails and the settings say so.
 
     Raises:
         NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
     """
-    from cosfly.kernels import segments_hit, signed_distances, visibility
+    from cosfly.planners.styles.drawing import Intent, draw_intent
 
     scenario = make_scenario(walk, obstacles, cfg)
+    intent = draw_intent(scenario, obstacles, cfg, style_rng(walk, seed))
+    has_other = bool(intent.segments) and cfg.styles_fallback == "follow"
+    try:
+        trace = _fly(walk, scenario, intent, obstacles, cfg, seed)
+        reason = trace.drop_reason
+    except NoPathError:
+        if not has_other:
+            raise
+        reason = "no_path"
+    if reason is None or not has_other:
+        return trace
+    follows = _fly(walk, scenario, Intent(scenario.wish), obstacles, cfg, seed)
+    return replace(follows, instead_of=f"{intent.styles}: {reason}")
+
+
+def style_rng(walk: Walk, seed: int) -> np.random.Generator:
+    """Give the generator of a flight's style. Walks of other maps have the same ids, so the place where it begins is in it."""
+    x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
+    return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}")
+
+
+def _fly(walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
+    from cosfly.kernels import segments_hit, signed_distances, visibility
+    from cosfly.planners.styles.camera import view_of
+    from cosfly.planners.styles.drawing import why_not_held
+
+    scenario = replace(scenario, wish=intent.wish)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
     positions = np.round(made.positions_m, 4)  # measured as it is written
     targets = np.round(scenario.targets_m, 4)
@@ -87,10 +117,12 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
             f"planner {cfg.planner} found no flight that is free of collisions", where=walk.path_id,
             got=f"a least clearance of {clearances.min():.2f} m", expected=f"{cfg.relaxed_safety_m:g} m and no segment in a box",
         )  # fmt: skip
-    pitch, yaw = look_at(positions, targets)
+    seen, judged = visibility(obstacles, positions, targets), intent.wish.keeps_sight
+    pitch, yaw = view_of(intent, positions, targets, seen, scenario.dt_s)
     rotations = np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1))
-    seen = visibility(obstacles, positions, targets)
-    metrics = flight_metrics(positions, targets, seen, clearances, scenario.ground_m, scenario.dt_s)
+    counted = seen[judged] if judged.any() else seen
+    metrics = flight_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
+    reason = drop_reason(metrics, cfg, made.is_converged, is_judged_by_sight=bool(judged.any()))
     return DroneTrace(
         path_id=walk.path_id,
         planner=cfg.planner,
@@ -102,16 +134,20 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
         clearances_m=clearances,
         metrics=metrics,
         solver=made.solver,
-        drop_reason=drop_reason(metrics, cfg, made.is_converged),
+        drop_reason=reason or why_not_held(intent, scenario, positions, seen),
+        segments=intent.segments,
+        mission=intent.mission,
         pace=walk.pace,
     )
 
 
-def drop_reason(metrics: dict[str, float], cfg: PlanConfig, is_converged: bool) -> str | None:
+def drop_reason(
+    metrics: dict[str, float], cfg: PlanConfig, is_converged: bool, *, is_judged_by_sight: bool = True
+) -> str | None:
     """Give why the prefilter before rendering rejects a flight, None if it passes (sec:step6, sec:dataset_stats)."""
     if not is_converged:
         return "not_converged"
-    if metrics["five_ray_mean"] < cfg.five_ray_mean_min:
+    if is_judged_by_sight and metrics["five_ray_mean"] < cfg.five_ray_mean_min:
         return "low_visibility"
     if metrics["accel_rms_mps2"] > cfg.accel_rms_max_mps2:
         return "high_acceleration"
@@ -145,6 +181,7 @@ def warm_up(cfg: PlanConfig) -> None:
     positions = np.column_stack([0.5 * walk, np.zeros(8), np.zeros(8)])
     # One box that hides the walk from behind: the search for a start runs too.
     obstacles = index_boxes(np.array([[-10.0, 0.0, 15.0]]), np.array([[1.0, 3.0, 15.0]]), np.eye(3)[None])
+    cfg = cfg.model_copy(update={"styles": {FOLLOW: 1.0}})
     plan_flight(Walk("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0)
 
 
@@ -196,7 +233,23 @@ def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[Kept | Dropp
     return {
         "num_boxes": len(box_map),
         "planning_ms": {"mean": round(float(times_ms.mean()), 1), "max": round(float(times_ms.max()), 1)},
+        **_styles_flown(traces),
         "means": {name: round(float(np.mean([trace.metrics[name] for trace in traces])), 4) for name in names},
+    }
+
+
+def _styles_flown(traces: list[DroneTrace]) -> dict:
+    """Count the parts of kept flights by style, and the flights whose style the map did not hold; nothing where all follow."""
+    styled = [trace for trace in traces if trace.segments or trace.instead_of]
+    if not styled:
+        return {}
+    parts = [part.style for trace in traces if not trace.drop_reason for part in trace.segments]
+    not_held = [trace.instead_of for trace in styled if trace.instead_of]
+    dropped = [f"{', '.join(p.style for p in t.segments)}: {t.drop_reason}" for t in styled if t.drop_reason]
+    return {
+        "styles": dict(sorted(Counter(parts).items())),
+        "styles_flown_as_follow": dict(sorted(Counter(not_held).items())),
+        "styles_dropped": dict(sorted(Counter(dropped).items())),
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import column, records, rounded, text_id
+from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.store import check_schema, read_json, write_json
 
@@ -23,6 +24,8 @@ class DroneTrace:
     time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the target.
     targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
     clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts.
+    segments: the styles of its parts, none where it follows from end to end. mission: the order that ended the pursuit. instead_of: the
+    style that it should have had and the map did not hold, and why. On the way home and in a search the camera looks elsewhere.
     drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are rendered.
     pace: of the walk.
     """
@@ -38,6 +41,9 @@ class DroneTrace:
     metrics: dict = field(default_factory=dict)
     solver: dict = field(default_factory=dict)
     drop_reason: str | None = None
+    segments: tuple[Segment, ...] = ()
+    mission: Mission | None = None
+    instead_of: str | None = None
     pace: str = PLAIN_PACE
 
     def as_json(self) -> dict:
@@ -47,6 +53,8 @@ class DroneTrace:
             "planner": self.planner,
             **pace_field(self.pace),
             "drop_reason": self.drop_reason,
+            **flown_as_json(self.segments, self.mission),
+            **({"instead_of": self.instead_of} if self.instead_of else {}),
             "metrics": self.metrics,
             "solver": self.solver,
             "t": rounded(self.time_s, 4),
@@ -72,6 +80,8 @@ class DroneTrace:
             text_id(record, where), str(record.get("planner", "")), time_s, groups["drone"][:, :3], groups["drone"][:, 3:],
             groups["target"], column(record, "visibility", where, len(time_s)),
             column(record, "clearance", where, len(time_s)), record.get("metrics", {}), record.get("solver", {}), record.get("drop_reason"),
+            read_segments(record.get("segments"), len(time_s), f"{where}.segments"),
+            read_mission(record.get("mission"), len(time_s), f"{where}.mission"), record.get("instead_of"),
             pace_of(record, where),
         )  # fmt: skip
 

@@ -52,7 +52,12 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
         keeps_sight=wish.keeps_sight,
         bearing_weight=muco.weight_view_angle if wish.any_bearing else muco.weight_bearing,
         altitude_weights=np.array(
-            [muco.weight_below, muco.weight_above, muco.weight_oscillation, 0.0 if wish.any_bearing else muco.weight_beneath]
+            [
+                muco.weight_below,
+                muco.weight_above,
+                muco.weight_oscillation,
+                0.0 if wish.any_bearing else muco.weight_beneath,
+            ]
         ),
         pitches_rad=np.stack([low, wish.pitch_rad, high], axis=1),
         influence_m=muco.influence_m,

@@ -1,0 +1,156 @@
+"""From rows of the table to a wish: the parts of a flight one after another, without jumps.
+
+A course is azimuth (world, radians), distance in the plane (m) and altitude (m), a row for each frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from cosfly.planners.contract import PlanConfig, Scenario, Wish
+from cosfly.planners.styles.table import ALTITUDE_LEAST_M, FOLLOW, TABLE, Range, Style
+
+if TYPE_CHECKING:
+    from cosfly.kernels import BoxIndex
+
+# How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
+APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 2.5
+# Least and greatest speed of a distance and of a height that change all through a part.
+EVEN_APART_MPS, EVEN_CLIMB_MPS = (0.8, 2.0), (1.0, 2.2)
+ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
+STEADY_RAD = np.radians(20.0)  # a drone does not swing round for a walker who turns by less
+
+# Parameters are drawn anew so often, until sight less the share of places too near to a box is as good as this.
+DRAWS, GOOD = 8, 0.97
+WAY_ROUND = 0.2  # of that is the price of half the way round the walker from the part before
+
+
+def wish_of(
+    names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
+) -> Wish:
+    """Give the wish of a flight whose parts, equally long, have these styles; the scenario's own wish is that of `follow`."""
+    num, paper = len(scenario.targets_m), scenario.wish
+    course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
+    cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
+    for name, begin, end in zip(names, cuts[:-1], cuts[1:], strict=True):
+        part = slice(begin, end)
+        if name == FOLLOW:
+            azimuth = paper.heading_rad[part] + np.pi
+            course[part] = np.column_stack([azimuth, paper.ground_distance_m[part], paper.altitude_m[part]])
+            continue
+        before = float(course[begin - 1, 0]) if begin else None
+        course[part] = _best_course(TABLE[name], part, before, scenario, obstacles, cfg, rng)
+        paces_mps[part] = rng.uniform(*TABLE[name].pace_mps)
+    return without_jumps(course, scenario, cfg, paces_mps)
+
+
+def without_jumps(
+    course: np.ndarray, scenario: Scenario, cfg: PlanConfig, paces_mps: np.ndarray | float = APART_MPS
+) -> Wish:
+    """Make a wish of a course, (n, 3): steps become ways at the speeds above, those of the distance at paces_mps; corners are rounded."""
+    num, dt_s, paper = len(course), scenario.dt_s, scenario.wish
+
+    def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
+        slewed = _slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
+        return gaussian_filter1d(slewed, ROUNDING_S / dt_s, mode="nearest")
+
+    apart_m, altitude_m = followed(course[:, 1], paces_mps), followed(course[:, 2], CLIMB_MPS)
+    azimuth = followed(np.unwrap(course[:, 0]), ROUND_MPS / np.maximum(apart_m, 1.0))
+    over_hips_m = altitude_m - (scenario.targets_m[:, 2] - scenario.ground_m)
+    return replace(
+        paper,
+        bearing_rad=azimuth - paper.heading_rad,
+        distance_m=np.hypot(over_hips_m, apart_m),
+        ground_distance_m=apart_m,
+        pitch_rad=np.arctan2(over_hips_m, apart_m),
+        altitude_m=altitude_m,
+        altitude_min_m=np.full(num, min(ALTITUDE_LEAST_M, cfg.altitude_min_m)),
+        any_bearing=False,
+    )
+
+
+def _best_course(
+    style: Style, part: slice, before: float | None, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """Draw the parameters of a part until its places see the walker and are free, or take the best of DRAWS; (k, 3)."""
+    from cosfly.kernels import signed_distances, visibility
+
+    targets_m, heading_rad = scenario.targets_m[part], scenario.wish.heading_rad[part]
+    best, best_score = np.empty(0), -np.inf
+    for _ in range(DRAWS):
+        course = _course(style, targets_m, heading_rad, before, scenario.dt_s, rng)
+        away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
+        places = np.column_stack([targets_m[:, :2] + away, scenario.ground_m[part] + course[:, 2]])
+        is_near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
+        score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
+        if before is not None:
+            score -= WAY_ROUND * abs(np.angle(np.exp(1j * (course[0, 0] - before)))) / np.pi
+        if score > best_score:
+            best, best_score = course, score
+        if score >= GOOD:
+            break
+    return best
+
+
+def _course(
+    style: Style,
+    targets_m: np.ndarray,
+    heading_rad: np.ndarray,
+    before: float | None,
+    dt_s: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Draw the course of one part, (k, 3). before: azimuth where the part before ended."""
+    seconds = np.arange(len(targets_m)) * dt_s
+    apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
+    altitude_m = _even(style.altitude_m, style.altitude_end_m, EVEN_CLIMB_MPS, seconds, rng)
+    if style.bearing_deg is None:
+        bearing = rng.uniform(-np.pi, np.pi) if before is None else before - heading_rad[0]
+    else:
+        bearing = np.radians(rng.uniform(*style.bearing_deg)) * (-1 if style.either_side and rng.random() < 0.5 else 1)
+    if style.hop_s is None:
+        azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / apart_m
+        return np.column_stack([azimuth, apart_m, altitude_m])
+    # A walker who comes nearer is so far away at the end of the halt, one who leaves at its beginning.
+    share, places, begin = 0.5 * (1.0 + np.cos(bearing)), np.empty((len(targets_m), 2)), 0
+    while begin < len(targets_m):
+        end = min(begin + max(2, round(rng.uniform(*style.hop_s) / dt_s)), len(targets_m))
+        moment = begin + round(share * (end - 1 - begin))
+        azimuth = heading_rad[moment] + bearing
+        places[begin:end] = targets_m[moment, :2] + apart_m[moment] * np.array([np.cos(azimuth), np.sin(azimuth)])
+        begin = end
+    away = places - targets_m[:, :2]
+    return np.column_stack([np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1]), altitude_m])
+
+
+def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Go evenly from a value of one range to one of another, within the rates a second; who is there early stays."""
+    first = rng.uniform(*start)
+    if end is None:
+        return np.full(len(seconds), first)
+    way = rng.uniform(*end) - first
+    rate = np.clip(abs(way) / max(float(seconds[-1]), 1e-9), *rates)
+    return first + np.sign(way) * np.minimum(rate * seconds, abs(way))
+
+
+def _steady(heading_rad: np.ndarray) -> np.ndarray:
+    """Keep a heading until the walker's differs by more than STEADY_RAD, then take that."""
+    kept, now = [], float(heading_rad[0])
+    for heading in heading_rad.tolist():
+        now = heading if abs(heading - now) > STEADY_RAD else now
+        kept.append(now)
+    return np.array(kept)
+
+
+def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
+    """Follow values (n,) from the first on with steps of at most `steps_max` (n,)."""
+    followed, now = [], float(values[0])
+    for value, most in zip(values.tolist(), steps_max.tolist(), strict=True):
+        now += min(max(value - now, -most), most)
+        followed.append(now)
+    return np.array(followed)

@@ -1,0 +1,68 @@
+"""The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that shows.
+
+A row is data; `courses.py` makes a wish of it, and a new row needs no code. Labels come from the motion that was flown, not from the
+style. Two styles are more than a row: `reacquire` looks for a place where the walker disappears, `return_home` ends with a mission.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FOLLOW, REACQUIRE, RETURN_HOME = "follow", "reacquire", "return_home"
+ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, which keeps that of the settings
+
+Range = tuple[float, float]  # a value is drawn evenly from it for each part of a flight
+
+
+@dataclass(frozen=True)
+class Style:
+    """One row. Distances are in the plane, altitudes above the ground under the walker.
+
+    bearing_deg: of the drone as seen from the walker, counter-clockwise from the walking direction: 0 in front, 180 behind;
+    None: where the part before ended, anywhere at the beginning; either_side: half of them are mirrored. The values with `end` are reached at the end of the part, None: as at its beginning.
+    round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a new place, of which
+    the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way there.
+    purpose: what it is for, in the words of the decisions.
+    """
+
+    purpose: tuple[str, ...]
+    ground_distance_m: Range
+    altitude_m: Range
+    bearing_deg: Range | None = None
+    either_side: bool = False
+    ground_distance_end_m: Range | None = None
+    altitude_end_m: Range | None = None
+    round_mps: Range = (0.0, 0.0)
+    hop_s: Range | None = None
+    pace_mps: Range = (4.0, 4.0)
+
+
+# Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would have to fly faster
+# round a bend than it can.
+TABLE: dict[str, Style] = {
+    "orbit_left": Style(("circle_left",), (10.0, 26.0), (8.0, 40.0), round_mps=(-6.0, -4.0)),
+    "orbit_right": Style(("circle_right",), (10.0, 26.0), (8.0, 40.0), round_mps=(4.0, 6.0)),
+    "side": Style(("strafe_left", "strafe_right"), (10.0, 28.0), (8.0, 22.0), (75.0, 105.0), either_side=True),
+    "lead": Style(("move_backward",), (12.0, 35.0), (8.0, 25.0), (-25.0, 25.0)),
+    "approach": Style(
+        ("move_forward",), (40.0, 52.0), (15.0, 28.0), (150.0, 210.0),
+        ground_distance_end_m=(8.0, 12.0), altitude_end_m=(8.0, 12.0),
+    ),
+    "retreat": Style(
+        ("move_backward",), (8.0, 12.0), (8.0, 12.0), (-50.0, 50.0),
+        ground_distance_end_m=(40.0, 52.0), altitude_end_m=(15.0, 28.0),
+    ),
+    "rise": Style(("ascend",), (10.0, 22.0), (8.0, 14.0), (135.0, 225.0), altitude_end_m=(40.0, 55.0)),
+    "sink": Style(("descend",), (10.0, 22.0), (40.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
+    "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
+    "stop_and_go": Style(
+        ("speed_up", "slow_down", "hover"), (12.0, 20.0), (8.0, 20.0), (165.0, 195.0), hop_s=(6.5, 9.0), pace_mps=(1.2, 1.8)
+    ),
+    "top": Style(("track_straight",), (4.0, 8.0), (22.0, 50.0), (150.0, 210.0)),
+}  # fmt: skip
+
+# Places from which a walker is lost behind a house or a tree; what the drone does then stands in reacquire.py.
+HIDING = Style(("search_to_reacquire_target",), (18.0, 42.0), (8.0, 16.0))
+
+NAMES = (FOLLOW, *TABLE, REACQUIRE, RETURN_HOME)
+WHOLE = (REACQUIRE, RETURN_HOME)  # take a whole flight; the others may take parts

@@ -1,0 +1,98 @@
+"""Which style a part of a flight was flown in, and the mission that ended it: kept in `drone_trace.json` and `trajectory.json`.
+
+A file without them holds a flight that follows the walker, as the paper's do, and no mission.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from cosfly.errors import InputError
+
+MISSION_KINDS = ("geofence", "battery", "time_over")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Frames [begin, end) of one style. keeps_sight: whether they are judged by how much they see of the target."""
+
+    style: str
+    begin: int
+    end: int
+    keeps_sight: bool = True
+
+    def as_json(self) -> dict:
+        return {"style": self.style, "begin": self.begin, "end": self.end, "keeps_sight": self.keeps_sight}
+
+
+@dataclass(frozen=True)
+class Mission:
+    """An order that ends a pursuit. kind: of MISSION_KINDS, its reason, which the drone knows from `at_frame` on and not before.
+
+    From `at_frame` the drone breaks off, from `home_frame` it flies home, to home_m (x, y, z).
+    """
+
+    kind: str
+    at_frame: int
+    home_frame: int
+    home_m: tuple[float, float, float]
+
+    def order_at(self, frame: int) -> str | None:
+        """Give the decision that stands as an order at a frame, None before the first."""
+        return None if frame < self.at_frame else "break_off" if frame < self.home_frame else "return_to_home"
+
+    def as_json(self) -> dict:
+        home = dict(zip("xyz", self.home_m, strict=True))
+        return {"kind": self.kind, "at_frame": self.at_frame, "home_frame": self.home_frame, "home": home}
+
+
+def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
+    """Give the keys that a record has of them: none for a flight that follows from end to end."""
+    record: dict = {"segments": [part.as_json() for part in segments]} if segments else {}
+    return record | ({"mission": mission.as_json()} if mission is not None else {})
+
+
+def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
+    """Read segments; none is no segment.
+
+    Raises:
+        InputError: names the field.
+    """
+    if value is None:
+        return ()
+    if not isinstance(value, list) or not all(isinstance(part, dict) for part in value):
+        raise InputError("not segments", where=where, got=repr(value)[:60], expected="a list of objects")
+    segments = []
+    for k, part in enumerate(value):
+        begin, end = (_frame(part, name, num_frames, f"{where}[{k}]") for name in ("begin", "end"))
+        if not isinstance(part.get("style"), str):
+            raise InputError("missing", where=f"{where}[{k}].style", got=repr(part.get("style")), expected="a name")
+        segments.append(Segment(part["style"], begin, end, part.get("keeps_sight") is not False))
+    return tuple(segments)
+
+
+def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
+    """Read a mission; null is none.
+
+    Raises:
+        InputError: names the field.
+    """
+    if value is None:
+        return None
+    home = value.get("home") if isinstance(value, dict) else None
+    if not isinstance(home, dict) or not all(type(home.get(axis)) in (int, float) for axis in "xyz"):
+        raise InputError("not a mission", where=f"{where}.home", got=repr(home)[:60], expected="numbers x, y, z")
+    if value.get("kind") not in MISSION_KINDS:
+        raise InputError(
+            "unknown kind", where=f"{where}.kind", got=repr(value.get("kind"))[:60], expected=", ".join(MISSION_KINDS)
+        )
+    at, home_frame = (_frame(value, name, num_frames, where) for name in ("at_frame", "home_frame"))
+    return Mission(value["kind"], at, home_frame, (float(home["x"]), float(home["y"]), float(home["z"])))
+
+
+def _frame(group: dict, name: str, num_frames: int, where: str) -> int:
+    value = group.get(name)
+    if type(value) is not int or not 0 <= value <= num_frames:
+        raise InputError("not a frame", where=f"{where}.{name}", got=repr(value)[:60], expected=f"0 to {num_frames}")
+    return value

@@ -1,0 +1,272 @@
+"""Styles: what the table says is what is drawn, flown by every planner, and seen in the labels."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
+
+from caption.schema import FutureMotion, LabelConfig
+from caption.truth.actions import label_of, measure
+from cosfly import kernels
+from cosfly.errors import InputError, NoPathError
+from cosfly.geometry import look_at, wrap_deg
+from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.planners.stage import make_scenario, plan_flight, run, style_rng
+from cosfly.planners.styles.courses import wish_of
+from cosfly.planners.styles.drawing import draw_intent
+from cosfly.planners.styles.reacquire import finds_again
+from cosfly.planners.styles.table import (
+    ALTITUDE_LEAST_M,
+    FOLLOW,
+    HIDING,
+    NAMES,
+    REACQUIRE,
+    RETURN_HOME,
+    TABLE,
+)
+from cosfly.products.boxes import write_boxes
+from cosfly.products.segments import Mission, read_mission, read_segments
+from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.products.walks import write_paths
+from cosfly.stage_folder import read_manifest
+
+OPEN = kernels.obstacle_index(town_of())
+STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])
+# A long house beside the walk hides a low drone on its other side for a while.
+HOUSE = kernels.obstacle_index(town_of(((45, 12, 14), (16, 6, 14)), ((45, -12, 14), (16, 6, 14))))
+
+
+def styled(name, **more):
+    return PlanConfig(styles={name: 1}, **more)
+
+
+def labels_of(trace):
+    """The labels of a flight's windows; what the camera does not look at is not seen."""
+    pitch, yaw = look_at(trace.positions_m, trace.targets_m)
+    aside = np.abs(wrap_deg(np.degrees(yaw) - trace.rotations_deg[:, 1]))
+    visible = (trace.visibility > 0) & (aside < 30) & (np.abs(np.degrees(pitch) - trace.rotations_deg[:, 0]) < 17)
+    found = []
+    for now in range(4, len(trace.time_s) - 5):
+        span, before = slice(now, now + 6), trace.positions_m[now] - trace.positions_m[now - 1]
+        future = FutureMotion(
+            tuple(range(now + 1, now + 6)), trace.time_s[span], trace.positions_m[span], trace.rotations_deg[span, 1],
+            trace.targets_m[span], visible[span], float(np.linalg.norm(before)) / 0.5,
+        )  # fmt: skip
+        found.append(label_of(measure(future), LabelConfig()))
+    return Counter(found)
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_rows_keep_the_ranges_of_heights_and_distances(name):
+    style = TABLE[name]
+    altitudes = (*style.altitude_m, *(style.altitude_end_m or ()))
+    assert min(altitudes) >= ALTITUDE_LEAST_M
+    assert max(altitudes) <= 60
+    for apart_m, altitude_m in (
+        (style.ground_distance_m, style.altitude_m),
+        (style.ground_distance_end_m or style.ground_distance_m, style.altitude_end_m or style.altitude_m),
+    ):
+        assert np.hypot(apart_m[0], altitude_m[0] - 0.9) >= 10
+        assert np.hypot(apart_m[1], altitude_m[1] - 0.9) <= 60
+    assert style.purpose
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_style_shows_the_decisions_that_it_is_for(name):
+    counts = Counter()
+    for seed in range(3):
+        trace = plan_flight(STRAIGHT, OPEN, styled(name), seed)
+        assert trace.drop_reason is None
+        assert [part.style for part in trace.segments] == [name]
+        counts += labels_of(trace)
+    share = {label: number / counts.total() for label, number in counts.items()}
+    assert sum(share.get(label, 0) for label in TABLE[name].purpose) >= 0.3
+    assert len(TABLE[name].purpose) == 1 or all(label in share for label in TABLE[name].purpose if "_left" not in label)
+
+
+def test_the_wish_of_parts_has_no_jumps_and_keeps_to_the_speed_limit():
+    scenario = make_scenario(walk_along("w", [(0, 0), (60, 0), (60, 60), (0, 60)]), OPEN, PlanConfig())
+    names = [*TABLE, FOLLOW, *reversed(TABLE)]
+    wish = wish_of(names, scenario, OPEN, PlanConfig(), np.random.default_rng(5))
+    steps_m = np.linalg.norm(np.diff(wish.places_m(scenario.targets_m, scenario.ground_m), axis=0), axis=1)
+    assert steps_m.max() / scenario.dt_s <= 10.0
+    np.testing.assert_allclose(wish.distance_m**2, wish.ground_distance_m**2 + (wish.altitude_m - 0.9) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(np.tan(wish.pitch_rad), (wish.altitude_m - 0.9) / wish.ground_distance_m)
+
+
+# --- flights ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("style", NAMES)
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_every_planner_flies_every_style_safely(planner, style):
+    box_map, corners = WORLDS["corner"]
+    obstacles, walk = kernels.obstacle_index(box_map), walk_along("w", corners)
+    cfg = styled(style, planner=planner, altitude_min_m=8.0, track_astar={"beam": 512})
+    trace = plan_flight(walk, obstacles, cfg, 0)
+    assert_safe(trace.positions_m, obstacles, cfg)
+    assert trace.drop_reason in (None, "style_not_held", "no_hiding_place", "not_lost_and_found")
+    again = plan_flight(walk, obstacles, cfg, 0)
+    np.testing.assert_array_equal(trace.positions_m, again.positions_m)
+    assert trace.as_json() == DroneTrace.from_json(trace.as_json(), "w").as_json()
+    assert trace.segments == again.segments
+    if style == FOLLOW:
+        assert trace.as_json().keys().isdisjoint({"segments", "mission", "instead_of"})
+
+
+def test_the_default_is_the_papers_flight_and_draws_nothing():
+    scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
+    intent = draw_intent(scenario, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
+    assert intent.wish is scenario.wish
+    assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
+
+
+def test_parts_draw_their_styles_and_cover_the_flight():
+    cfg = PlanConfig(styles={"side": 1, "rise": 1, "hold": 0}, segment_s=15)
+    trace = plan_flight(STRAIGHT, OPEN, cfg, 1)
+    assert {part.style for part in trace.segments} == {"side", "rise"}
+    assert trace.segments[0].begin == 0
+    assert [a.end for a in trace.segments[:-1]] == [b.begin for b in trace.segments[1:]]
+    assert trace.segments[-1].end == len(trace.time_s)
+
+
+def test_walks_of_two_maps_with_one_id_draw_apart():
+    moved = replace(STRAIGHT, positions_m=STRAIGHT.positions_m + np.array([7.0, 0, 0]))
+    assert style_rng(STRAIGHT, 0).random() != style_rng(moved, 0).random()
+    assert style_rng(STRAIGHT, 0).random() == style_rng(STRAIGHT, 0).random()
+
+
+def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why():
+    dropped = plan_flight(STRAIGHT, OPEN, styled(REACQUIRE), 0)
+    assert dropped.drop_reason == "no_hiding_place"
+    instead = plan_flight(STRAIGHT, OPEN, styled(REACQUIRE, styles_fallback="follow"), 0)
+    assert (instead.drop_reason, instead.instead_of) == (None, "reacquire: no_hiding_place")
+    np.testing.assert_array_equal(instead.positions_m, plan_flight(STRAIGHT, OPEN, PlanConfig(), 0).positions_m)
+    # Towers all along leave an orbit no room.
+    towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
+    walled = kernels.obstacle_index(town_of(*towers))
+    assert plan_flight(STRAIGHT, walled, styled("orbit_left"), 0).drop_reason in ("style_not_held", "low_visibility")
+    assert plan_flight(STRAIGHT, walled, styled("orbit_left", styles_fallback="follow"), 0).drop_reason is None
+
+
+def test_the_manifest_counts_styles_and_what_was_not_held(tmp_path):
+    write_boxes(tmp_path / "map.json", town_of(*CANYON))
+    write_paths(tmp_path / "path.json", [walk_along(name, [(0, 0), (60, 0)]) for name in "ab"], {})
+    cfg = styled("top")
+    product = run(cfg, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
+    assert read_manifest(tmp_path / "plan").model_dump()["styles"] == {"top": 2}
+    assert [part.style for trace in read_traces(product) for part in trace.segments] == ["top", "top"]
+
+
+# --- searching --------------------------------------------------------------------------------------------------------
+
+
+def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it():
+    traces = [plan_flight(STRAIGHT, HOUSE, styled(REACQUIRE), seed) for seed in range(6)]
+    trace = max((trace for trace in traces if trace.drop_reason is None), key=lambda t: (t.visibility == 0).sum())
+    assert finds_again(trace.visibility, 0.5)
+    assert not trace.segments[0].keeps_sight
+    lost = np.flatnonzero(trace.visibility == 0)
+    yaw = look_at(trace.positions_m, trace.targets_m)[1]
+    aside = np.abs(wrap_deg(np.degrees(yaw) - trace.rotations_deg[:, 1]))
+    assert aside[lost].max() > 3  # nobody tells it where the walker is
+    assert aside[trace.visibility > 0].max() < 1e-3
+    assert labels_of(trace)["search_to_reacquire_target"] >= 2
+
+
+@pytest.mark.parametrize(
+    ("seen", "found"),
+    [
+        ([1] * 20 + [0] * 6 + [1] * 20, True),
+        ([1] * 46, False),  # never lost
+        ([1] * 20 + [0] * 26, False),  # lost for good
+        ([0] * 20 + [1] * 26, False),  # never had it
+        ([1] * 20 + [0] * 2 + [1] * 20, False),  # a pole in between is no loss
+        ([1] * 20 + [0] * 40 + [1] * 20, False),  # longer than anybody searches
+    ],
+)
+def test_what_counts_as_lost_and_found(seen, found):
+    assert finds_again(np.array(seen, dtype=float), 0.5) == found
+
+
+# --- missions ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
+    trace = plan_flight(STRAIGHT, OPEN, styled(RETURN_HOME), 3)
+    mission = trace.mission
+    assert trace.drop_reason is None
+    assert [part.style for part in trace.segments] == [FOLLOW, RETURN_HOME]
+    assert trace.segments[0].end == trace.segments[1].begin == mission.at_frame
+    assert 0 < mission.at_frame < mission.home_frame < len(trace.time_s)
+    assert np.linalg.norm(trace.positions_m[-1, :2] - mission.home_m[:2]) < 6
+    flown = np.diff(trace.positions_m, axis=0)[mission.home_frame + 4 : -4]
+    course_deg = np.degrees(np.arctan2(flown[:, 1], flown[:, 0]))
+    is_under_way = np.hypot(flown[:, 0], flown[:, 1]) > 1.0
+    turned = np.abs(wrap_deg(course_deg - trace.rotations_deg[mission.home_frame + 4 : -5, 1]))
+    assert turned[is_under_way].max() < 25
+    assert trace.metrics["five_ray_mean"] == 1.0  # of the pursuit alone
+    assert [mission.order_at(i) for i in (mission.at_frame - 1, mission.at_frame, mission.home_frame)] == [
+        None,
+        "break_off",
+        "return_to_home",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"kind": "boredom"}, "mission.kind"),
+        ({"home": None}, "mission.home"),
+        ({"at_frame": -1}, "mission.at_frame"),
+        ({"home_frame": 1e400}, "mission.home_frame"),
+    ],
+)
+def test_a_broken_mission_is_named(change, where):
+    good = Mission("battery", 10, 18, (1.0, 2.0, 30.0)).as_json()
+    assert read_mission(good, 60, "mission") == Mission("battery", 10, 18, (1.0, 2.0, 30.0))
+    with pytest.raises(InputError) as caught:
+        read_mission(good | change, 60, "mission")
+    assert str(caught.value.where) == where
+
+
+@pytest.mark.parametrize("value", ["follow", [1], [{"style": 3, "begin": 0, "end": 1}], [{"style": "top", "begin": 0}]])
+def test_broken_segments_are_named(value):
+    with pytest.raises(InputError, match="segments"):
+        read_segments(value, 60, "segments")
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shares", "words"),
+    [
+        ({"orbit_lft": 1}, "did you mean 'orbit_left'"),
+        ({"follow": 0}, "add up to more than 0"),
+        ({}, "add up to more than 0"),
+        ({"follow": 2, "top": -1}, "share of top"),
+        ({"top": float("inf")}, "finite number"),
+        ({"top": float("nan")}, "finite number"),
+    ],
+)
+def test_shares_that_say_nothing_are_refused(shares, words):
+    with pytest.raises(ValueError, match=words):
+        PlanConfig(styles=shares)
+
+
+def test_no_way_in_any_style_is_still_a_clear_error():
+    roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
+    for fallback in ("drop", "follow"):
+        with pytest.raises(NoPathError, match="no free"):
+            plan_flight(STRAIGHT, roof, styled("rise", styles_fallback=fallback), 0)
+
+
+def test_hiding_places_are_within_the_ranges():
+    assert HIDING.altitude_m[0] >= ALTITUDE_LEAST_M
+    assert np.hypot(HIDING.ground_distance_m[1], HIDING.altitude_m[1]) <= 60
