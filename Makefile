@@ -5,11 +5,13 @@ SHELL := /bin/bash
 
 VENV ?= .venv
 BIN := $(VENV)/bin
+TOOLS := $(VENV)-tools
+PINNED := docs/container/requirements.txt
 RUN ?= runs/quickstart
 SLOW ?=
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
-.PHONY: quickstart test lint format clean
+.PHONY: quickstart test lint format audit sbom lock clean
 
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
@@ -26,8 +28,19 @@ format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+audit: $(TOOLS)/.installed $(VENV)/.installed-dev  ## Known weaknesses of what the container and the tests install; asks a public advisory service
+	$(TOOLS)/bin/pip-audit --disable-pip --require-hashes -r $(PINNED)
+	$(TOOLS)/bin/pip-audit --path $$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+
+sbom: $(TOOLS)/.installed $(VENV)/.installed  ## sbom.json (CycloneDX): every package of this environment, with versions and licences
+	$(TOOLS)/bin/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --of JSON -o sbom.json
+
+lock: $(TOOLS)/.installed  ## What the container installs, anew: the newest versions that pyproject.toml allows, pinned with hashes
+	$(TOOLS)/bin/pip-compile --quiet --upgrade --generate-hashes --strip-extras --allow-unsafe --build-deps-for wheel --extra pyrender \
+	  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host -o $(PINNED) pyproject.toml
+
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(TOOLS) build *.egg-info sbom.json
 
 # The system's part: Python with venv, and the GL libraries of the renderer. Installed where we may, named where we may not.
 $(VENV)/bin/python:
@@ -57,3 +70,8 @@ $(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
 $(VENV)/.installed-dev: pyproject.toml tests/constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -q -c tests/constraints.txt -e '.[dev]'
 	touch $@ $(VENV)/.installed
+
+$(TOOLS)/.installed: | $(VENV)/bin/python
+	$(VENV)/bin/python -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install -q --upgrade pip pip-audit pip-tools cyclonedx-bom
+	touch $@

@@ -184,3 +184,22 @@ def test_foreign_text_is_escaped_in_one_place(name):
         assert not re.search(r"html import escape|html\.escape|rich\.markup|<!doctype", text, re.IGNORECASE)
     if name != "cosfly.console":
         assert not re.search(r"\bConsole\(", text)
+
+
+def test_what_the_container_installs_is_pinned_with_hashes_and_is_what_the_project_needs():
+    text = (ROOT / "docs/container/requirements.txt").read_text(encoding="utf-8")
+    entries = re.findall(r"^([a-z0-9-]+)==\S+((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", text, re.MULTILINE)
+    pinned = {name for name, _ in entries}
+    assert len(pinned) == len(re.findall("^[a-z0-9]", text, re.MULTILINE)), "a line without a hash"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    needed = [
+        *project["project"]["dependencies"], *project["project"]["optional-dependencies"]["pyrender"],
+        *project["build-system"]["requires"],
+    ]  # fmt: skip
+    assert {re.split("[<>=!~]", line)[0] for line in needed} <= pinned
+
+
+def test_the_container_has_the_gl_libraries_of_the_makefile():
+    packages = re.search("^GL_PACKAGES := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert packages is not None
+    assert packages[1] in (ROOT / "docs/container/Containerfile").read_text(encoding="utf-8")
