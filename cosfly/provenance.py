@@ -275,12 +275,11 @@ def verify(paths: Iterable[Path]) -> int:
     digests: dict[Path, str] = {}
     folders = list(dict.fromkeys(_stage_folder(path) or path for path in paths))
     for folder in folders:
-        listed = _recorded_files(folder) if folder.is_dir() else {}
+        listed, strangers = _recorded_files(folder) if folder.is_dir() else ({}, [])
         if not listed:
             log.warning("verify: %s: there is no record to hold it against", folder)
-            continue
         digests |= listed
-        wrong += [*_unrecorded(folder, listed), *_strangers(folder, recorded_digests(folder))]
+        wrong += strangers
     with progress_bar("verify", total=len(digests)) as advance:
         for path, digest in digests.items():
             wrong += _changed(path.parent, {path.name: digest})
@@ -293,18 +292,19 @@ def verify(paths: Iterable[Path]) -> int:
     return len(digests)
 
 
-def _recorded_files(folder: Path) -> dict[Path, str]:
-    """Give the sha256 of every file that a stage folder or tree has on record."""
+def _recorded_files(folder: Path) -> tuple[dict[Path, str], list[str]]:
+    """Give the sha256 of every file that a stage folder or tree has on record, and name the files that are in none."""
     found = {inside(folder, name): digest for name, digest in recorded_digests(folder).items()}
+    strangers = list(_strangers(folder, recorded_digests(folder)))
     for lists in sorted(folder.rglob(CHECKSUMS)):
-        found |= {lists.parent.resolve() / name: digest for name, digest in read_checksums(lists.parent).items()}
-    return found
-
-
-def _unrecorded(folder: Path, listed: Collection[Path]) -> Iterator[str]:
-    """Find the files beside a checksum file that it does not list; what begins with a dot is others'."""
-    for lists in sorted(folder.rglob(CHECKSUMS)):
-        for path in sorted(lists.parent.rglob("*")):
-            is_ours = not any(part.startswith(".") for part in path.relative_to(lists.parent).parts)
-            if is_ours and path.is_file() and path != lists and path.resolve() not in listed:
-                yield f"{path} is in no record"
+        if found.get(lists.resolve()) not in (None, sha256_file(lists)):
+            continue  # what it says counts for nothing, and it is named itself
+        root = lists.parent.resolve()
+        found |= {root / name: digest for name, digest in read_checksums(root).items()}
+        for path in sorted(root.rglob("*")):
+            is_ours = not any(
+                part.startswith(".") for part in path.relative_to(root).parts
+            )  # what a hub puts there is not
+            if is_ours and path.is_file() and path.name != CHECKSUMS and path not in found:
+                strangers.append(f"{path} is in no record")
+    return found, strangers

@@ -1,24 +1,34 @@
 """The whole way on a tiny town: every stage, one and two workers, kill -9 in the middle of every stage."""
 
+import contextlib
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from cosfly import pipeline
+from cosfly import pipeline, provenance
+from cosfly.cli import app
 from cosfly.config import load
-from cosfly.errors import ConfigError, ResumeError, StorageError
+from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
+from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.walks import read_paths as read_walks
 from cosfly.settings import RunConfig
-from cosfly.store import read_json
+from cosfly.stage_folder import read_failures
+from cosfly.store import read_checksums, read_json, sha256_file, write_checksums, write_json
+from distill import dataset
+from release import package
+from release.sources import Source
 from release.validate import verify
 
 TINY = [
@@ -143,6 +153,155 @@ def test_a_second_run_in_the_same_folder_is_refused(base, tmp_path, held_by_anot
     with held_by_another(out) as other, pytest.raises(ResumeError, match=f"another process .* process {other.pid} "):
         pipeline.run(tiny(), out)
     assert not (out / "run.yaml").exists()
+
+
+# --- what if a file were changed? -------------------------------------------------------------------------------------
+
+# Made for people, or the record of another file: nothing reads them as a product.
+UNBOUND = {
+    "run.yaml",
+    "summary.json",
+    "contact_sheet.png",
+    "preview.gif",
+    "stage.json",
+    "manifest.json",
+    "items.jsonl",
+    "failures.jsonl",
+    "events.jsonl",
+}
+CHANGES = {
+    "edited": lambda data, other: data[:-2] + bytes([data[-2] ^ 1]) + data[-1:],
+    "cut": lambda data, other: data[: len(data) // 2],
+    "emptied": lambda data, other: b"",
+    "exchanged": lambda data, other: other,
+}
+# Which stages refuse a changed file when they begin. Those that are missing here read pictures: of them below.
+REFUSED_BY = {
+    "maps/boxes_Nd.json": ("simplify", "render"),
+    "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"),
+    "pedestrians/path.json": ("plan",),
+    "plan/drone_trace.json": ("render", "inspect"),
+    "render/Town_SynthTown/instance_ids.json": ("caption", "release"),
+    "render/Town_SynthTown/map.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/ORI/trajectory.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/aug_N/trajectory.json": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/ORI/checksums.shaN": ("caption", "release"),
+    "render/Town_SynthTown/trajectory_N/aug_N/checksums.shaN": ("caption", "release"),
+    "inspect/inspect.json": ("release",),
+    "caption/captions.jsonl": ("release",),
+}
+
+
+@pytest.fixture(scope="module")
+def tampered(base, tmp_path_factory):
+    """A copy of the run for tests that change a file and put it back."""
+    return shutil.copytree(base, tmp_path_factory.mktemp("tampered") / "run")
+
+
+def kinds_of(out: Path) -> dict[str, list[Path]]:
+    """The files of a run that records hold, by their path with numbers taken out."""
+    kinds: dict[str, list[Path]] = {}
+    for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in UNBOUND):
+        kinds.setdefault(re.sub(r"\d+", "N", path.relative_to(out).as_posix()), []).append(path)
+    return kinds
+
+
+@contextlib.contextmanager
+def changed(paths: list[Path], change: str) -> Iterator[Path]:
+    """Change the first file of a kind, exchange it for the second or for what another run has, and put it back."""
+    data = paths[0].read_bytes()
+    other = paths[1].read_bytes() if len(paths) > 1 else b"of another run"
+    paths[0].write_bytes(CHANGES[change](data, data + b" " if other == data else other))
+    try:
+        yield paths[0]
+    finally:
+        paths[0].write_bytes(data)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_every_changed_file_of_a_run_is_named_when_all_is_read(tampered, change):
+    kinds = kinds_of(tampered)
+    assert len(kinds) > 30
+    for kind, paths in kinds.items():
+        with (
+            changed(paths, change) as path,
+            pytest.raises(VerifyError, match=re.escape(f"{path.name} has other bytes")),
+        ):
+            provenance.verify([tampered / kind.split("/")[0]])
+    assert provenance.verify([tampered / stage for stage in STAGES]) > 500
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered, change):
+    kinds = kinds_of(tampered)
+    for kind, stages in REFUSED_BY.items():
+        for stage in stages:
+            with changed(kinds[kind], change) as path, pytest.raises(VerifyError, match=re.escape(path.name)):
+                work(tiny(), tampered, stage)
+
+
+def test_no_changed_picture_reaches_a_release(base, tmp_path):
+    out = begin(base, tmp_path / "run", "release")
+    flights = find_flights(out / "render")
+    for flight, name in zip(flights[:3], ("rgb.png", "depth.npy", "instance.png"), strict=True):
+        frames = flight / "frames_playback"
+        shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)
+    work(tiny(), out, "release")
+    failures = read_failures(out / "release/failures.jsonl")
+    named = {
+        f.message.split(": ")[0].rpartition("/")[2] for f in failures if "not the one that was inspected" in f.message
+    }
+    assert named == {"rgb.png", "depth.npy", "instance.png"}
+    assert read_json(out / "release/manifest.json")["counts"]["kept"] == 1
+
+
+def test_a_flight_whose_records_were_changed_too_is_rejected(base, tmp_path):
+    out = begin(base, tmp_path / "run", "inspect")
+    folder = find_flights(out / "render")[0]
+    meta = folder / "perturbation_report.json"
+    meta.write_text(meta.read_text() + " ")
+    write_checksums(folder, read_checksums(folder) | {meta.name: sha256_file(meta)})
+    work(tiny(), out, "inspect")
+    found = [f for f in read_inspection(out / "inspect/inspect.json").flights if f.result == "rejected"]
+    assert [(f.folder, f.issues[0].where) for f in found] == [
+        (folder.relative_to(out / "render").as_posix(), "checksums.sha256")
+    ]
+
+
+def test_captions_and_inspections_of_another_tree_are_refused(base, tmp_path):
+    """Another seed's tree has the same names: only its digests tell."""
+    other = shutil.copytree(base / "render", tmp_path / "run/render")
+    ids = next(other.glob("*/instance_ids.json"))
+    ids.write_text(ids.read_text() + " ")
+    manifest = read_json(other / "manifest.json")
+    entry = next(entry for entry in manifest["outputs"] if entry["path"].endswith(ids.name))
+    entry |= {"sha256": sha256_file(ids), "bytes": ids.stat().st_size}
+    write_json(other / "manifest.json", manifest)
+    captions, inspected = base / "caption/captions.jsonl", base / "inspect/inspect.json"
+    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
+        dataset.run(dataset.PrepareConfig(), captions, other, tmp_path / "set")
+    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
+        package.run(package.ReleaseConfig(), [Source("x", other, captions, inspected)], tmp_path / "release")
+    shutil.copy(captions, tmp_path / "captions.jsonl")
+    with pytest.raises(VerifyError, match=r"inspect\.json: it was made of another input 'data'"):
+        package.run(
+            package.ReleaseConfig(), [Source("x", other, tmp_path / "captions.jsonl", inspected)], tmp_path / "release"
+        )
+    assert not (tmp_path / "set").exists()
+    assert not (tmp_path / "release").exists()
+
+
+def test_verify_on_the_command_line_names_the_file_before_anything_is_done(tampered):
+    kinds = kinds_of(tampered)
+    picture = next(paths for kind, paths in kinds.items() if kind.endswith("depth.npy"))
+    settings = [word for setting in TINY for word in ("--set", setting)]
+    caption = ["caption", "--data", str(tampered / "render"), "--out", str(tampered / "caption"), *settings]
+    with changed(picture, "edited") as path:
+        assert CliRunner().invoke(app, caption).exit_code == 0, "a complete stage reads no picture"
+        found = CliRunner().invoke(app, [*caption, "--verify"])
+    assert isinstance(found.exception, VerifyError)
+    assert f"{path} has other bytes" in str(found.exception)
+    assert CliRunner().invoke(app, [*caption, "--verify"]).exit_code == 0
 
 
 @pytest.mark.slow
