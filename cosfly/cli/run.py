@@ -33,7 +33,9 @@ def run(
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
-    options.verify_first(verify, *sorted(path.parent for path in out.glob("*/manifest.json")))
+    options.verify_first(
+        verify, *sorted(path.parent for depth in ("*", "*/*") for path in out.glob(f"{depth}/manifest.json"))
+    )
     results = pipeline.run(cfg, out, resume=resume)
     _closing_table(results, out)
     options.check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
