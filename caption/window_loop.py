@@ -48,7 +48,6 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
     motion = measure(window.future)
     terms = _terms(teacher, observed.sample_id, cfg)
     question = make_question(observed, cfg.image, terms.writing)
-    pictures = question.pictures
     loop = _Loop(teacher, cfg, terms, motion, label_of(motion, cfg.label), judge)
     loop.checks.keyframe = window.keyframe
     loop.checks.contradicted = contradicted_by(motion, cfg.label, loop.label)
@@ -65,6 +64,12 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unreadable_frame"
             loop.checks.frame = error.what
+    return _record(window, question, teacher, loop, reason)
+
+
+def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
+    """Give what is kept of a window. reason: to drop it."""
+    observed, pictures = window.observed, question.pictures
     return Caption(
         sample_id=observed.sample_id,
         town=observed.town,

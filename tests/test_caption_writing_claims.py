@@ -108,6 +108,7 @@ def test_spellings_of_a_claim_are_read_in_one_way(fields, found):
         (ANSWER | {"claims": [7]}, "claims_malformed", "Claim 1: it must be an object"),
         (changed(0, modality="seen"), "claims_malformed", "modality"),
         (changed(0, value=None), "claims_malformed", "value"),
+        (changed(0, value=True), "claims_malformed", "value"),
         (changed(0, colour="red"), "claims_malformed", "colour"),
         (changed(0, quantity="x" * 60), "claims_malformed", "longer than"),
         (changed(0, value=10**400), "claims_malformed", "value"),

@@ -70,10 +70,10 @@ class RuleTeacher:
 
     async def ask(self, question: Question) -> Reply:
         english = self._answers(question)[0]
-        return _native(dict(english) | {"therefore": english.flight_decision})
+        return _native(english.model_dump() | {"therefore": english.flight_decision})
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
-        return _native(dict(self._answers(question)[1]))
+        return _native(self._answers(question)[1].model_dump())
 
 
 def _native(answer: dict[str, str]) -> Reply:

@@ -61,6 +61,33 @@ class Filler:
         return Refused(DECISION_REASON, complaint)
 
     def _print(self, slot: Slot) -> str | Refused:
+        word = self._plain_value(slot)
+        if word is None:
+            fact = self._fitting(slot)
+            if isinstance(fact, Refused):
+                return fact
+            word = self._written(slot, fact)
+        if slot.article:
+            word = f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}"
+        self._printed[slot.key] = word
+        return word
+
+    def _plain_value(self, slot: Slot) -> str | None:
+        """Write a value of a series, which most slots are; None where it is something else, or not known."""
+        quantity = slot.quantity
+        if quantity is None:
+            return None
+        assert slot.reference is not None
+        series, frame = quantity.read(self.facts), slot.reference.first
+        if not series or (frame is not None and frame >= len(series)):
+            return None
+        value = series[-1 if frame is None else frame]
+        if value is None:
+            return None
+        return _DIGITS[quantity.digits] % (abs(value) if slot.is_size else value) + self._units[quantity.unit]
+
+    def _fitting(self, slot: Slot) -> Fact | Refused:
+        """Give the fact of a slot, with the side that its sentence needs."""
         fact = self._look_up(slot)
         if isinstance(fact, str):
             return self._missing(slot, fact)
@@ -69,11 +96,7 @@ class Filler:
             if slot.needs_side and fact.value in _NEITHER:
                 fix = f"it is {fact.value} here, neither side: say it without this slot, or as `is {{{slot.name}}}`"
                 return Refused("slots_no_side", f"{{{slot.name}}}: {fix}")
-        word = self._written(slot, fact)
-        if slot.article:
-            word = f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}"
-        self._printed[slot.key] = word
-        return word
+        return fact
 
     def _written(self, slot: Slot, fact: Fact) -> str:
         value, unit, digits = fact

@@ -70,12 +70,14 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
     for letter, name in zip("CR", TEXTS, strict=True):
         filled: list[str] = []
         for number, sentence in enumerate(read_text(getattr(written, name), language, num_frames, facts.step_s), 1):
-            plain = sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=letter == "R")
-            if isinstance(plain, Refused):
-                problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
-            elif isinstance(sentence, Sentence):
-                judged.append(Judged(f"{letter}{number}", plain, sentence.state))
-                filled.append(plain)
+            if isinstance(sentence, Sentence):
+                plain = filler.fill(sentence, is_reasoning=letter == "R")
+                if isinstance(plain, str):
+                    judged.append(Judged(f"{letter}{number}", plain, sentence.state))
+                    filled.append(plain)
+                    continue
+                sentence = plain
+            problems.append(Refused(sentence.reason, f"{name}, sentence {number}: {sentence.complaint}."))
         texts[name] = "".join(filled)
     if problems:
         return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))

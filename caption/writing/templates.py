@@ -20,6 +20,7 @@ from caption.truth.references import (
     ANGLES,
     MOTIONS,
     QUANTITIES,
+    Quantity,
     Reference,
     parse_reference,
 )
@@ -57,6 +58,14 @@ class Slot:
     def key(self) -> str:
         """What decides how it is printed."""
         return f"{self.name} {self.form} {self.needs_side:d} {self.is_size:d} {self.article}"
+
+    @cached_property
+    def quantity(self) -> Quantity | None:
+        """Give the series of which it is a plain value, None where it is something else."""
+        reference = self.reference
+        if reference is None or reference.aspect or self.is_shaped:
+            return None
+        return QUANTITIES.get(reference.quantity)
 
     @cached_property
     def is_word(self) -> bool:

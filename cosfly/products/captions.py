@@ -286,7 +286,7 @@ class Claim(BaseModel):
     sentence: str
     quantity: str
     at: str | None = None
-    value: float | str
+    value: Annotated[float, Field(strict=True)] | str  # true is no 1.0
     unit: str | None = None
     modality: Modality = "observed"
 

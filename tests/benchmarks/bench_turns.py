@@ -24,12 +24,13 @@ def work(tree: str) -> None:
     bench = importlib.import_module("bench_captions")
     made = [bench.make_flight(NUM_POINTS, seed=seed, width_px=1280, height_px=720)[0] for seed in range(NUM_FLIGHTS)]
     teacher = bench.RuleTeacher(0)
+    loop = asyncio.new_event_loop()  # one for all, as in the stage
     print("ready", flush=True)
     for number, _ in enumerate(sys.stdin):
         name = f"trajectory_{bench.FIRST_SECOND + number}"
         flight = dataclasses.replace(made[number % NUM_FLIGHTS], folder=Path("nowhere"), trajectory=name)
         start_s = time.process_time()
-        captions = asyncio.run(bench._caption(flight, teacher))
+        captions = loop.run_until_complete(bench._caption(flight, teacher))
         text = "".join(caption.model_dump_json() for caption in captions)
         assert text
         print((time.process_time() - start_s) / len(captions) * 1e6, flush=True)
