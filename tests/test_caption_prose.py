@@ -77,9 +77,9 @@ def test_the_gold_captions_pass_and_their_errors_are_caught():
         for one in read_gold_prose()
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.8
-    assert caught["numbers"] >= 0.86
-    assert caught["sides"] >= 0.83
+    assert caught["all"] >= 0.82
+    assert caught["numbers"] >= 0.89
+    assert caught["sides"] >= 0.86
 
 
 def test_the_second_set_passes_and_its_errors_are_caught():
@@ -89,9 +89,9 @@ def test_the_second_set_passes_and_its_errors_are_caught():
         for one in read_gold_prose(SECOND_SET)
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.77
+    assert caught["all"] >= 0.78
     assert caught["numbers"] >= 0.85
-    assert caught["sides"] >= 0.7
+    assert caught["sides"] >= 0.75
 
 
 FILLER = {"en": "The scene is calm.", "zh": "场面平静。"}

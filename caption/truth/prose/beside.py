@@ -37,6 +37,8 @@ class Beside:
         else:
             near.sort(key=lambda t: gap(t, numeral.start, numeral.end) - (8 if t.start >= numeral.end else 0))
         token = near[0]
+        if self.text[token.end : numeral.start] == " to ":
+            return 0, 0  # "has come back right to 0.9 degrees"
         if numeral.unit == "deg" and self._is_of_person(token):
             self.used_sides.add(token)
             return 0, 0

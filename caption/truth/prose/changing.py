@@ -101,7 +101,7 @@ class Changing:
     def _is_done(self, numeral: Numeral) -> bool:
         """ "掉了 5 米", "varies by no more than 0.3 m": a change, whatever the verb."""
         if self.language == "zh" and re.search(
-            r"了(?:约|大约|近|将近|差不多|整整|仅|有)?\s*$", self.text[: numeral.start]
+            r"(?<![到至])了(?:约|大约|近|将近|差不多|整整|仅|有)?\s*$", self.text[: numeral.start]
         ):
             return numeral.unit in ("m", "px", "mps") or self.clause.has("quantity", "pitch")
         return bool(

@@ -188,6 +188,16 @@ def _cut(text: str, tokens: list[Token], found: list[Numeral], language: Languag
 _GIVEN = re.compile(r"\s*(?:given|considering|since|because|as)\b|\s*(?:因为|由于)")
 
 
+# Before a number they aim at nothing: "makes about twice", "1.2 against 4.3 m/s", "又回到 20 米".
+_STATING = frozenset(["make", "makes", "made", "making", "against", "回到"])
+_A_NUMBER = re.compile(
+    r"(?: (?:about|roughly|some|only|just|a mere|that|the|our|its|present|current|\w+'s))* #|(?:了|约|大约)?\s*#"
+)
+
+
+_LOOKS_AS = re.compile(r"\b(?:looks|seems|appears) as $")
+
+
 def _block(clauses: list[Clause], text: str) -> None:
     """Mark where a sentence speaks of what is not observed: conditions up to a semicolon or a reason, goals to the clause's end."""
     conditional = False
@@ -204,6 +214,8 @@ def _block(clauses: list[Clause], text: str) -> None:
                 (clause.start, clause.end, why) for _, end, why in before.blocked if end >= before.end and why != "if"
             ]
         for token in clause.of("modality"):
+            if token.value == "if" and (text.startswith("的", token.end) or _LOOKS_AS.search(text, 0, token.start)):
+                continue  # "只有他的一半", "it looks as if"
             if token.value == "if":
                 conditional = True
                 clause.blocked.append((clause.start, clause.end, "if"))
@@ -212,5 +224,7 @@ def _block(clauses: list[Clause], text: str) -> None:
             elif token.value in ("future", "goal"):
                 if text[token.start : token.end] == "把" and clause.has("visibility"):
                     continue  # "屋顶把他挡住"
+                if text[token.start : token.end] in _STATING and _A_NUMBER.match(text, token.end):
+                    continue
                 whole = token.value == "future" and not clause.numerals
                 clause.blocked.append((clause.start if whole else token.start, clause.end, token.value))

@@ -116,7 +116,7 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
             t.value,
         )
         for t in clause.of("who", "drone", "target")
-        if sentence.text[t.start : t.end] not in _OBJECTS
+        if sentence.text[t.start : t.end] not in OBJECTS
     )
     if not ranked and _ITS.search(sentence.text, clause.start, clause.end):
         return ""
@@ -134,7 +134,7 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
 
 
 _ITS = re.compile(r"\bits?\b|其")
-_OBJECTS = ("him", "them", "us", "me")  # have no speed or distance: "flies round him at 2 m/s"
+OBJECTS = ("him", "them", "us", "me")  # have no speed or distance: "flies round him at 2 m/s"
 _OF = {"en": re.compile(r"\s*(?:for |of |by )?(?:the |a |our |its )?"), "zh": re.compile(r"\s*的?\s*")}
 
 
@@ -143,6 +143,10 @@ def _belongs(sentence: Sentence, token: Token, end: int) -> bool:
     return token.start >= end and _OF[sentence.language].fullmatch(sentence.text, end, token.start) is not None
 
 
+# From the first step to the last.
+OVERALL = re.compile(
+    r"\b(?:overall|altogether|in all|in total|between the first|(?:from|the) first (?:step )?to (?:the )?last)\b|总体|首末|首尾|首步到末步"
+)
 GOES_TO = re.compile(r"\b(?:to|at|back|up|down|in)\b|到|至|在")
 
 

@@ -196,6 +196,8 @@ class NumberJudge:
             sign = 0
         if s.mode != "change" or name == "target_turn":
             for true in self.values(s, name):
+                if s.side and sign and true * sign < -2.0 * step:
+                    continue  # on the other side by more than its rounding
                 if self._close(value, true, slack, sign, s.hedge):
                     return True
         if s.mode == "value":

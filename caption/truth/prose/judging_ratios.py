@@ -57,6 +57,10 @@ def _of_operands(s: Statement, ratio: float) -> Iterator[float]:
     "from 20.0 m to 16.0 m, 20 percent", "peaked at 7.5 m/s and has halved to 3.7 m/s".
     """
     is_change = s.mode != "value"
+    if s.kind == "percent" and is_change and s.trend and not s.is_ordered:
+        low, high = min(ratio, 1.0 / ratio), max(ratio, 1.0 / ratio)
+        yield from (low, 1.0 - low) if s.trend < 0 else (high, high - 1.0)
+        return
     is_one_way = s.is_ordered and (s.kind == "percent" or not is_change)
     for told in (ratio,) if is_one_way else (ratio, 1.0 / ratio):
         yield told

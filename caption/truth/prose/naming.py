@@ -35,6 +35,8 @@ class Naming:
         cues = cues_of(self.sentence, self.clause, numeral, owner)
         if cues and not self.clause.has("who", "drone", "target") and cues[0].value in ("turn", "heading", "yaw_rate"):
             owner = ""
+        if not cues and numeral.unit == "mps" and self.context.cue == "climb_rate" and not named:
+            return names_of("climb_rate", "mps", owner), True
         if not cues and numeral.unit == "mps":
             climbs = any(c.has("trend", "alt_up", "alt_down") for c in self.sentence.clauses)
             return names_of("speed", "mps", owner) + (("climb_rate", "rate:altitude") if climbs else ()), True

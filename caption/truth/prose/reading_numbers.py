@@ -10,6 +10,7 @@ from caption.truth.prose.beside import Beside
 from caption.truth.prose.changing import MORE_THAN, Changing
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
+    OVERALL,
     Context,
     crossing,
     is_wide,
@@ -36,6 +37,7 @@ _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date)\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
+_AT_PACE = re.compile(r"(?:\b(?:at|doing|does|do|did|making|makes|our|their|his|her)|\w's|只有|为|是|有) ?$")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 _WAYS = {"travelled", "displacement", "target_travelled"}
 
@@ -76,7 +78,7 @@ class NumberReader:
                 continue
             owners = [self.sureness.right_beside(n) for n in (a, b)]
             if re.match(r"\s*的?[^(]*\(", self.text[b.end :]) or self.text[: self.clause.start].endswith(":"):
-                owners = ["", ""]  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
+                owners = self._owners_behind()  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
             first = {"drone": 1, "target": -1, "": 0}[owners[0]] or -{"drone": 1, "target": -1, "": 0}[owners[1]]
             today = not any(t.value not in ("now", "last_step") for t in self.clause.of("time"))
             frames = (NOW,) if today else None
@@ -92,6 +94,18 @@ class NumberReader:
                 )
             )
 
+    def _owners_behind(self) -> list[str]:
+        """Give the two owners that stand alone in brackets behind a clause."""
+        if not self.text.startswith("(", self.clause.end):
+            return ["", ""]
+        end = self.text.find(")", self.clause.end)
+        inside = [t for c in self.sentence.clauses if self.clause.end < c.end <= end for t in c.of("who")]
+        return (
+            [t.value for t in inside]
+            if {t.value for t in inside} == {"drone", "target"} and len(inside) == 2
+            else ["", ""]
+        )
+
     def _with_unit(self, numeral: Numeral) -> Numeral:
         """A number without a unit has that of the quantity right before it."""
         if numeral.unit == "m" and self._is_per_second():
@@ -102,6 +116,8 @@ class NumberReader:
         is_told = times_of(self.clause) or self.clause.has("time", "mean", "max", "min")
         if earlier and is_told and not self.clause.has("quantity") and self._num_told() == 1:
             return replace(numeral, unit=earlier[-1].unit, factor=earlier[-1].factor)
+        if earlier and earlier[-1].unit == "mps" and numeral.fraction is not None and self._is_pace(numeral):
+            return replace(numeral, unit="mps", factor=earlier[-1].factor)
         near = [t for t in self.clause.of("quantity") if t.end <= numeral.start and t.value in _IMPLIED]
         if (
             not near
@@ -116,6 +132,14 @@ class NumberReader:
         ):
             return numeral
         return replace(numeral, unit=_IMPLIED[near[-1].value])
+
+    def _is_pace(self, numeral: Numeral) -> bool:
+        """ "and the walker crawls at 1.28", "而行人只有 0.62": a speed after one with its unit."""
+        people = self.clause.of("who", "drone", "target")
+        named = any(t.end <= numeral.start for t in people) or (not people and self.context.subject)
+        bare = [n for n in map(self.sentence.numerals.__getitem__, self.clause.numerals) if not n.unit]
+        alone = not self.clause.has("quantity") and len(bare) == 1
+        return bool(named) and alone and _AT_PACE.search(self.text, self.clause.start, numeral.start) is not None
 
     def _is_per_second(self) -> bool:
         """ "每秒 0.4 米,后又提到 1.2 米": a length that may be a speed."""
@@ -139,16 +163,12 @@ class NumberReader:
         elif first.unit == "percent":
             for i in members:
                 self._percent(i)
-        elif first.unit == "times":
+        elif first.unit == "times" or (not first.unit and self.clause.has("quantity", "ratio")):
             self.statements.append(
                 ratio_statement(self.sentence, self.clause, self.context, first.start, first.end, (members[0],))
             )
         elif first.unit == "clock":
             self._clock(members[0])
-        elif not first.unit and self.clause.has("quantity", "ratio"):
-            self.statements.append(
-                ratio_statement(self.sentence, self.clause, self.context, first.start, first.end, (members[0],))
-            )
         elif first.unit not in MEASURED or self._is_none(first):
             self.left_out = self.left_out or any(n.whole is not None for n in numerals)
         elif len(members) >= 3 and not {"-", "~"} & set(joins):
@@ -172,9 +192,9 @@ class NumberReader:
                 self._single([i], "number")
 
     def _is_none(self, numeral: Numeral) -> bool:
+        """ "not a single pixel", "一个像素也没变", "give or take 0.3 m"."""
         if _GIVE_OR_TAKE.search(self.text[: numeral.start]):
             return True
-        """ "not a single pixel", "一个像素也没变"."""
         around = self.text[self.clause.start : numeral.end + 4]
         return numeral.whole is None and bool(re.search(r"\bnot\b|n't|\bnever\b|没|不", around))
 
@@ -209,6 +229,8 @@ class NumberReader:
             names, is_cued, mode, trend = ("speed_difference", "difference_mean"), True, "value", 0
         if numeral.unit == "deg" and side and names and set(names) <= {"target_turn", "target_heading"}:
             mode, frames = "change", None  # "has bent left by 45 degrees"
+        if set(names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
+            names = ("target_turn",)
         if (
             numeral.unit == "deg"
             and side
@@ -223,6 +245,8 @@ class NumberReader:
         boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
         if numeral.unit == "px" and (side or vertical) and not boxed:
             names, is_cued = (("offset_x",) if side else ("offset_y",)), True
+        if side and sure[0]:
+            names = tuple([name for name in names if name in sure[0]]) or names
         found = Statement(
             kind="range" if kind == "range" else "number",
             clause=(self.clause.start, self.clause.end),
@@ -254,6 +278,8 @@ class NumberReader:
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
             return s
+        if not s.sure_names and s.names == ("yaw",) and s.side:
+            s = replace(s, sure_names=s.names)  # "has swung 3 degrees to the left in the last step"
         is_speed = numeral.unit == "mps" and s.mode == "either" and s.sure_names and s.frames == (-2, NOW)
         return replace(s, sure_frames=(NOW,) if is_speed else s.frames)  # a speed is that of the step before it
 

@@ -38,7 +38,7 @@ def ratio_statement(
     """
     told = _Multiple(sentence, clause, context, start, end)
     names, side = told.names_and_side()
-    signs = {1 if t.value.endswith("up") else -1 for t in told.trends}
+    signs = {1 if t.value.endswith("up") else -1 for t in told.trends} or told.signs_of_more()
     is_past = clause.has("time", "past", "start", "prev1", "prev2", "window", "mean") or context.has_past
     operands, is_ordered = _operands(sentence, start, end, numbers)
     return Statement(
@@ -125,6 +125,14 @@ class _Multiple:
         names = TREND_SERIES.get(cue, ())
         return ("box_width", "box_height", "box_area") if "box" in "".join(names) else names
 
+    def signs_of_more(self) -> set[int]:
+        """Give the way that a comparative says: "20 % less", "低了约三成"."""
+        more = _MORE_BY.match(self.text, self.end)
+        word = more.group().split()[-1] if more and self.text.isascii() else ""
+        zh = _ZH_MORE_BY.search(self.text[self.clause.start : self.start]) if not self.text.isascii() else None
+        word = zh.group()[0] if zh else word
+        return {-1} if word in _LESS else {1} if word in _MORE else set()
+
     def may_be_change(self) -> bool:
         """Tell whether a share that was added or lost may be told, not the multiple itself."""
         zh = self.sentence.language == "zh" and _ZH_MORE_BY.search(self.text[self.clause.start : self.start])
@@ -132,6 +140,10 @@ class _Multiple:
         return bool(is_more or self.trends or _LOSS.search(self.part))
 
 
+_LESS = frozenset(["slower", "less", "smaller", "below", "lower", "under", "down", "慢", "低", "少", "小", "短"])
+_MORE = frozenset(
+    ["faster", "quicker", "more", "bigger", "larger", "above", "higher", "over", "up", "快", "高", "多", "大", "长"]
+)
 _ZH_MORE_BY = re.compile(r"(?:快|慢|高|低|多|少|大|小|长|短)(?:了|出)?(?:约|大约|近|将近|差不多)?\s*$")
 _LOSS = re.compile(r"\b(?:drop|loss|gain|growth|rise|increase|decrease|reduction|deficit|cut|down|up)\b|幅")
 # Between a number and the multiple that is told of it: "2.4 m/s 的三倍", "from 1.19 to 0.49 m/s (59 % less)".

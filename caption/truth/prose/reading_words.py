@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from caption.truth.prose.clause_words import ClauseWords
-from caption.truth.prose.cues import TREND_SERIES, crossing, gap, times_of
+from caption.truth.prose.cues import OVERALL, TREND_SERIES, crossing, gap, times_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.reading_comparisons import compared_speeds
 from caption.truth.prose.reading_ratios import ratio_statement
@@ -225,7 +225,10 @@ class WordReader(ClauseWords):
             self.left_out = True
             return
         frames = self._frames(token)
-        if topic == "bend" and re.search(r"\b(?:has|have|had)\b|已", self.text[self.clause.start : token.start]):
+        told = self.text[self.clause.start : token.start]
+        if topic == "bend" and (
+            re.search(r"\b(?:has|have|had)\b|已", told) or OVERALL.search(self.text, self.clause.start)
+        ):
             frames = None  # the whole window's turn
         is_hedged = topic == "bend" and self.clause.has("modality", "likely")
         span = self._trend_span() if topic == "yaw" else None

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import GOES_TO, Context, names_of
+from caption.truth.prose.cues import GOES_TO, OBJECTS, Context, names_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.moments import Moments
 from caption.truth.prose.numerals import Numeral
@@ -194,7 +194,8 @@ class Sureness:
         for who in reversed(people):
             if any(_GENITIVE.fullmatch(self.text, who.end, t.start) for t in quantities if who.end <= t.start):
                 return who.value
-            if who.end <= numeral.start and any(
+            is_subject = who.end <= numeral.start and self.text[who.start : who.end] not in OBJECTS
+            if is_subject and any(
                 pattern.fullmatch(self.text, who.end, numeral.start) for pattern in (_GENITIVE, link, _DOES)
             ):
                 return who.value
@@ -255,7 +256,9 @@ class Sureness:
         if numeral.unit == "mps":
             return "either" if self._may_differ(numeral) else "value"
         tokens = [t for t in self.clause.of("quantity") if t.end <= numeral.start]
-        if self.text[max(0, numeral.start - 3) : numeral.start].strip("约近 ").endswith("了"):
+        if self.text[max(0, numeral.start - 3) : numeral.start].strip("约近 ").endswith("了") and not _REACHED.search(
+            self.text, self.clause.start, numeral.start
+        ):
             return "either"
         if any(_LINK[self.language].fullmatch(self.text, t.end, numeral.start) for t in tokens):
             return "value"
@@ -268,7 +271,7 @@ class Sureness:
             return bool(before or MORE_THAN.match(self.text, numeral.end) or self._follows_trend(numeral))
         return bool(
             ZH_MORE.search(self.text[: numeral.start])
-            or re.search(r"[了差比较]", self.text[self.clause.start : numeral.start])
+            or re.search(r"(?<![到至])了|[差比较]", self.text[self.clause.start : numeral.start])
         ) or self._follows_trend(numeral)
 
     def _follows_trend(self, numeral: Numeral) -> bool:
@@ -295,6 +298,7 @@ class Sureness:
         return self._follows_trend(numeral)
 
 
+_REACHED = re.compile(r"[到至]了[约近]?\s*$")
 _CHANGES_BY = {
     "en": re.compile(r"\s*(?:by|of|another|a further|about|roughly|some|almost|nearly|just|only|exactly|a mere|\s)*"),
     "zh": re.compile(r"\s*(?:了|约|大约|近|将近|仅|又|只)*\s*"),
