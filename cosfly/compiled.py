@@ -23,6 +23,8 @@ from typing import Any
 import numba
 from numba import boolean, int64
 
+from cosfly.reading.files import read_bytes
+
 __all__ = ["boolean", "int64", "njit"]
 
 PACKAGE = Path(__file__).parent
@@ -38,7 +40,7 @@ def sources_digest(package: Path) -> str:
     """Hash the sources below a folder that hold compiled functions, 16 hex digits."""
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        text = path.read_bytes()
+        text = read_bytes(path)
         if b"@njit" in text:
             digest.update(str(path.relative_to(package)).encode() + b"\0" + text)
     return digest.hexdigest()[:16]

@@ -8,10 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cosfly.errors import ConfigError, nearest
+from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.reading.files import read_text
+from cosfly.reading.settings_text import MOST_DEPTH, parse_yaml
 
 MOST_LISTED = 15  # names of settings in a message
 
@@ -43,31 +44,17 @@ class Config(BaseModel):
 C = TypeVar("C", bound=BaseModel)
 
 
-class _Loader(yaml.SafeLoader):
-    """The safe loader; a key that is given twice is an error, because only the last would count."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
-        keys = [key.value for key, _ in node.value]
-        twice = next((key for key, _ in node.value if keys.count(key.value) > 1 and key.value != "<<"), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"{twice.value!r} is given twice", twice.start_mark)
-        return super().construct_mapping(node, deep)
-
-
 def read_yaml(path: Path) -> dict:
-    """Read a YAML mapping with the safe loader.
+    """Read a YAML mapping.
 
     Raises:
-        ConfigError: it is missing, not YAML, or not a mapping.
+        ConfigError: it cannot be read, is not YAML, not a mapping, or says more than settings may.
     """
     try:
-        value = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ConfigError(
-            "cannot read the configuration", where=path, got=error.strerror, fix="check the path"
-        ) from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError("the configuration is not valid YAML", where=path, got=str(error)) from None
+        text = read_text(path, what="configuration")
+    except InputError as error:
+        raise ConfigError(error.what, where=path, got=error.got, fix=error.fix) from None
+    value = parse_yaml(text, path)
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -82,17 +69,14 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
-        if not equals or not all(key.split(".")):
+        if not equals or not all(key.split(".")) or key.count(".") > MOST_DEPTH:
             raise ConfigError(
                 "not an assignment",
                 where="--set",
-                got=override,
+                got=override[:80],
                 expected="key=value, for instance pedestrians.num_paths=3",
             )
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError("the value is not valid YAML", where=f"--set {key}", got=str(error)) from None
+        value = parse_yaml(text, f"--set {key}", what="value")
         node = data
         *parents, last = key.split(".")
         for parent in parents:

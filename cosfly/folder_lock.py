@@ -19,6 +19,7 @@ from typing import IO
 from weakref import WeakValueDictionary
 
 from cosfly.errors import ResumeError
+from cosfly.reading.documents import parse_json
 from cosfly.store import storage_errors
 
 log = logging.getLogger(__name__)
@@ -104,7 +105,7 @@ def _locked(path: Path) -> IO[str] | None:
 def _holder(text: str) -> str:
     """Say who holds a lock, from what stands in its file."""
     try:
-        found = json.loads(text)
+        found = parse_json(text)
         return f"process {found['pid']:d} on {found['host']}, {found['command']!r} since {found['since']}"
     except (ValueError, LookupError, TypeError):
         return "a process that has not said who it is"

@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from cosfly.store import dump_json, parse_json, sha256_bytes, storage_errors
+from cosfly.reading.documents import parse_json
+from cosfly.reading.files import open_file, read_lines
+from cosfly.store import dump_json, sha256_bytes, storage_errors
 
 TAIL = 65_536  # bytes at the end in which `last` looks
 
@@ -34,17 +36,16 @@ class Journal:
         self.num_damaged = 0
         if not self.path.exists():
             return
-        with open(self.path, "rb") as file:
-            for line in file:
-                record = _record_of(line)
-                if record is None:
-                    self.num_damaged += 1
-                else:
-                    yield record
+        for line in read_lines(self.path, what="journal"):
+            record = _record_of(line)
+            if record is None:
+                self.num_damaged += 1
+            else:
+                yield record
 
     def last(self) -> dict | None:
         """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""
-        with open(self.path, "rb") as file:
+        with open_file(self.path, what="journal") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             tail = file.read()
         return _record_of(tail[tail.rfind(b"\n", 0, -1) + 1 :])
@@ -88,7 +89,8 @@ def _record_of(line: bytes) -> dict | None:
         digest, body = line.rstrip(b"\n").split(b" ", 1)
         if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
             return None
-        return parse_json(body)
+        record = parse_json(body)
+        return record if isinstance(record, dict) else None
     except ValueError:
         return None
 

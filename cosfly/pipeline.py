@@ -27,9 +27,11 @@ import release.package
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
+from cosfly.reading.documents import read_json
+from cosfly.reading.limits import use_limits
 from cosfly.settings import RunConfig, manner_of_work
 from cosfly.stage_folder import Manifest, Resume, read_manifest
-from cosfly.store import read_json, refuse_link, write_bytes, write_json
+from cosfly.store import refuse_link, write_bytes, write_json
 from release.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)
@@ -89,6 +91,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
     and `summary.json` in the run folder, in that of each town where there are several.
     """
+    use_limits(cfg.reading)
     towns = {name: cfg.of_town(name) for name in cfg.towns}
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)  # the last stage would ask for it

@@ -19,17 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
-from cosfly.store import (
-    CHECKSUMS,
-    checksum_lines,
-    dump_json,
-    inside,
-    read_checksums,
-    read_json,
-    read_model,
-    sha256_bytes,
-    sha256_file,
-)
+from cosfly.reading.documents import read_json, read_model, read_object
+from cosfly.reading.files import sha256_file
+from cosfly.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +79,9 @@ def read_stage_record(folder: Path) -> StageRecord:
     Raises:
         InputError: it is missing or malformed.
     """
-    return read_model(folder / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION, what="stage record")
+    return read_model(
+        folder / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION, what="stage record", tree=folder
+    )
 
 
 def fingerprint(path: Path) -> str:
@@ -100,7 +94,7 @@ def fingerprint(path: Path) -> str:
         )
     manifest = path / "manifest.json"
     if manifest.is_file():
-        return sha256_bytes(dump_json(read_json(manifest).get("outputs", [])).encode())
+        return sha256_bytes(dump_json(read_object(manifest, what="manifest").get("outputs", [])).encode())
     digest = hashlib.sha256()
     for file in sorted(path.rglob(FLIGHT)):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
@@ -118,7 +112,9 @@ def recorded_digests(folder: Path) -> dict[str, str]:
     """Give the sha256 of a finished stage's products by their paths in its folder; empty where there is no manifest of ours."""
     if not _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
         return {}
-    made = read_model(folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
+    made = read_model(
+        folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest", tree=folder
+    )
     return {output.path: output.sha256 for output in made.outputs}
 
 
@@ -294,7 +290,7 @@ def verify(paths: Iterable[Path]) -> int:
 
 def _recorded_files(folder: Path) -> tuple[dict[Path, str], list[str]]:
     """Give the sha256 of every file that a stage folder or tree has on record, and name the files that are in none."""
-    found = {inside(folder, name): digest for name, digest in recorded_digests(folder).items()}
+    found = {inside(folder.resolve(), name): digest for name, digest in recorded_digests(folder).items()}
     strangers = list(_strangers(folder, recorded_digests(folder)))
     for lists in sorted(folder.rglob(CHECKSUMS)):
         if found.get(lists.resolve()) not in (None, sha256_file(lists)):

@@ -17,6 +17,7 @@ from cosfly.inspection.flight import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
+from cosfly.reading.limits import Limits
 from cosfly.render.stage import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worker_pool import Watch
@@ -57,6 +58,9 @@ class RunConfig(Config):
     )
     roi: Path | None = Field(
         None, description="region of interest for the pedestrians (a roi_polygon.json of yours); none: the whole map"
+    )
+    reading: Limits = Field(
+        default_factory=Limits, description="what a file may ask of this machine; makes no difference to products"
     )
     towns: dict[str, dict[str, Any]] = Field(
         {},

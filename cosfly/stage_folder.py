@@ -30,19 +30,9 @@ from cosfly.provenance import (
     checked_inputs,
     read_stage_record,
 )
-from cosfly.store import (
-    dump_json,
-    inside,
-    model_lines,
-    read_model,
-    refuse_links,
-    remove_partials,
-    sha256_bytes,
-    sha256_file,
-    validation_errors,
-    write_bytes,
-    write_model,
-)
+from cosfly.reading.documents import model_lines, read_model, validation_errors
+from cosfly.reading.files import sha256_file
+from cosfly.store import dump_json, inside, refuse_links, remove_partials, sha256_bytes, write_bytes, write_model
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +137,9 @@ class Manifest(BaseModel):
 
 def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of a complete stage."""
-    return read_model(folder / "manifest.json", Manifest, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest")
+    return read_model(
+        folder / "manifest.json", Manifest, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest", tree=folder
+    )
 
 
 class StageFolder:

@@ -22,6 +22,7 @@ from multiprocessing.connection import Connection
 from cosfly.console import set_levels
 from cosfly.errors import CosflyError
 from cosfly.items import Item, Work, attempt, counted_steps
+from cosfly.reading.limits import Limits, use_limits
 from cosfly.stage_folder import ItemRecord
 
 LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
@@ -55,6 +56,7 @@ class Start:
     heartbeat_s: float
     log_level: int
     parent_pid: int
+    reading: Limits
 
 
 @contextlib.contextmanager
@@ -76,6 +78,7 @@ def work_through(connection: Connection, start: Start) -> None:
     voice = _Voice(connection)
     logging.getLogger().handlers = [voice]
     set_levels(start.log_level)
+    use_limits(start.reading)
     threading.Thread(target=voice.tell_life, args=(start.heartbeat_s,), daemon=True).start()
     try:
         work = start.make_worker(*start.worker_args)

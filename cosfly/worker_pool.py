@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 from cosfly.errors import EnvironmentMissing
 from cosfly.items import Item, Work
+from cosfly.reading.limits import limits
 from cosfly.stage_events import EventLog, cpu_seconds
 from cosfly.stage_folder import Failed, ItemRecord
 from cosfly.worker import Broken, Message, Sign, Start, signals_held_back, work_through
@@ -181,7 +182,7 @@ class WorkerPool:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         here, there = context.Pipe()
         level = logging.getLogger().level
-        start = Start(self.make_worker, self.worker_args, self.watch.heartbeat_s, level, os.getpid())
+        start = Start(self.make_worker, self.worker_args, self.watch.heartbeat_s, level, os.getpid(), limits())
         process = context.Process(target=work_through, args=(there, start), daemon=True)
         with signals_held_back():
             process.start()

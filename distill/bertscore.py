@@ -16,7 +16,7 @@ from pydantic import Field
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
-from cosfly.store import read_json
+from cosfly.reading.documents import read_json
 from distill.student import Device, pick_device, quiet_transformers, require
 
 Scorer = Callable[[Sequence[str], Sequence[str]], np.ndarray]  # candidates, references -> (n, 3) precision, recall, F1

@@ -12,16 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.errors import InputError
-from cosfly.store import (
-    atomic_folder,
-    parse_json,
-    read_checksums,
-    read_json,
-    sha256_file,
-    write_bytes,
-    write_checksums,
-    write_json,
-)
+from cosfly.reading.documents import parse_json, read_json
+from cosfly.reading.files import read_lines, sha256_file
+from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json
 from distill.student import Student, weight_files
 
 log = logging.getLogger(__name__)
@@ -75,7 +68,7 @@ def cut_log(path: Path, num_steps: int) -> None:
     """Keep the lines of the first `num_steps` steps: what came after the checkpoint is done again."""
     kept = []
     if path.exists():
-        for line in path.read_bytes().splitlines(keepends=True):
+        for line in read_lines(path, what="log"):
             try:
                 if parse_json(line)["step"] <= num_steps and line.endswith(b"\n"):
                     kept.append(line)

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from cosfly.errors import InputError
 from cosfly.frame_views import frame_label
-from cosfly.products.frames import read_depth
+from cosfly.products.frames import tree_of
+from cosfly.reading.arrays import array_header, picture_size
 from cosfly.store import inside
 from distill.schema import Sample
 from distill.student import IMAGE_TOKEN, Student
@@ -67,15 +68,14 @@ def most_pixels(samples: Sequence[Sample]) -> int:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Give (width, height) px of a file of a frame, of an image from the header alone."""
+    """Give (width, height) px of a file of a frame, from its header alone."""
     if path.name == "depth.npy":
-        height_px, width_px = read_depth(path.parent).shape
+        height_px, width_px = array_header(path, tree=tree_of(path.parent)).shape
         return width_px, height_px
-    try:
-        with Image.open(path) as image:
-            return image.width, image.height
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError("cannot read the image", where=path, got=str(error), fix="check --data") from None
+    size = picture_size(path, tree=tree_of(path.parent))
+    if size is None:
+        raise InputError("not an image", where=path, expected="a PNG", fix="check --data")
+    return size
 
 
 # --- tokens -----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ whose answer does not parse, or could not be made, counts as wrong and scores 0.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,6 +22,7 @@ from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language
 from cosfly.products.predictions import Prediction, read_predictions
+from cosfly.reading.documents import parse_document, validation_errors
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
 from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts
@@ -155,8 +155,13 @@ def text_of(coc: Coc) -> str:
 
 
 def reference_of(sample: Sample) -> str:
-    """Give the text that a sample's prediction is compared with."""
-    return text_of(Coc.model_validate(json.loads(sample.answer)))
+    """Give the text that a sample's prediction is compared with.
+
+    Raises:
+        InputError: the sample's answer is none.
+    """
+    with validation_errors(sample.key):
+        return text_of(Coc.model_validate(parse_document(sample.answer, sample.key, what="answer")))
 
 
 def semantic_scores(pairs: Sequence[Pair], scorer: Scorer, rng: np.random.Generator) -> dict[str, Any]:

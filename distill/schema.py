@@ -15,7 +15,7 @@ from cosfly.frame_views import VIEW_FILES, Pictures, View
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.playback import flight_of
 from cosfly.products.predictions import Split
-from cosfly.store import model_lines
+from cosfly.reading.documents import model_lines
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarce trajectories are handed out
 

@@ -17,7 +17,8 @@ from typing import Any, Literal
 from cosfly.chance import rng_for
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.products.captions import ACTIONS, FIELDS
-from cosfly.store import atomic_folder, read_json
+from cosfly.reading.documents import read_json
+from cosfly.store import atomic_folder
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"

@@ -21,8 +21,10 @@ from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
+from cosfly.reading.documents import parse_json
+from cosfly.reading.files import read_lines
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import atomic_folder, dump_json, inside, parse_json, storage_errors, write_json
+from cosfly.store import atomic_folder, dump_json, inside, storage_errors, write_json
 from distill.checkpoint import (
     ADAPTER_FACTS,
     adapter_facts,
@@ -320,7 +322,7 @@ def fit(
                 save_checkpoint(checkpoints / f"step_{step + 1:08d}", student, optimizer, step + 1)
                 drop_old_checkpoints(checkpoints, cfg.keep_checkpoints)
             advance(1)
-    return [parse_json(line) for line in log_path.read_text(encoding="utf-8").splitlines()]
+    return [parse_json(line) for line in read_lines(log_path, what="log")]
 
 
 def run(

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import itertools
 import math
 import re
@@ -15,12 +14,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import yaml
 
 from cosfly.escaping import for_markdown, for_terminal, markdown_code
 from cosfly.products.captions import FIELDS
 from cosfly.products.frames import FrameFile
+from cosfly.reading.files import read_text
+from cosfly.reading.tables import open_table, rows_of
 from release.columns import (
     CAPTION_FACTS,
     CAPTION_FIELDS,
@@ -54,9 +54,7 @@ FILE_TEXT: dict[FrameFile, str] = {
 def read_rows(shards: Iterable[Path], columns: list[str] = SCALAR_NAMES) -> Iterator[dict[str, Any]]:
     """Yield the rows of all shards, a row group at a time; by default without pictures and depth."""
     for shard in shards:
-        with pq.ParquetFile(shard) as file:
-            for k in range(file.num_row_groups):
-                yield from file.read_row_group(k, columns=columns).to_pylist()
+        yield from rows_of(shard, columns, tree=shard.parents[1])
 
 
 def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
@@ -141,11 +139,11 @@ def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
     owner = {column.name: file for file, column in PICTURES.items()}
     sizes: Counter[str] = Counter()
     for shard in shards:
-        metadata = pq.read_metadata(shard)
-        for group in range(metadata.num_row_groups):
-            for column in range(metadata.num_columns):
-                chunk = metadata.row_group(group).column(column)
-                sizes[owner.get(chunk.path_in_schema.split(".")[0], "annotations")] += chunk.total_compressed_size
+        with open_table(shard, tree=shard.parents[1]) as table:
+            for group in range(table.num_row_groups):
+                for column in range(table.metadata.num_columns):
+                    chunk = table.metadata.row_group(group).column(column)
+                    sizes[owner.get(chunk.path_in_schema.split(".")[0], "annotations")] += chunk.total_compressed_size
     return dict(sorted(sizes.items()))
 
 
@@ -172,7 +170,7 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 
 def render_card(record: ReleaseRecord) -> str:
     """Give README.md for a release.json."""
-    template = (importlib.resources.files("release") / "card_template.md").read_text(encoding="utf-8")
+    template = read_text(Path(__file__).with_name("card_template.md"))
     values = _values(record)
     names = set(re.findall(r"\{\{(\w+)\}\}", template))
     assert names == set(values), f"template and values differ: {sorted(names ^ set(values))}"

@@ -17,8 +17,9 @@ import pyarrow as pa
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS
-from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
+from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, tree_of
 from cosfly.products.playback import EVENTS, Flight, sample_id
+from cosfly.reading.files import read_bytes
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
@@ -194,11 +195,7 @@ def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:
 def _read(flight: Flight, i: int, file: FrameFile) -> bytes:
     """Read a frame's file and see that its end is there; `release verify` decodes all of it."""
     path = flight.frame_folder(i) / FILE_NAMES[file]
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        got, fix = error.strerror, "run cosfly inspect again"
-        raise InputError("cannot read a frame's file", where=path, got=got, fix=fix) from None
+    data = read_bytes(path, what="frame's file", fix="run cosfly inspect again", tree=tree_of(path.parent))
     num_pixels = flight.camera.width_px * flight.camera.height_px
     if not (len(data) > 4 * num_pixels if file == "depth" else PNG_END in data[-256:]):
         raise InputError("a frame's file is cut short", where=path, got=f"{len(data)} bytes", fix="render it again")

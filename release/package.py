@@ -24,9 +24,11 @@ from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.products.playback import read_flight
 from cosfly.provenance import digest_of, folder_digests
+from cosfly.reading.files import sha256_file
+from cosfly.reading.tables import num_rows, row_groups
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, sha256_file, write_bytes, write_checksums
+from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes, write_checksums
 from release import columns
 from release.card import compute_numbers, render_card
 from release.record import (
@@ -215,10 +217,8 @@ def assemble_shards(parts: list[Path], folder: Path, cfg: ReleaseConfig) -> list
             continue
         with open_writer(shard, schema) as writer:
             for index in group:
-                with pq.ParquetFile(parts[index]) as source:
-                    for k in range(source.num_row_groups):
-                        table = source.read_row_group(k)
-                        writer.write_table(table, row_group_size=table.num_rows)
+                for table in row_groups(parts[index], tree=parts[index].parent):
+                    writer.write_table(table, row_group_size=table.num_rows)
     return shards
 
 
@@ -323,7 +323,7 @@ def make_record(
     listed = [
         Shard(
             path=f"data/{shard.name}",
-            rows=pq.read_metadata(shard).num_rows,
+            rows=num_rows(shard),
             bytes=shard.stat().st_size,
             sha256=sha256_file(shard),
         )

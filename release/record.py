@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
-from cosfly.store import read_model, write_model
+from cosfly.reading.documents import read_model
+from cosfly.store import write_model
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
 
@@ -173,4 +174,6 @@ def read_record(path: Path) -> ReleaseRecord:
     Raises:
         InputError: names the file and the field.
     """
-    return read_model(path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record")
+    return read_model(
+        path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record", tree=path.parent
+    )

@@ -13,6 +13,7 @@ from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryF
 from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.town import read_town_map
 from cosfly.provenance import fingerprint, warn_unbound, was_made_of
+from cosfly.reading.files import check_stays_below
 from release.captions import ByFlight, load_captions
 from release.columns import ReleasedCaption
 from release.record import ReleasedMap
@@ -41,7 +42,10 @@ class Source:
                 "not a run folder", where=folder, expected="a folder with render/, caption/ and inspect/",
                 fix="give --data, --captions and --inspect where they stand elsewhere",
             )  # fmt: skip
-        return cls.of_files(folder / "render", folder / "caption/captions.jsonl", folder / "inspect/inspect.json")
+        captions, inspected = folder / "caption/captions.jsonl", folder / "inspect/inspect.json"
+        for product in (captions, inspected):
+            check_stays_below(product, product.parent)
+        return cls.of_files(folder / "render", captions, inspected)
 
     @classmethod
     def of_files(cls, data: Path, captions: Path, inspect: Path) -> Source:

@@ -6,23 +6,23 @@ target projected again from pose and intrinsics; every picture decoded.
 
 from __future__ import annotations
 
-import io
 import itertools
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.issues import Report
 from cosfly.products.captions import ACTIONS
 from cosfly.products.frames import FrameFile
+from cosfly.reading.arrays import parse_array, parse_picture
+from cosfly.reading.files import read_bytes, sha256_file
+from cosfly.reading.tables import open_table
 from cosfly.stage_folder import flattened
-from cosfly.store import CHECKSUMS, inside, read_checksums, sha256_file
+from cosfly.store import CHECKSUMS, inside, read_checksums
 from release import columns
 from release.card import compute_numbers, read_rows, render_card
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_LISTS, CAPTION_SHARES, PICTURES, PLACE, POINT
@@ -68,8 +68,12 @@ def verify(folder: Path, *, pixels: Pixels = "all") -> Report:
         for check in checks:
             try:
                 check(paths, record, report)
-            except (pa.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
-                # Damage inside a column chunk shows only when it is read; as what depends on the byte.
+            except (
+                InputError,
+                ValueError,
+                KeyError,
+                TypeError,
+            ) as error:  # a value of no sense, or none where one must be
                 report.error("unreadable", "data", f"{type(error).__name__}: {error}", "rows that can be read")
     _check_card(folder, record, report)
     return report
@@ -94,14 +98,15 @@ def _read_record(folder: Path, report: Report) -> ReleaseRecord | None:
 def _check_names_and_sizes(folder: Path, record: ReleaseRecord, report: Report) -> list[str]:
     """Compare the files that are there with those that should be; give the shards that are there."""
     listed = {entry.path: entry for entry in record.shards}
+    paths = [path for path in folder.rglob("*") if not path.is_dir()]
+    paths = [path for path in paths if path.relative_to(folder).parts[0] not in ALLOWED]
+    names = {path.relative_to(folder).as_posix() for path in paths}
     found = {
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if not path.is_dir() and path.relative_to(folder).parts[0] not in ALLOWED
-    }
+        path.relative_to(folder).as_posix() for path in paths if path.is_file()
+    }  # neither a pipe nor a broken link
     for name in sorted({*listed, *RECORDS} - found):
         report.error("missing", name, "no such file", "a file of the release")
-    for name in sorted(found - {*listed, *RECORDS}):
+    for name in sorted(names - {*listed, *RECORDS}):
         report.error("unexpected", name, "a file", "nothing: release.json does not know it")
     for name in sorted(listed.keys() & found):
         size = (folder / name).stat().st_size
@@ -139,10 +144,10 @@ def _readable(folder: Path, names: list[str], record: ReleaseRecord, report: Rep
     good = []
     for name in names:
         try:
-            with pq.ParquetFile(folder / name) as file:
-                schema, num_rows = file.schema_arrow, file.metadata.num_rows
-        except (pa.ArrowException, OSError) as error:
-            report.error("unreadable", name, str(error), "a parquet file")
+            with open_table(folder / name, tree=folder) as table:
+                schema, num_rows = table.schema_arrow, table.metadata.num_rows
+        except InputError as error:
+            report.error("unreadable", name, error.got or error.what, "a parquet file")
             continue
         has_features = (schema.metadata or {}).get(b"huggingface") == expected.metadata[b"huggingface"]
         if not schema.equals(expected) or not has_features:
@@ -193,7 +198,11 @@ def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
     path = folder / "README.md"
     if not path.is_file():
         return
-    found = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    try:
+        found = read_bytes(path, what="card", tree=folder).decode(errors="replace").split("\n")
+    except InputError as error:
+        report.error("card", "README.md", error.got or error.what, "the card")
+        return
     wanted = render_card(record).split("\n")
     for number, (line, expected) in enumerate(itertools.zip_longest(found, wanted, fillvalue="the end"), 1):
         if line != expected:
@@ -290,14 +299,12 @@ def _check_pictures(paths: list[Path], record: ReleaseRecord, report: Report) ->
 
 def picture_problem(file: FrameFile, value: Any, size: tuple[int, int]) -> str | None:
     """Say why a picture is not one of (height, width), None if it is."""
-    if file == "depth":
-        try:
-            depth = np.load(io.BytesIO(value or b""), allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
-            return f"not a NumPy array: {error}"
-        return None if depth.dtype == np.float32 and depth.shape == size else f"{depth.dtype} {depth.shape}"
-    data = (value or {}).get("bytes") or b""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if image is None:
-        return f"{len(data)} bytes that do not decode"
-    return None if image.shape[:2] == size else f"{image.shape[1]} x {image.shape[0]} px"
+    try:
+        if file == "depth":
+            found = parse_array(value or b"", "depth", dtype=np.float32, ndim=2).shape
+        else:
+            data = (value or {}).get("bytes") or b""
+            found = parse_picture(data, file, flags=cv2.IMREAD_UNCHANGED).shape[:2]
+    except InputError as error:
+        return f"{error.what}: {error.got}"
+    return None if found == size else f"{found[1]} x {found[0]} px"

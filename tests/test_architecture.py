@@ -124,6 +124,50 @@ def test_compiled_functions_share_one_cache():
     assert importers == {"cosfly.compiled"}
 
 
+# Names that read what stands on disk, or text that stood there. Only the gate calls them: it knows what a file may do.
+READING = {"open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread", "imdecode",
+           "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"}  # fmt: skip
+ALLOWED_TO_READ = {
+    ("cosfly.folder_lock", "open"),  # a lock, opened to be written
+    ("cosfly.stage_events", "read_bytes"),  # /proc, whose files have no size
+    ("cosfly.chat.objects", "loads"),  # a string of a server's reply
+    ("distill.student", "loads"),  # what the tokenizer's own library gives
+    ("distill.checkpoint", "load"),  # tensors, whose checksums were compared
+    ("distill.checkpoint", "load_file"),
+}
+
+
+def reading_calls(name: str) -> set[tuple[str, str]]:
+    """Calls that open or decode input, as (module, name of the function); opening to write is none."""
+    tree, found = ast.parse(SOURCES[name].read_text(encoding="utf-8")), set()
+    ours = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] in PACKAGES:
+            ours |= {alias.name for alias in node.names}
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        plain = isinstance(call.func, ast.Name)
+        function = call.func.id if plain else getattr(call.func, "attr", "")
+        if function not in READING or (plain and function in ours):
+            continue
+        modes = [a.value for a in [*call.args, *(k.value for k in call.keywords)] if isinstance(a, ast.Constant)]
+        writes = function == "open" and any(isinstance(mode, str) and set(mode) & set("wax+") for mode in modes)
+        own = not plain and ast.unparse(call.func.value) in ("StageFolder", "cls")  # a folder of ours
+        if not writes and not own:
+            found.add((name, function))
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(name for name in SOURCES if not name.startswith("cosfly.reading")))
+def test_only_the_gate_opens_files_to_read_them(name):
+    assert reading_calls(name) <= ALLOWED_TO_READ
+
+
+def test_the_exceptions_of_the_gate_are_needed():
+    assert {
+        call for name in SOURCES if not name.startswith("cosfly.reading") for call in reading_calls(name)
+    } == ALLOWED_TO_READ
+
+
 def test_the_rule_can_fail(monkeypatch, tmp_path):
     bad = tmp_path / "bad.py"
     bad.write_text("import torch\nimport release.package\n")
@@ -132,6 +176,17 @@ def test_the_rule_can_fail(monkeypatch, tmp_path):
         test_imports_point_one_way("cosfly.store")
     with pytest.raises(AssertionError):
         test_heavy_packages_are_imported_where_they_are_used("cosfly.store")
+    for text in (
+        "open(path)",
+        "path.open()",
+        "Image.open(path)",
+        "np.load(path)",
+        "path.read_text()",
+        "json.load(file)",
+    ):
+        bad.write_text(text)
+        with pytest.raises(AssertionError):
+            test_only_the_gate_opens_files_to_read_them("cosfly.store")
 
 
 @pytest.mark.parametrize("package", PACKAGES)

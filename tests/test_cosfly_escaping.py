@@ -30,7 +30,7 @@ from cosfly.inspection.stage import run as inspect
 from cosfly.issues import Report
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.inspection import Inspection, read_inspection
-from cosfly.store import read_json
+from cosfly.reading.documents import read_json
 from release.card import render_card
 from release.record import ReleaseRecord
 from specimens import make_playback_tree

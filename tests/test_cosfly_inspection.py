@@ -28,7 +28,9 @@ from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.store import read_json, sha256_file, write_checksums, write_json
+from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
+from cosfly.store import write_checksums, write_json
 from specimens import make_playback_tree
 
 NUM_POINTS = 10

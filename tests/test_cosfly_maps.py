@@ -495,8 +495,8 @@ def change(model: dict, path: str, value) -> None:
         ("CityObjects/road/geometry/0/boundaries", 5, "road.geometry[0].boundaries: not nested as its type says"),
         ("CityObjects/road/geometry/0/boundaries", [[[8, 9]]], "road.geometry[0].boundaries surface 0: not a ring"),
         ("vertices/8", [10**9, 0, 0], "vertices: the map is too wide"),
-        ("vertices/8", [10**400, 0, 0], "vertices: not a list of vertices"),
-        ("transform/scale/0", 10**400, "transform.scale: not a vector"),
+        ("vertices/8", [10**400, 0, 0], "vertices[8][0]: the city model holds a number"),
+        ("transform/scale/0", 10**400, "transform.scale[0]: the city model holds a number"),
     ],
 )  # fmt: skip
 def test_malformed_city_models_name_the_object_and_the_field(tmp_path: Path, path: str, value, words: str):

@@ -8,8 +8,10 @@ import pytest
 from cosfly import provenance
 from cosfly.config import Config
 from cosfly.errors import VerifyError
+from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
 from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import dump_json, read_json, sha256_bytes, sha256_file, write_bytes, write_checksums, write_json
+from cosfly.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
 
 
 def begin(out: Path, name: str, **inputs: Path) -> StageFolder:

@@ -26,6 +26,7 @@ from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_in
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.reading.files import sha256_file
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
 from cosfly.render.contract import (
     GROUND_PLANE_HALF_M,
@@ -44,7 +45,7 @@ from cosfly.render.gl.scene import build_scene
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.stage import RenderConfig, open_renderer, run, script_flight
-from cosfly.store import read_checksums, sha256_file
+from cosfly.store import read_checksums
 
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()

@@ -13,8 +13,9 @@ from cosfly import store
 from cosfly.config import Config, MayDiffer
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.journal import Journal
+from cosfly.reading.documents import read_json
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
-from cosfly.store import inside, read_json, write_bytes, write_json
+from cosfly.store import inside, write_bytes, write_json
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -29,9 +29,11 @@ from cosfly.products.frames import read_meta
 from cosfly.products.inspection import read_inspection
 from cosfly.products.places import Place, flight_ids, stand, town_folder
 from cosfly.products.playback import find_flights, read_flight, read_twin, write_flight
+from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees
 from cosfly.stage_folder import read_failures
-from cosfly.store import read_checksums, read_json, sha256_file, write_checksums, write_json
+from cosfly.store import read_checksums, write_checksums, write_json
 from distill import dataset
 from distill.dataset import PrepareConfig
 from distill.schema import SPLITS, read_split

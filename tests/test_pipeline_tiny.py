@@ -23,9 +23,11 @@ from cosfly.products.captions import read_captions
 from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.walks import read_paths as read_walks
+from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
 from cosfly.settings import RunConfig
 from cosfly.stage_folder import read_failures
-from cosfly.store import read_checksums, read_json, sha256_file, write_checksums, write_json
+from cosfly.store import read_checksums, write_checksums, write_json
 from distill import dataset
 from release import package
 from release.sources import Source

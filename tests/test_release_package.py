@@ -33,7 +33,9 @@ from cosfly.products.inspection import (
 )
 from cosfly.products.playback import find_flights, read_flight, sample_id
 from cosfly.products.town import write_town_map
-from cosfly.store import read_json, sha256_file, write_json
+from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
+from cosfly.store import write_json
 from release.card import render_card, size_category
 from release.columns import SCALARS
 from release.package import ReleaseConfig, plan_shards, run

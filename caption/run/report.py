@@ -13,6 +13,7 @@ from cosfly.frame_views import thumbnail
 from cosfly.products.captions import ACTIONS, Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import flight_of
+from cosfly.reading.files import read_text
 from cosfly.store import write_bytes
 
 PICTURE_WIDTH_PX = 240
@@ -24,7 +25,7 @@ VERDICTS = {  # color, what it means
 }
 STATES = {"proved": "#2f855a", "contradicted": "#c53030", "unread": "#cbd5e0"}
 LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
-STYLE = "\n" + Path(__file__).with_name("report.css").read_text(encoding="utf-8")
+STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 DIFFERENT_TEACHER = (
     "The rule teacher is a deterministic baseline: it looks at the flight data of five frames and at no picture. It is a "
     "different teacher than the paper's, so these shares say nothing about the paper's 21.5 / 57.5 / 21.0 %."

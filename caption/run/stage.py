@@ -28,6 +28,7 @@ from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.products.playback import flight_of
+from cosfly.reading.files import read_lines
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest
 from cosfly.store import write_json
@@ -254,5 +255,4 @@ def _merge(stage: StageFolder, allotted: list[Allotted], foreign: set[str] | Non
 
 
 def _num_lines(path: Path) -> int:
-    with open(path, "rb") as file:
-        return sum(1 for _ in file)
+    return sum(1 for _ in read_lines(path))

@@ -36,7 +36,7 @@ from cosfly.chat.refusals import MEANINGS
 from cosfly.errors import TeacherError
 from cosfly.frame_views import VIEW_FILES
 from cosfly.products.captions import Writing, answer_schema, parse_answer
-from cosfly.store import parse_json
+from cosfly.reading.documents import parse_json
 
 State = Literal["ok", "warning", "unusable"]
 

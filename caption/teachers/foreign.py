@@ -17,7 +17,8 @@ from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError
 from cosfly.products.captions import Claim, Coc, Language, TeacherKind, TeacherRecord, TeacherSettings, Writing
 from cosfly.products.predictions import FAILED, Prediction, read_predictions
-from cosfly.store import dump_json, model_lines
+from cosfly.reading.documents import model_lines
+from cosfly.store import dump_json
 
 NOT_IN_FILE = "not_in_file"
 

@@ -19,6 +19,7 @@ from caption.truth.glossary import load_glossary
 from caption.writing.contract import Draft, way_of
 from cosfly.frame_views import Pictures, frame_label
 from cosfly.products.captions import ACTIONS, PICTURES_MARK, Language, Prompt, Writing
+from cosfly.reading.files import read_text
 from cosfly.store import dump_json, sha256_bytes
 
 PROMPTS = Path(__file__).with_name("prompts")
@@ -68,7 +69,7 @@ class Question:
 @cache
 def read_prompt(name: str) -> Template:
     """Read `prompts/<name>.txt` without its version line."""
-    text = (PROMPTS / f"{name}.txt").read_text(encoding="utf-8")
+    text = read_text(PROMPTS / f"{name}.txt")
     version, _, body = text.partition("\n")
     assert version.startswith("# version: "), f"{name}.txt lacks its version line"
     return Template(body.rstrip("\n"))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from caption.truth.facts import Facts
 from cosfly.products.captions import Claim, Coc, Language
-from cosfly.store import model_lines
+from cosfly.reading.documents import model_lines
 
 GOLD_PROSE = Path(__file__).with_name("gold_prose.jsonl")
 

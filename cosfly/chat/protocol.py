@@ -10,7 +10,8 @@ from urllib.parse import urlsplit, urlunsplit
 import httpx
 
 from cosfly.chat.contract import Reply, Request, Usage
-from cosfly.store import dump_json, parse_json, sha256_bytes
+from cosfly.reading.documents import parse_json
+from cosfly.store import dump_json, sha256_bytes
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content
@@ -95,10 +96,7 @@ def read_body(content: bytes) -> Any:
     Raises:
         ValueError: it is no JSON, or nested deeper than can be read.
     """
-    try:
-        return _writable(parse_json(content))
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
+    return _writable(parse_json(content))
 
 
 def _writable(value: Any) -> Any:

@@ -45,10 +45,13 @@ Data = Annotated[
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings; None is not given."""
     from cosfly.config import load
+    from cosfly.reading.limits import use_limits
     from cosfly.settings import RunConfig
 
     extra = [f"{name}={value}" for name, value in given.items() if value is not None]
-    return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+    cfg = load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+    use_limits(cfg.reading)
+    return cfg
 
 
 def _config_path(config: Path | None) -> Path | None:

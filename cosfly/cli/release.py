@@ -49,10 +49,15 @@ def release_build(
 
 
 @app.command("verify")
-def release_verify(folder: Annotated[Path, typer.Argument(help="Release folder.")]) -> None:
+def release_verify(
+    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
     """Check structure, checksums, every number of the card, and re-projection. Exit 1 if anything is wrong."""
     from release.validate import verify
 
+    options.resolve(config, overrides)
     report = verify(folder)
     typer.echo(str(report))
     if not report.is_ok:

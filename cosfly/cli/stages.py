@@ -168,10 +168,13 @@ def render(
 def gallery(
     out: Annotated[Path, typer.Option(help="Folder for contact_sheet.png and preview.gif.")],
     data: options.Data = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
 ) -> None:
     """A contact sheet and a preview GIF of a playback tree."""
     from cosfly.gallery import contact_sheet, preview_gif
 
+    options.resolve(config, overrides)
     tree = options.data_folder(data)
     contact_sheet(tree, out / "contact_sheet.png")
     preview_gif(tree, out / "preview.gif")
@@ -182,6 +185,8 @@ def gallery(
 def convert_tree(
     data: Annotated[Path, typer.Option(help="Playback tree of an earlier cosfly; it stays as it is.")],
     out: Annotated[Path, typer.Option(help="Folder of the converted tree.")],
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
@@ -189,7 +194,7 @@ def convert_tree(
     """An older playback tree to one that public readers of CosFly-Track take; pictures are linked, not copied."""
     from cosfly.render import older_trees
 
-    cfg = options.resolve(None, None, {"workers": workers})
+    cfg = options.resolve(config, overrides, {"workers": workers})
     options.verify_first(verify, data, out)
     options.tell_product(older_trees.run(data, out, **options.manner(cfg, resume)), out, cfg)
 

@@ -28,14 +28,16 @@ from cosfly.products.frames import (
     read_instance,
     read_meta,
     read_rgb,
+    tree_of,
 )
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.reading.arrays import PNG_SIGNATURE, array_header, picture_size
+from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.runner import advance
-from cosfly.store import CHECKSUMS, read_checksums, sha256_file
+from cosfly.store import CHECKSUMS, read_checksums
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 SMALL_PX = (128, 72)  # frames are shrunk to this before they are compared with each other
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street still has more than 5
 # The centre of the person's box and its visible surface are at most a half height apart along the optical axis.
@@ -76,16 +78,6 @@ def png_problem(data: bytes) -> str | None:
     return f"the file ends at byte {len(data)}, before the image does"
 
 
-def png_size(path: Path) -> tuple[int, int] | None:
-    """Read (width, height) of a PNG from its header, None if there is none."""
-    with open(path, "rb") as file:
-        head = file.read(24)
-    if len(head) < 24 or not head.startswith(PNG_SIGNATURE):
-        return None
-    width, height = struct.unpack(">II", head[16:24])
-    return width, height
-
-
 def check_files(flight: Flight, report: Report) -> list[int]:
     """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
 
@@ -110,16 +102,10 @@ def check_files(flight: Flight, report: Report) -> list[int]:
             path, where = flight.frame_folder(i) / name, f"{frame_name(i)}/{name}"
             if not path.is_file():
                 report.error("missing_file", where, "no such file", "one file per frame and modality")
-            elif name.endswith(".png"):
-                found = png_size(path)
-                if found != size:
-                    report.error("wrong_format", where, found or "no PNG header", f"a PNG of {size[0]} x {size[1]} px")
-            elif name.endswith(".npy"):
-                problem = _depth_header_problem(path, (size[1], size[0]))
-                if problem:
-                    report.error("wrong_format", where, problem, f"float32 ({size[1]}, {size[0]})")
-            else:
+            elif name == "meta.json":
                 _check_meta(flight, i, report)
+            else:
+                _check_header(path, size, where, report)
         if len(report.issues) == problems_before:
             complete.append(i)
     known = {Path(frame_name(i)).name for i in range(len(flight))}
@@ -133,12 +119,19 @@ def _has_any(flight: Flight, name: str) -> bool:
     return any((flight.frame_folder(i) / name).exists() for i in range(len(flight)))
 
 
-def _depth_header_problem(path: Path, shape: tuple[int, int]) -> str | None:
+def _check_header(path: Path, size: tuple[int, int], where: str, report: Report) -> None:
+    """Check type and (width, height) of a picture or a depth image, by its header."""
+    is_depth = path.suffix == ".npy"
+    expected = f"float32 ({size[1]}, {size[0]})" if is_depth else f"a PNG of {size[0]} x {size[1]} px"
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # reads the header, compares the length
-    except (OSError, ValueError, EOFError):
-        return f"{path.stat().st_size} bytes that are not a complete NumPy array"
-    return None if array.shape == shape and array.dtype == np.float32 else f"{array.dtype} {array.shape}"
+        if is_depth:
+            found: object = str(array_header(path, tree=tree_of(path.parent)))
+        else:
+            found = picture_size(path, tree=tree_of(path.parent)) or "no PNG header"
+    except InputError as error:
+        found = error.got or error.what
+    if found != (expected if is_depth else size):
+        report.error("wrong_format", where, found, expected)
 
 
 def _check_meta(flight: Flight, i: int, report: Report) -> None:
@@ -205,17 +198,13 @@ def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float,
     for i in indices:
         advance()
         frame, where = flight.frame_folder(i), frame_name(i)
-        broken = False
-        for name in ("rgb.png", "instance.png"):
-            if not (frame / name).exists():
-                continue  # of a tree that has none: `check_files` said so
-            problem = png_problem((frame / name).read_bytes())
-            if problem:
-                report.error("broken_image", f"{where}/{name}", problem, "a PNG that decodes in full")
-                broken = True
-        if broken:
-            continue
         try:
+            problems = [(name, _png_problem_of(frame / name)) for name in ("rgb.png", "instance.png")]
+            for name, problem in problems:
+                if problem:
+                    report.error("broken_image", f"{where}/{name}", problem, "a PNG that decodes in full")
+            if any(problem for _, problem in problems):
+                continue
             rgb = read_rgb(frame)
             depth = read_depth(frame) if (frame / "depth.npy").exists() else None
             kinds = read_instance(frame)[0] if (frame / "instance.png").exists() else None
@@ -235,6 +224,11 @@ def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float,
             if kinds is not None:
                 _check_mask(flight, i, kinds, depth, mask_visibility_min, numbers, report)
     return numbers
+
+
+def _png_problem_of(path: Path) -> str | None:
+    """As `png_problem`; None for a file of a tree that has none, of which `check_files` said so."""
+    return png_problem(read_bytes(path, what="image", tree=tree_of(path.parent))) if path.exists() else None
 
 
 def _moved(flight: Flight, i: int, k: int) -> bool:

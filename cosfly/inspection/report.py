@@ -13,11 +13,12 @@ from cosfly.frame_views import thumbnail
 from cosfly.issues import Issue
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
 from cosfly.products.playback import Flight
+from cosfly.reading.files import read_text
 from cosfly.store import write_bytes
 
 CURVE_POINTS = 160
 
-STYLE = "\n" + Path(__file__).with_name("report.css").read_text(encoding="utf-8")
+STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 
 # column title, metric, format
 COLUMNS = (

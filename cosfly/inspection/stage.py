@@ -25,9 +25,9 @@ from cosfly.products.inspection import (
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.provenance import recorded_digests
+from cosfly.reading.documents import validation_errors
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder
-from cosfly.store import validation_errors
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:

@@ -21,7 +21,7 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
-from cosfly.maps.footprints import cover, polygons_of, rectangle_polygon, united
+from cosfly.maps.footprints import check_outline, cover, polygons_of, rectangle_polygon, united
 from cosfly.maps.terrain import ground_of
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.ground import Ground, GroundGrid
@@ -184,7 +184,9 @@ def _facets(item: CityObject) -> list[Facet]:
         a, b = -normal[0] / normal[2], -normal[1] / normal[2]
         middle = ring.mean(axis=0)
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
-        facets.append(Facet(Polygon(ring[:, :2], [hole[:, :2] for hole in surface[1:]]), plane))
+        polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in surface[1:]])
+        check_outline(polygon, item.object_id)
+        facets.append(Facet(polygon, plane))
     return facets
 
 

@@ -7,9 +7,7 @@ until 1.0 `transform` may be missing (vertices are metres then) and `lod` is a n
 
 from __future__ import annotations
 
-import gzip
 import logging
-import zlib
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,7 +15,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.store import parse_json
+from cosfly.reading.documents import parse_document, parse_json
+from cosfly.reading.files import read_unpacked
+from cosfly.reading.limits import limits, over_limit
 
 log = logging.getLogger(__name__)
 
@@ -142,11 +142,18 @@ def _city_object(object_id: str, value: Any, part: _Part, templates: _Templates)
     surfaces, level = _surfaces(value.get("geometry", []), part.vertices, templates, f"{where}.geometry")
     if not surfaces:
         return "no_geometry"
-    if level < 1 and rule.form == "solid" and value.get("children"):
+    if level < 1 and rule.form == "solid" and _has_parts(value, part):
         return (
             "outline_of_parts"  # a building whose parts stand in the file with a height; it would hide their courtyards
         )
     return CityObject(object_id, rule, surfaces)
+
+
+def _has_parts(value: dict, part: _Part) -> bool:
+    """Tell whether an object's parts stand in the file; one that names absent ones has nothing but its own geometry."""
+    children = value.get("children")
+    names = children if isinstance(children, list) else []
+    return any(isinstance(name, str) and name in part.objects for name in names)
 
 
 def rule_of(object_type: str, attributes: dict) -> Rule | None:
@@ -161,18 +168,13 @@ def rule_of(object_type: str, attributes: dict) -> Rule | None:
 
 def _read_json(path: Path) -> tuple[dict, list[tuple[str, dict]]]:
     """Give the document, and the features of a sequence with their places in the file."""
-    try:
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
-    except OSError as error:
-        raise InputError("cannot read the city model", where=path, got=error.strerror, fix="check the path") from None
+    data = read_unpacked(path, what="city model", limit="city_mb")
     lines = data.replace(RECORD_SEPARATOR, b"").splitlines()
     is_sequence = len(lines) > 1 and b'"CityJSONFeature"' in data and _is_whole(lines[0])
     texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()] if is_sequence else []
-    head, *features = [(where, _parsed(line, where)) for where, line in texts] or [(str(path), _parsed(data, path))]
+    head, *features = [
+        (where, parse_document(text, where, what="city model")) for where, text in texts or [(str(path), data)]
+    ]
     model = _document(head[1], path)
     for where, feature in features:
         if not isinstance(feature, dict) or feature.get("type") != "CityJSONFeature":
@@ -187,16 +189,9 @@ def _is_whole(line: bytes) -> bool:
     """Tell whether a line is JSON by itself: a document over several lines is not."""
     try:
         parse_json(line)
-    except (ValueError, RecursionError):
+    except ValueError:
         return False
     return True
-
-
-def _parsed(text: bytes, where: str | Path) -> Any:
-    try:
-        return parse_json(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError("the city model is not valid JSON", where=where, got=str(error)) from None
 
 
 def _document(model: Any, path: Path) -> dict:
@@ -239,7 +234,7 @@ def _transform(model: dict, path: Path) -> np.ndarray:
     for name in ("scale", "translate"):
         try:
             part = np.array(transform[name], dtype=np.float64) if isinstance(transform, dict) else np.empty(0)
-        except (KeyError, TypeError, ValueError, OverflowError):
+        except (KeyError, TypeError, ValueError):
             part = np.empty(0)
         if part.shape != (3,) or not np.isfinite(part).all():
             raise InputError("not a vector", where=f"{path}: transform.{name}", expected="three finite numbers")
@@ -251,7 +246,7 @@ def _vectors(values: Any, where: str) -> np.ndarray:
     """Lists of three numbers as (n, 3)."""
     try:
         vectors = np.empty((0, 3)) if values == [] else np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError):
         vectors = np.empty(0)
     if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.isfinite(vectors).all():
         raise InputError("not a list of vertices", where=where, expected="lists of three finite numbers")
@@ -313,7 +308,7 @@ def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: 
         )
     try:
         matrix = np.array(geometry.get("transformationMatrix"), dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError):
         matrix = np.full((4, 4), np.nan)
     if not np.isfinite(matrix).all():
         expected = "16 finite numbers, row by row"
@@ -340,6 +335,9 @@ def _level(geometry: dict) -> float:
 def _rings(surface: Any, vertices: np.ndarray, where: str) -> list[np.ndarray]:
     if not isinstance(surface, list) or not surface:
         raise InputError("not a surface", where=where, got=repr(surface)[:60], expected="a list of rings")
+    num_vertices = sum(len(ring) for ring in surface if isinstance(ring, list))
+    if num_vertices > limits().polygon_vertices:
+        raise over_limit("polygon_vertices", where, f"{num_vertices:,} vertices")
     rings = []
     for ring in surface:
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):

@@ -10,7 +10,10 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from cosfly.reading.limits import limits, over_limit
+
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
+PAIRS_AT_ONCE = 1_000_000  # of edges that are compared before the count is looked at
 MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
 
 Share = tuple[float, float]
@@ -110,6 +113,38 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
                 best = (empty, parts)
     assert best is not None
     return best[1]
+
+
+def check_outline(polygon: Polygon, where: str) -> None:
+    """Refuse an outline that crosses itself so often that mending it would take minutes and gigabytes.
+
+    Raises:
+        InputError: names the limit.
+    """
+    most = limits().polygon_crossings
+    if not polygon.is_valid and num_crossings(polygon, most) > most:
+        raise over_limit("polygon_crossings", where, "more crossings of its own outline")
+
+
+def num_crossings(polygon: Polygon, most: int) -> int:
+    """Count the pairs of edges, not neighbours in a ring, that meet; stops soon after `most`."""
+    edges, before, first = [], [], 0
+    for ring in (polygon.exterior, *polygon.interiors):
+        corners = np.asarray(ring.coords)[:, :2]
+        corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(axis=1)]]
+        edges.append(np.stack([corners[:-1], corners[1:]], axis=1))
+        before.append(first + np.roll(np.arange(len(corners) - 1), 1))  # the edge before each
+        first += len(corners) - 1
+    lines, previous = shapely.linestrings(np.concatenate(edges)), np.concatenate(before)
+    tree, count = shapely.STRtree(lines), 0
+    step = max(1, PAIRS_AT_ONCE // len(lines))
+    for start in range(0, len(lines), step):
+        one, other = tree.query(lines[start : start + step], predicate="intersects")
+        one = one + start
+        count += int(((one < other) & (previous[one] != other) & (previous[other] != one)).sum())
+        if count > most:
+            break
+    return count
 
 
 def united(polygons: list[Polygon]) -> BaseGeometry:

@@ -23,7 +23,7 @@ from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.store import read_json, validation_errors
+from cosfly.reading.documents import read_json, validation_errors
 
 log = logging.getLogger(__name__)
 

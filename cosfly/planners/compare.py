@@ -23,9 +23,10 @@ from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
+from cosfly.reading.documents import read_json
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
-from cosfly.store import read_json, write_bytes, write_json
+from cosfly.store import write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "2.0"
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety

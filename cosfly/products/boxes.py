@@ -13,10 +13,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
-from cosfly.products.columns import rounded
+from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
-from cosfly.store import check_schema, dump_json, read_json, validation_errors, write_bytes
+from cosfly.reading.documents import check_schema, read_json, validation_errors
+from cosfly.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
 COMPUTED = {
@@ -75,7 +76,7 @@ class MapHeader(_Kept):
     source: MapSource = MapSource()
     licence: LicenceId = UNKNOWN_LICENCE
     credits: str = ""  # who must be named, one sentence or more
-    ground_z_m: float = Field(0.0, allow_inf_nan=False)
+    ground_z_m: float = Field(0.0, ge=-LARGEST, le=LARGEST)
     ground: GroundGrid | None = None
     extent_sources: dict[str, int] = {}  # where a box's size comes from -> boxes
     roads: dict[str, float] = {}
@@ -168,7 +169,7 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         InputError: NaN, a negative extent, an unknown kind or a repeated id; names the box and the field.
     """
     for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
-        bad = np.flatnonzero(~np.isfinite(getattr(box_map, name)).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(getattr(box_map, name)) <= LARGEST).all(axis=1))  # NaN is not
         if len(bad):
             row = int(bad[0])
             raise InputError(

@@ -20,7 +20,8 @@ from pydantic_core import to_json
 
 from cosfly.chat.contract import Usage
 from cosfly.chat.objects import find_object
-from cosfly.store import atomic_file, model_lines
+from cosfly.reading.documents import model_lines
+from cosfly.store import atomic_file
 
 # tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
 ACTION_GROUPS: dict[str, tuple[str, ...]] = {

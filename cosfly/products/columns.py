@@ -8,6 +8,13 @@ import numpy as np
 
 from cosfly.errors import InputError
 
+LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
+
+
+def is_in_range(numbers: np.ndarray) -> bool:
+    """Tell whether all numbers are finite and no larger than a length or a time can be."""
+    return bool((np.abs(numbers) <= LARGEST).all())  # NaN is not
+
 
 def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
     """Micrometres are enough for a map, and short numbers keep files small."""
@@ -33,9 +40,9 @@ def column(record: dict, name: str, where: str, length: int | None = None) -> np
         column = np.array(record[name], dtype=np.float64)
     except KeyError:
         raise InputError("missing", where=f"{where}.{name}", expected="a list of numbers") from None
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError):
         column = np.empty((0, 0))
-    if column.ndim != 1 or len(column) == 0 or not np.isfinite(column).all() or length not in (None, len(column)):
+    if column.ndim != 1 or len(column) == 0 or not is_in_range(column) or length not in (None, len(column)):
         wanted = "a list of finite numbers" if length is None else f"{length} finite numbers"
         raise InputError("not a column", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
     return column
@@ -45,9 +52,9 @@ def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
     """Read a list of vectors of finite numbers, (n, width) float64."""
     try:
         matrix = np.array(record.get(name), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError):
         matrix = np.empty((0, 0))
-    if matrix.ndim != 2 or matrix.shape[1] != width or not np.isfinite(matrix).all():
+    if matrix.ndim != 2 or matrix.shape[1] != width or not is_in_range(matrix):
         got, expected = repr(record.get(name))[:60], f"{width} finite numbers each"
         raise InputError("not a list of vectors", where=f"{where}.{name}", got=got, expected=expected)
     return matrix

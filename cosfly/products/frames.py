@@ -6,7 +6,6 @@ Axes inside the tree are CARLA's (left-handed); `tree_...` below take the projec
 from __future__ import annotations
 
 import io
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,9 +15,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.config import Config
-from cosfly.errors import InputError, RenderError
+from cosfly.errors import RenderError
 from cosfly.geometry import mirror_positions, mirror_rotations
-from cosfly.store import dump_json, read_model
+from cosfly.products.places import tree_of_flight
+from cosfly.reading.arrays import read_array, read_picture
+from cosfly.reading.documents import read_model
+from cosfly.store import dump_json
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
@@ -185,7 +187,9 @@ def read_meta(frame: Path) -> FrameMeta:
         InputError: missing, or not such a file; names the field.
     """
     path = frame / "meta.json"
-    return read_model(path, FrameMeta, schema=META_SCHEMA, version=META_VERSION, what="frame annotation")
+    return read_model(
+        path, FrameMeta, schema=META_SCHEMA, version=META_VERSION, what="frame annotation", tree=tree_of(frame)
+    )
 
 
 # --- the files --------------------------------------------------------------------------------------------------------
@@ -195,13 +199,18 @@ def frame_name(index: int) -> str:
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 
+def tree_of(frame: Path) -> Path:
+    """Give the playback tree that a frame stands in."""
+    return tree_of_flight(frame.absolute().parents[1])
+
+
 def read_rgb(frame: Path) -> np.ndarray:
     """Read `rgb.png` of a frame folder, (h, w, 3) uint8 RGB; an alpha channel is left out.
 
     Raises:
         InputError: missing or not an image.
     """
-    return cv2.cvtColor(_read_png(frame / "rgb.png"), cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(read_picture(frame / "rgb.png", tree=tree_of(frame)), cv2.COLOR_BGR2RGB)
 
 
 def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -210,28 +219,14 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         semantic kinds (h, w) uint8 and instance ids (h, w) uint16.
     """
-    bgr = _read_png(frame / "instance.png")
+    bgr = read_picture(frame / "instance.png", tree=tree_of(frame))
     # OpenCV loads B, G, R: R is the semantic tag, G the low and B the high byte of the id.
     return bgr[..., 2], bgr[..., 1].astype(np.uint16) | (bgr[..., 0].astype(np.uint16) << 8)
 
 
-# NumPy reads a header with `ast`, which in two threads at once may raise SystemError (Python before 3.11.8, its issue 106905).
-_ONE_HEADER = threading.Lock()
-
-
 def read_depth(frame: Path) -> np.ndarray:
     """Read `depth.npy` of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky, 0.0 invalid."""
-    path = frame / "depth.npy"
-    try:
-        with _ONE_HEADER:
-            depth = np.load(path, allow_pickle=False)
-    except OSError as error:
-        raise InputError("cannot read the depth", where=path, got=error.strerror or str(error)) from None
-    except (ValueError, EOFError) as error:
-        raise InputError("not a NumPy array", where=path, got=str(error)) from None
-    if depth.ndim != 2 or depth.dtype != np.float32:
-        raise InputError("not a depth image", where=path, got=f"{depth.dtype} {depth.shape}", expected="float32 (h, w)")
-    return depth
+    return read_array(frame / "depth.npy", dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame))
 
 
 def rgb_bytes(rgb: np.ndarray, compression: int) -> bytes:
@@ -258,14 +253,3 @@ def _png_bytes(bgr: np.ndarray, compression: int) -> bytes:
     if not ok:
         raise RenderError("cannot encode a PNG", got=str(bgr.shape))
     return data.tobytes()
-
-
-def _read_png(path: Path) -> np.ndarray:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError("cannot read the image", where=path, got=error.strerror) from None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if image is None:
-        raise InputError("not an image", where=path, got=f"{len(data)} bytes", expected="a PNG")
-    return image

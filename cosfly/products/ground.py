@@ -11,7 +11,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Height = Annotated[float, Field(allow_inf_nan=False)]
+from cosfly.products.columns import LARGEST
+
+Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class GroundGrid(BaseModel):
 
     west_m: Height
     south_m: Height
-    cell_m: float = Field(gt=0, allow_inf_nan=False)
+    cell_m: float = Field(gt=0, le=LARGEST)
     heights_m: list[list[Height]] = Field(min_length=2)
 
     @model_validator(mode="after")

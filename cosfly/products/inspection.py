@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.issues import Issue
 from cosfly.products.playback import ORIGINAL
-from cosfly.store import read_model, write_model
+from cosfly.reading.documents import read_model
+from cosfly.store import write_model
 
 INSPECT_SCHEMA, INSPECT_VERSION = "cosfly.inspect", "1.0"
 

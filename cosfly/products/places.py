@@ -47,6 +47,12 @@ def place_of(folder: Path, run: str = "") -> Place:
     return Place(run, town, trajectory, variant)
 
 
+def tree_of_flight(folder: Path) -> Path:
+    """Give the tree that a flight's folder stands in by its name: no link in it may lead out of that."""
+    parents = folder.absolute().parents
+    return parents[min(2, len(parents) - 1)]
+
+
 def stand(root: Path, folder: str) -> Path:
     """Find a flight's folder by its name relative to a tree, whichever of its two names the town has there.
 

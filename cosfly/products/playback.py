@@ -20,6 +20,7 @@ import numpy as np
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
+from cosfly.products.places import tree_of_flight
 from cosfly.products.trajectory import (
     BBOX,
     SCHEMA,
@@ -32,7 +33,8 @@ from cosfly.products.trajectory import (
     offsets_of,
     vectors_of,
 )
-from cosfly.store import read_json, write_json
+from cosfly.reading.documents import read_json
+from cosfly.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
@@ -153,7 +155,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         InputError: names the file, the point and the field.
     """
     path = folder / "trajectory.json"
-    raw = read_json(path, what="trajectory")
+    raw = read_json(path, what="trajectory", tree=tree_of_flight(folder))
     if not isinstance(raw, dict):
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
     reader = FieldReader(path, strict)

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language
-from cosfly.store import model_lines
+from cosfly.reading.documents import model_lines
 
 Split = Literal["train", "val", "test"]
 PREDICTIONS = "predictions.jsonl"

@@ -8,7 +8,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
-from cosfly.store import read_json, validation_errors
+from cosfly.products.columns import is_in_range
+from cosfly.reading.documents import read_json, validation_errors
+from cosfly.reading.limits import limits, over_limit
 
 
 class RoiPolygon(BaseModel):
@@ -43,9 +45,12 @@ def read_roi(path: Path) -> Roi:
         raise InputError("the polygon is not closed", where=where, got="false", expected="true", fix=fix)
     if not roi.rings():
         raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
+    num_vertices = sum(len(ring) for polygon in roi.rings() for ring in (polygon.points_world, *polygon.holes))
+    if num_vertices > limits().polygon_vertices:
+        raise over_limit("polygon_vertices", path, f"{num_vertices:,} vertices")
     for number, polygon in enumerate(roi.rings()):
         for ring in (polygon.points_world, *polygon.holes):
-            if len(ring) < 3 or not np.isfinite(np.array(ring, dtype=np.float64)).all():
+            if len(ring) < 3 or not is_in_range(np.array(ring, dtype=np.float64)):
                 where, got = f"{path}: polygon {number}", f"{len(ring)} points"
                 raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
     return roi

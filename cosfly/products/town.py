@@ -7,7 +7,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.boxes import UNKNOWN_LICENCE, LicenceId, MapHeader
-from cosfly.store import read_model, write_model
+from cosfly.reading.documents import read_model
+from cosfly.store import write_model
 
 TOWN_SCHEMA, TOWN_VERSION, TOWN_FILE = "cosfly.town_map", "1.0", "map.json"
 
@@ -32,4 +33,6 @@ def read_town_map(town: Path) -> TownMap:
     """Read what a town's folder says of its map; a foreign tree has no such file, and its licence is unknown."""
     if not (town / TOWN_FILE).exists():
         return TownMap(name=town.name, licence=UNKNOWN_LICENCE, credits="")
-    return read_model(town / TOWN_FILE, TownMap, schema=TOWN_SCHEMA, version=TOWN_VERSION, what="town's map")
+    return read_model(
+        town / TOWN_FILE, TownMap, schema=TOWN_SCHEMA, version=TOWN_VERSION, what="town's map", tree=town.parent
+    )

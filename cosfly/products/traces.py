@@ -12,7 +12,8 @@ from cosfly.geometry import step_s
 from cosfly.products.columns import column, records, rounded, text_id
 from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
-from cosfly.store import check_schema, read_json, write_json
+from cosfly.reading.documents import check_schema, read_json
+from cosfly.store import write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
 

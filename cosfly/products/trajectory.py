@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,11 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
+from cosfly.products.columns import LARGEST, is_in_range
 from cosfly.products.frames import ANGLES, XYZ, Camera
+from cosfly.reading.arrays import check_pixels
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
-LARGEST = sys.float_info.max  # 1e999 is read as infinity, and a whole number of 400 digits fits no array
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
 
 BBOX = ("xmin", "ymin", "xmax", "ymax")
@@ -107,11 +107,12 @@ class FieldReader:
         width, height = self.number("camera", group, "width"), self.number("camera", group, "height")
         try:
             matrix = np.array(group.get("intrinsic"), dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError):
             matrix = np.empty(0)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or width < 1 or height < 1:
+        if matrix.shape != (3, 3) or not is_in_range(matrix) or matrix[0, 0] <= 0 or width < 1 or height < 1:
             got, expected = repr(group.get("intrinsic"))[:60], "a 3x3 matrix with a positive focal length"
             raise self.error("not a camera", "camera.intrinsic", got, expected)
+        check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
         return Camera(int(width), int(height), matrix)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import column, matrix, records, rounded, text_id
-from cosfly.store import check_schema, read_json, write_json
+from cosfly.reading.documents import check_schema, read_json
+from cosfly.store import write_json
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)

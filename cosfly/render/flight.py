@@ -17,12 +17,13 @@ from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, TargetMet
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Gait
 from cosfly.render.perturbation import HIDDEN, Perturbed, Poses
 from cosfly.runner import advance
-from cosfly.store import sha256_bytes, sha256_file, storage_errors, write_checksums, write_json
+from cosfly.store import sha256_bytes, storage_errors, write_checksums, write_json
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight

@@ -16,17 +16,10 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, XYZ, read_meta
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.playback import find_flights, read_flight
+from cosfly.reading.files import sha256_file
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
-from cosfly.store import (
-    CHECKSUMS,
-    atomic_folder,
-    read_checksums,
-    sha256_file,
-    storage_errors,
-    write_checksums,
-    write_json,
-)
+from cosfly.store import CHECKSUMS, atomic_folder, read_checksums, storage_errors, write_checksums, write_json
 
 log = logging.getLogger(__name__)
 

@@ -15,6 +15,7 @@ from cosfly.errors import EnvironmentMissing
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
+from cosfly.reading.files import read_text
 from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
@@ -56,7 +57,7 @@ def open_context() -> Any:
 
 def _source(*names: str) -> str:
     folder = Path(__file__).parent
-    return "#version 330 core\n" + "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+    return "#version 330 core\n" + "\n".join(read_text(folder / name) for name in names)
 
 
 class GlRenderer:

@@ -1,0 +1,174 @@
+"""Pictures and NumPy arrays: the header is read first, and nothing is allocated for what it claims before that is checked.
+
+PNG is the only picture format of a data set, so no other decoder is ever given a file. NumPy's own reader evaluates headers as Python
+literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its issue 106905); the three fields are
+found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.reading.files import disk_errors, open_file, read_bytes
+from cosfly.reading.limits import limits, over_limit
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height
+NPY_MAGIC = b"\x93NUMPY"
+MOST_HEADER_BYTES = 10_000  # NumPy's own limit
+_DESCR = re.compile(rb"'descr' *: *'([<>|=][a-z][0-9]{1,2})'")
+_ORDER = re.compile(rb"'fortran_order' *: *(True|False)")
+_SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
+
+
+# --- NumPy arrays -----------------------------------------------------------------------------------------------------
+
+
+class ArrayHeader(NamedTuple):
+    """What stands before the numbers of a `.npy` file, and where these begin."""
+
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    is_fortran: bool
+    offset: int
+
+    def __str__(self) -> str:
+        return f"{self.dtype} {self.shape}"
+
+
+def array_header(path: Path, *, what: str = "array", tree: Path | None = None) -> ArrayHeader:
+    """Read the header of a `.npy` file, and see that the numbers are all there.
+
+    Raises:
+        InputError: it cannot be read, or is no complete array.
+    """
+    with open_file(path, what=what, tree=tree) as file:
+        return _header(file, path, what)
+
+
+def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
+    """Read a `.npy` file of a known type and number of dimensions.
+
+    Raises:
+        InputError: it cannot be read, is something else, cut short, or larger than pictures may be.
+    """
+    with open_file(path, what=what, tree=tree) as file:
+        return _array(file, path, what, dtype, ndim)
+
+
+def parse_array(data: bytes, where: str | Path, *, dtype: type, ndim: int, what: str = "array") -> np.ndarray:
+    """Read the bytes of a `.npy` file; raises as `read_array`."""
+    return _array(io.BytesIO(data), where, what, dtype, ndim)
+
+
+def _array(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, dtype: type, ndim: int) -> np.ndarray:
+    header = _header(file, where, what)
+    if header.dtype != dtype or len(header.shape) != ndim:
+        expected = f"{np.dtype(dtype)} of {ndim} dimensions"
+        raise InputError(f"not a {what}", where=where, got=str(header), expected=expected)
+    check_pixels(math.prod(header.shape), where, str(header.shape))
+    values: np.ndarray = np.empty(header.shape, dtype, order="F" if header.is_fortran else "C")
+    with disk_errors(Path(where), what):
+        num_read = file.readinto(values.T.data if header.is_fortran else values.data)
+    if num_read != values.nbytes:
+        raise _no_array(where, what, "a file that became shorter while it was read")
+    return values
+
+
+def _header(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str) -> ArrayHeader:
+    with disk_errors(Path(where), what):
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        start = file.read(12)
+        form = "<H" if start[6:7] == b"\1" else "<I"
+        first = 8 + struct.calcsize(form)
+        if len(start) < 12 or not start.startswith(NPY_MAGIC) or not 1 <= start[6] <= 3:
+            raise _no_array(where, what, f"{size} bytes that do not begin as a NumPy array")
+        (length,) = struct.unpack_from(form, start, 8)
+        if length > MOST_HEADER_BYTES:
+            raise _no_array(where, what, f"a header of {length} bytes")
+        file.seek(first)
+        text = file.read(length)
+    found = [pattern.search(text) for pattern in (_DESCR, _ORDER, _SHAPE)]
+    if not all(found):
+        raise _no_array(where, what, repr(text[:80].decode("latin-1")))
+    descr, order, shape = (match.group(1).decode() for match in found if match)
+    with contextlib.suppress(TypeError, ValueError):
+        header = ArrayHeader(np.dtype(descr), _lengths(shape), order == "True", first + length)
+        if math.prod(header.shape) * header.dtype.itemsize == size - header.offset:
+            return header
+    raise _no_array(where, what, f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
+
+
+def _lengths(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in text.split(",") if part.strip())
+
+
+def _no_array(where: str | Path, what: str, got: str) -> InputError:
+    return InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
+    """Refuse what has more pixels than a picture may have."""
+    if num_pixels > limits().picture_mpx * 1_000_000:
+        raise over_limit("picture_mpx", where, got, " million pixels")
+
+
+def png_size(data: bytes) -> tuple[int, int] | None:
+    """Give (width, height) px of a PNG from its first bytes, None if it is none."""
+    if len(data) < PNG_HEADER_BYTES or not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
+        return None
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
+    """Give (width, height) px of a PNG file from its header, None if it is none; raises as `open_file`."""
+    with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
+        return png_size(file.read(PNG_HEADER_BYTES))
+
+
+def read_picture(path: Path, *, flags: int = cv2.IMREAD_COLOR, tree: Path | None = None) -> np.ndarray:
+    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours; raises as `parse_picture`, and where it cannot be read."""
+    return parse_picture(read_bytes(path, what="image", tree=tree), path, flags=flags)
+
+
+def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
+    """Decode a PNG.
+
+    Raises:
+        InputError: it is none, damaged, or larger than pictures may be.
+    """
+    size = png_size(data)
+    image = None
+    if size is not None:
+        check_pixels(size[0] * size[1], where, "{} x {} px".format(*size))
+        with decoder_errors(where):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise InputError("not an image", where=where, got=f"{len(data)} bytes", expected="a PNG")
+    return image
+
+
+@contextlib.contextmanager
+def decoder_errors(where: str | Path) -> Iterator[None]:
+    """Turn what OpenCV raises on a file that it cannot decode into an InputError; only the call of a decoder stands in it."""
+    try:
+        yield
+    except cv2.error as error:
+        raise InputError("the image does not decode", where=where, got=str(error), expected="a PNG") from None

@@ -1,0 +1,243 @@
+"""JSON on disk: into plain values, and into models. Whatever stands there, a reader gets what it asked for or an InputError.
+
+Refused beyond what JSON forbids: numbers that are not finite (NaN, 1e999) or whole with more than DIGITS digits, nesting deeper than
+DEPTH, half a surrogate pair, which no file could hold again, and in files of ours a key that is given twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from cosfly.errors import InputError
+from cosfly.reading.files import CHECK_PATH, decoded, read_bytes, read_lines
+
+Model = TypeVar("Model", bound=BaseModel)
+
+DEPTH = 64  # the deepest honest file, a CityJSON CompositeSolid, has 10
+DIGITS = 40  # ids have up to 20; a float holds no number of 309
+MOST_SHOWN = 40  # characters of a number in a message
+
+# A number that may overflow has an exponent of three digits, or very many digits: looked for with these, which takes a
+# fortieth of the time of a parse. A text that looks so is harmless and only parsed more slowly.
+_ZEROS = bytes.maketrans(b"123456789E", b"000000000e")
+_LONG_EXPONENT, _LONG_NUMBER = b"e000", b"0" * (DIGITS + 1)
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
+
+
+class _BadNumber(ValueError):
+    """A number stands in JSON text that is not finite, or has too many digits for one."""
+
+    def __init__(self, word: str, wanted: str = "a finite number") -> None:
+        self.got = word if len(word) <= MOST_SHOWN else f"{word[:MOST_SHOWN]}... of {len(word)} characters"
+        super().__init__(f"{self.got} is not a number that a file may hold, expected {wanted}")
+        self.wanted = wanted
+
+
+def _no_constants(text: str) -> float:
+    raise _BadNumber(text)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise _BadNumber(text)
+    return number
+
+
+def _whole(text: str) -> int:
+    if len(text.lstrip("-")) > DIGITS:
+        raise _BadNumber(text, f"at most {DIGITS} digits")
+    return int(text)
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice[:MOST_SHOWN]!r} is given twice")
+    return members
+
+
+def parse_json(text: str | bytes, *, each_key_once: bool = False) -> Any:
+    """Read JSON text in UTF-8.
+
+    Raises:
+        ValueError: it is no JSON, or holds what no file of a data set may hold.
+    """
+    data = text.encode() if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
+    hooks: dict[str, Any] = {"object_pairs_hook": _each_once} if each_key_once else {}
+    flat = data.translate(_ZEROS, b"+")
+    if _LONG_EXPONENT in flat or _LONG_NUMBER in flat:
+        hooks |= {"parse_float": _finite, "parse_int": _whole}
+    del flat  # as large as the file
+    try:
+        value = json.loads(data.decode() if isinstance(text, bytes) else text, parse_constant=_no_constants, **hooks)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if data.count(b"[") + data.count(b"{") > DEPTH and _is_deep(value):
+        raise ValueError(f"nested deeper than {DEPTH}")
+    return value
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(DEPTH + 1):
+        level = [
+            member
+            for group in level
+            for member in (group.values() if type(group) is dict else group)
+            if type(member) is dict or type(member) is list
+        ]
+        if not level:
+            return False
+    return True
+
+
+def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", each_key_once: bool = False) -> Any:
+    """Read the JSON text of a file.
+
+    Raises:
+        InputError: as `parse_json`.
+    """
+    raw = data.encode() if isinstance(data, str) else data
+    try:
+        value = parse_json(raw, each_key_once=each_key_once)
+        if _SURROGATE.search(raw):
+            json.dumps(value, ensure_ascii=False).encode()  # fails on half of a pair
+    except _BadNumber as error:
+        place = f"{where}: {_place_of_bad_number(raw)}".removesuffix(": ")
+        raise InputError(
+            f"the {what} holds a number that is not finite or too long",
+            where=place,
+            got=error.got,
+            expected=error.wanted,
+        ) from None
+    except UnicodeDecodeError as error:
+        raise InputError("not UTF-8 text", where=where, got=str(error)) from None
+    except UnicodeEncodeError:
+        raise InputError(
+            f"the {what} holds half of a surrogate pair", where=where, expected="whole characters"
+        ) from None
+    except ValueError as error:
+        raise InputError(f"the {what} is not valid JSON", where=where, got=str(error)) from None
+    return value
+
+
+def _place_of_bad_number(data: bytes) -> str:
+    """Name the first field that holds one; empty where the text is broken farther on."""
+    with contextlib.suppress(ValueError, RecursionError):
+        return (_place_in(json.loads(data)) or "").lstrip(".")
+    return ""
+
+
+def _place_in(value: Any) -> str | None:
+    """Name the first field that holds no usable number, as in `.boxes[3].center[0]`; None where there is none."""
+    if isinstance(value, int | float):
+        return None if abs(value) < 10**DIGITS or (isinstance(value, float) and math.isfinite(value)) else ""
+    if not isinstance(value, dict | list):
+        return None
+    for key, member in value.items() if isinstance(value, dict) else enumerate(value):
+        place = _place_in(member)
+        if place is not None:
+            return (f".{key}" if isinstance(value, dict) else f"[{key}]") + place
+    return None
+
+
+def read_json(
+    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, each_key_once: bool = False
+) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        InputError: it is missing, unreadable or not JSON.
+    """
+    data = read_bytes(path, what=what, fix=fix, tree=tree)
+    return parse_document(data, path, what=what, each_key_once=each_key_once)
+
+
+def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> dict[str, Any]:
+    """Read a JSON file that holds an object; raises as `read_json`, and for anything else."""
+    value = read_json(path, what=what, tree=tree)
+    if not isinstance(value, dict):
+        raise InputError(f"not the {what}", where=path, got=type(value).__name__, expected="an object")
+    return value
+
+
+# --- models -----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def validation_errors(where: str | Path) -> Iterator[None]:
+    """Turn what pydantic says of data that was read into an InputError that names the file and the first wrong field."""
+    try:
+        yield
+    except ValidationError as error:
+        detail = error.errors()[0]
+        places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
+        field = "".join(places).removeprefix(".") or "top level"
+        what = "not an object" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
+        raise InputError(what, where=f"{where}: {field}", got=repr(detail["input"])[:80]) from None
+
+
+def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Iterator[tuple[str, Model]]:
+    """Yield each line of a JSON-lines file as it stands there, its end included, and the model it holds.
+
+    Args:
+        what, fix: for the message when there is no such file, or one of another `schema_version` than the model's.
+    Raises:
+        InputError: names the file, the line and the field.
+    """
+    version = field.default if (field := model.model_fields.get("schema_version")) else None
+    for number, data in enumerate(read_lines(path, what=what, fix=fix), 1):
+        line = decoded(data, f"{path}:{number}")
+        value = parse_document(data, f"{path}:{number}", what="line")
+        if isinstance(value, dict) and value.get("schema_version", version) != version:
+            raise InputError(
+                f"{what} of another version",
+                where=f"{path}:{number}: schema_version",
+                got=repr(value["schema_version"])[:80],
+                expected=repr(version),
+                fix=f"make it anew: {fix}",
+            )
+        with validation_errors(f"{path}:{number}"):
+            content = model.model_validate(value)
+        yield line, content
+
+
+def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
+    """Check that a JSON value is an object of the wanted schema and major version."""
+    if not isinstance(value, dict):
+        raise InputError(
+            "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"
+        )
+    kind, found = value.get("schema"), value.get("schema_version")
+    if kind != schema:
+        raise InputError(
+            "not the expected kind of file", where=f"{path}: schema", got=repr(kind)[:80], expected=repr(schema)
+        )
+    if str(found).split(".")[0] != version.split(".")[0]:
+        got = repr(found)[:80]
+        raise InputError("unknown version", where=f"{path}: schema_version", got=got, expected=repr(version))
+    return value
+
+
+def read_model(
+    path: Path, model: type[Model], *, schema: str, version: str, what: str = "file", tree: Path | None = None
+) -> Model:
+    """Read a JSON file of the wanted schema and major version.
+
+    Raises:
+        InputError: names the file and the field.
+    """
+    value = check_schema(read_json(path, what=what, tree=tree, each_key_once=True), schema, version, path)
+    with validation_errors(path):
+        return model.model_validate({key: v for key, v in value.items() if key not in ("schema", "schema_version")})

@@ -1,0 +1,182 @@
+"""Opening files: regular ones only, of a bounded size, and not through links that lead out of their tree.
+
+A pipe would block for ever, a device never end. What the disk says against a file becomes an InputError here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import gzip
+import hashlib
+import io
+import os
+import stat
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from cosfly.errors import InputError
+from cosfly.reading.limits import MB, limits, over_limit
+
+CHECK_PATH = "check the path"
+GZIP_MAGIC = b"\x1f\x8b"
+SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
+CHUNK = 16 * MB
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"),
+)  # fmt: skip
+
+
+def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> io.BufferedReader:
+    """Open a regular file to read its bytes.
+
+    Args:
+        what, fix: for the message.
+        tree: the folder whose files are being read: a link that leads out of it is refused. None: the user named this file.
+    Raises:
+        InputError: it is missing, no regular file, not readable, or not below its tree.
+    """
+    if tree is not None:
+        check_stays_below(path, tree)
+    try:
+        # A named pipe without a writer would hold a plain open for ever.
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        got = "a socket" if error.errno == errno.ENXIO else error.strerror
+        raise InputError(f"cannot read the {what}", where=path, got=got, fix=fix) from None
+    except ValueError as error:  # a name that no system has
+        raise InputError(f"cannot read the {what}", where=path, got=str(error), fix=fix) from None
+    mode = os.fstat(number).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(number)
+        got = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        raise InputError(f"cannot read the {what}", where=path, got=got, expected="a regular file", fix=fix)
+    return os.fdopen(number, "rb")
+
+
+@contextlib.contextmanager
+def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
+    """Turn what the system says while it reads into an InputError; only calls that read stand in it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot read the {what}", where=path, got=error.strerror or str(error), fix=fix) from None
+
+
+def read_bytes(
+    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, limit: str = "file_mb"
+) -> bytes:
+    """Read a whole file.
+
+    Args:
+        what, fix, tree: as for `open_file`. limit: the field of Limits that bounds its size.
+    Raises:
+        InputError: as `open_file`; or it is over the limit.
+    """
+    with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
+        size = os.fstat(file.fileno()).st_size
+        if size > getattr(limits(), limit) * MB:
+            raise over_limit(limit, path, f"{size / MB:,.0f} MB", " MB")
+        return file.read(size)
+
+
+def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> str:
+    """Read a whole file of UTF-8 text; raises as `read_bytes`, and for other text."""
+    return decoded(read_bytes(path, what=what, fix=fix, tree=tree), path)
+
+
+def decoded(data: bytes, where: object) -> str:
+    """Give UTF-8 bytes as text.
+
+    Raises:
+        InputError: they are none.
+    """
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError("not UTF-8 text", where=str(where), got=str(error)) from None
+
+
+def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
+    """Yield the lines of a file, each with its end; raises as `open_file`, and for a line over the limit."""
+    with open_file(path, what=what, fix=fix, tree=tree) as file:
+        most, number = limits().line_mb * MB, 0
+        while True:
+            number += 1
+            with disk_errors(path, what, fix):
+                line = file.readline(most + 1)
+            if len(line) > most:
+                raise over_limit("line_mb", f"{path}:{number}", "a longer line", " MB")
+            if not line:
+                return
+            yield line
+
+
+def read_unpacked(path: Path, *, what: str = "file", fix: str = CHECK_PATH, limit: str = "file_mb") -> bytes:
+    """Read a whole file, and unpack it where it is gzipped; raises as `read_bytes`, and for damaged gzip data."""
+    data = read_bytes(path, what=what, fix=fix, limit=limit)
+    if not data.startswith(GZIP_MAGIC):
+        return data
+    by_factor = max(SMALL_UNPACKED_MB * MB, limits().unpack_factor * len(data))
+    most = getattr(limits(), limit) * MB
+    chunks, size = [], 0
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            while chunk := packed.read(CHUNK):
+                size += len(chunk)
+                if size > most:
+                    raise over_limit(limit, path, "more, unpacked", " MB")
+                if size > by_factor:
+                    raise over_limit(
+                        "unpack_factor", path, f"{len(data):,} bytes that unpack to more", " times the file"
+                    )
+                chunks.append(chunk)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
+    return b"".join(chunks)
+
+
+def sha256_file(path: Path, *, tree: Path | None = None) -> str:
+    """Give the hex digest of a file; raises as `open_file`."""
+    with open_file(path, tree=tree) as file, disk_errors(path, "file"):
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- links ------------------------------------------------------------------------------------------------------------
+
+
+def check_stays_below(path: Path, tree: Path) -> None:
+    """Check that no symbolic link leads from a tree to a file outside.
+
+    The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to blobs, these are
+    part of it.
+
+    Raises:
+        InputError: it leads out; names the setting that allows it.
+    """
+    if limits().follow_links:
+        return
+    try:
+        real, root = os.path.realpath(path), os.path.realpath(tree)
+    except ValueError as error:  # a NUL in a name
+        raise InputError("not a name of a file", where=tree, got=str(error)) from None
+    if not any(_is_below(real, allowed) for allowed in (root, *_blobs(Path(root)))):
+        raise InputError(
+            "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
+            fix="if you trust it, --set reading.follow_links=true",
+        )  # fmt: skip
+
+
+def _is_below(path: str, root: str) -> bool:
+    return path == root or path.startswith(root.rstrip(os.sep) + os.sep)
+
+
+def _blobs(root: Path) -> list[str]:
+    """The folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to `<repository>/blobs`."""
+    snapshots = next((folder for folder in root.parents if folder.name == "snapshots"), None)
+    if snapshots is None:
+        return []
+    blobs = snapshots.parent / "blobs"
+    return [str(blobs)] if blobs.is_dir() else []

@@ -1,0 +1,444 @@
+"""The gate: whatever stands where a file should, a reader gives an InputError, soon and in little memory."""
+
+import gzip
+import io
+import json
+import os
+import socket
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from shapely.geometry import Polygon
+
+from caption.teachers.foreign import read_foreign
+from cosfly.config import Config, apply_overrides, build, read_yaml
+from cosfly.errors import ConfigError, CosflyError, InputError
+from cosfly.maps import cityjson, simworld
+from cosfly.maps.footprints import check_outline, num_crossings
+from cosfly.products.boxes import read_boxes
+from cosfly.products.captions import read_captions
+from cosfly.products.frames import depth_bytes, read_depth, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.products.inspection import read_inspection
+from cosfly.products.playback import read_flight
+from cosfly.products.predictions import read_predictions
+from cosfly.products.roi import read_roi
+from cosfly.products.town import read_town_map
+from cosfly.products.traces import read_traces
+from cosfly.products.walks import read_paths
+from cosfly.reading import arrays, documents, files, tables
+from cosfly.reading.limits import Limits, use_limits
+from cosfly.stage_folder import read_failures, read_manifest
+from cosfly.store import CHECKSUMS, inside, read_checksums
+from distill.schema import read_split
+from release.record import read_record
+
+
+@pytest.fixture
+def limited():
+    """Set the limits of this process; afterwards they are as before."""
+    yield lambda **changes: use_limits(Limits(**changes))
+    use_limits(Limits())
+
+
+# --- every reader, every hostile file ---------------------------------------------------------------------------------
+
+# name -> the file that is hostile, and the reader of it
+READERS = {
+    "boxes": ("boxes_3d.json", read_boxes),
+    "roi": ("roi.json", read_roi),
+    "walks": ("path.json", read_paths),
+    "traces": ("drone_trace.json", read_traces),
+    "inspection": ("inspect.json", read_inspection),
+    "flight": ("Town01/t/ORI/trajectory.json", lambda path: read_flight(path.parent)),
+    "flight, tolerant": ("Town01/t/ORI/trajectory.json", lambda path: read_flight(path.parent, strict=False)),
+    "annotation": ("Town01/t/ORI/frames_playback/frame_00000/meta.json", lambda path: read_meta(path.parent)),
+    "town": ("Town01/map.json", lambda path: read_town_map(path.parent)),
+    "manifest": ("manifest.json", lambda path: read_manifest(path.parent)),
+    "failures": ("failures.jsonl", read_failures),
+    "captions": ("captions.jsonl", lambda path: list(read_captions(path))),
+    "predictions": ("predictions.jsonl", read_predictions),
+    "samples": ("train.jsonl", lambda path: list(read_split(path.parent, "train"))),
+    "foreign captions": ("foreign.jsonl", read_foreign),
+    "city model": ("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
+    "world": ("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path, sizes=[path]))),
+    "release record": ("release.json", read_record),
+    "checksums": (CHECKSUMS, lambda path: read_checksums(path.parent)),
+    "settings": ("run.yaml", read_yaml),
+    "rgb": ("Town01/t/ORI/frames_playback/frame_00000/rgb.png", lambda path: read_rgb(path.parent)),
+    "instance": ("Town01/t/ORI/frames_playback/frame_00000/instance.png", lambda path: read_instance(path.parent)),
+    "depth": ("Town01/t/ORI/frames_playback/frame_00000/depth.npy", lambda path: read_depth(path.parent)),
+    "shard": ("shard.parquet", lambda path: list(tables.rows_of(path))),
+}  # fmt: skip
+CONTENTS = {
+    "a NUL": b"\0",
+    "no UTF-8": b'{"id": "\xff\xfe"}\n',
+    "UTF-16": '{"id": 1}\n'.encode("utf-16"),
+    "cut short": b'{"id": [1, ',
+    "NaN, then deep": b"[NaN,[[[",
+    "deep": b"[" * 20_000,
+    "deep and whole": b"[" * 500 + b"]" * 500,
+    "deep objects": b'{"a":' * 100_000,
+    "a number of 400 digits": b'{"schema_version": ' + b"7" * 400 + b"}",
+    "a number of 5,000 digits": b'{"schema_version": -' + b"7" * 5000 + b"}",
+    "an endless exponent": b'{"schema_version": 1e999}',
+    "half a surrogate pair": b'{"schema_version": "\\ud800"}',
+    "a list": b"[1, 2]",
+    "a word": b'"word"',
+    "null": b"null",
+    "an array header of terabytes": b"\x93NUMPY\1\0v\0{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }" + b" " * 43 + b"\n",
+    "a picture header of gigabytes": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIBBBBB", 32_000, 32_000, 8, 2, 0, 0, 0),
+    "the head of a parquet file": b"PAR1" + b"\0" * 40 + b"\xff\xff\xff\x7fPAR1",
+}  # fmt: skip
+
+
+PAIRS = [
+    (reader, content)
+    for reader in READERS
+    for content in CONTENTS
+    if reader != "settings" or content not in ("null", "an endless exponent")  # no settings, and a word, to YAML
+]
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("reader", "content"), PAIRS)
+def test_hostile_contents_are_one_clear_line(tmp_path, reader, content):
+    name, read = READERS[reader]
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(CONTENTS[content])
+    tracemalloc.start()
+    try:
+        with pytest.raises((InputError, ConfigError)) as caught:
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
+    assert path.name in str(caught.value)
+    assert len(str(caught.value)) < 5000
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "socket", "missing", "link to itself"])
+@pytest.mark.parametrize("reader", [name for name in READERS if name != "town"])  # a tree may have no map.json
+def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch, reader, kind):
+    name, read = READERS[reader]
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(path.parent)  # the path of a socket may have 100 bytes
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        socket.socket(socket.AF_UNIX).bind(path.name)
+    elif kind == "link to itself":
+        path.symlink_to(path)
+    with pytest.raises((InputError, ConfigError), match=path.name):
+        read(path)
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        (b'{"a": 1e308, "b": -1e-999, "c": 123456789012345678901234567890}', [1e308, -0.0, 123456789012345678901234567890]),
+        (b'{"a": 0.1000000000000000055511151231257827021181583404541015625}', [0.1]),
+        (b'\xef\xbb\xbf{"a": "e9999 \\ud83d\\ude00"}', ["e9999 \U0001f600"]),
+        (b'{"a": ' + b"[" * 60 + b"]" * 60 + b"}", None),
+    ],
+)  # fmt: skip
+def test_honest_json_passes(tmp_path, text, value):
+    (tmp_path / "x.json").write_bytes(text)
+    found = documents.read_json(tmp_path / "x.json")
+    assert value is None or list(found.values()) == value
+
+
+def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
+    (tmp_path / "x.json").write_text('{"result": "rejected", "result": "accepted"}')
+    assert documents.read_json(tmp_path / "x.json") == {"result": "accepted"}
+    with pytest.raises(InputError, match="'result' is given twice"):
+        documents.read_json(tmp_path / "x.json", each_key_once=True)
+
+
+def test_the_place_of_a_number_is_named(tmp_path):
+    (tmp_path / "x.json").write_text('{"a": [0, {"b": 1e999}]}')
+    with pytest.raises(InputError, match=r"x\.json: a\[1\]\.b: .*got 1e999"):
+        documents.read_json(tmp_path / "x.json")
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_limit_is_named_and_can_be_raised(tmp_path, limited):
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps("x" * 1_100_000))
+    limited(file_mb=1)
+    with pytest.raises(
+        InputError, match=r"limit reading\.file_mb; got 1 MB; expected at most 1 MB; .*--set reading\.file_mb"
+    ):
+        documents.read_json(path)
+    limited(file_mb=2)
+    assert len(documents.read_json(path)) == 1_100_000
+
+
+def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
+    with open(tmp_path / "x.json", "wb") as file:
+        file.truncate(20_000_000_000)
+    for read in (read_boxes, READERS["city model"][1], read_yaml):
+        with pytest.raises(CosflyError, match="over the limit"):
+            read(tmp_path / "x.json")
+
+
+def test_a_long_line_is_refused(tmp_path, limited):
+    limited(line_mb=1)
+    (tmp_path / "x.jsonl").write_bytes(b"{}\n" + b" " * 1_200_000)
+    with pytest.raises(InputError, match=r"x\.jsonl:2: over the limit reading\.line_mb"):
+        list(files.read_lines(tmp_path / "x.jsonl"))
+
+
+def test_a_gzip_bomb_is_refused_while_it_unpacks(tmp_path, limited):
+    path = tmp_path / "city.json.gz"
+    path.write_bytes(gzip.compress(b" " * 70_000_000, 1))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"reading\.unpack_factor"):
+            files.read_unpacked(path)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
+    limited(unpack_factor=1_000)
+    assert len(files.read_unpacked(path)) == 70_000_000
+    limited(unpack_factor=1_000, file_mb=80)
+    with pytest.raises(InputError, match=r"reading\.file_mb"):
+        files.read_unpacked(path)
+
+
+# --- pictures and arrays ----------------------------------------------------------------------------------------------
+
+
+def _npy(array) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=True)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arrays_are_read_as_numpy_reads_them(tmp_path, order):
+    array = np.asarray(np.random.default_rng(0).random((7, 5)), dtype=np.float32, order=order)
+    (tmp_path / "x.npy").write_bytes(_npy(array))
+    for found in (
+        arrays.read_array(tmp_path / "x.npy", dtype=np.float32, ndim=2),
+        arrays.parse_array(_npy(array), "x", dtype=np.float32, ndim=2),
+        np.load(io.BytesIO(depth_bytes(array))),
+    ):
+        assert (found == array).all()
+        assert found.flags.writeable
+
+
+GOOD = _npy(np.zeros((7, 5), np.float32))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        GOOD[:-1], GOOD + b"\0", GOOD[:40], b"", GOOD.replace(b"(7, 5)", b"(5, 7, 1)"), GOOD.replace(b"<f4", b"<f8"), GOOD.replace(b"<f4", b"|O4"),
+        GOOD.replace(b"<f4", b"<q9"), GOOD.replace(b"(7, 5)", b"(-7,-5)"), GOOD.replace(b"(7, 5)", b"(" + b"9" * 99 + b",)"), _npy(np.array([{}], object)),
+        _npy(np.zeros((7, 5), ">f4")), GOOD[:8] + b"\xff\xff" + GOOD[10:], GOOD[:6] + b"\7" + GOOD[7:], _npy(np.zeros(3, [("a", "<f4")])),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_other_arrays_are_refused(data):
+    with pytest.raises(InputError):
+        arrays.parse_array(data, "x", dtype=np.float32, ndim=2)
+
+
+def _png(width: int, height: int) -> bytes:
+    """A PNG whose header and checksums are right, with hardly any pixels."""
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(b"\0" * 9)),
+        (b"IEND", b""),
+    ]
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    ]
+    return arrays.PNG_SIGNATURE + b"".join(chunks)
+
+
+def test_a_picture_is_measured_before_it_is_decoded(limited, monkeypatch):
+    picture = rgb_bytes(np.zeros((40, 60, 3), np.uint8), 1)
+    assert arrays.png_size(picture) == (60, 40)
+    assert arrays.parse_picture(picture, "x").shape == (40, 60, 3)
+    monkeypatch.setattr(cv2, "imdecode", None)
+    for width, height in ((32_000, 32_000), (2**32 - 1, 2**32 - 1), (50_000_001, 1)):
+        with pytest.raises(
+            InputError, match=r"reading\.picture_mpx; got \d+ x \d+ px; expected at most 50 million pixels"
+        ):
+            arrays.parse_picture(_png(width, height), "x")
+    limited(picture_mpx=1)
+    with pytest.raises(InputError, match=r"reading\.picture_mpx"):
+        arrays.parse_picture(_png(1200, 1000), "x")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", _png(0, 3), b"BM" + b"\0" * 90, cv2.imencode(".jpg", np.zeros((9, 9, 3), np.uint8))[1].tobytes()],
+    ids=len,
+)
+def test_other_pictures_are_refused(data):
+    with pytest.raises(InputError):
+        arrays.parse_picture(data, "x")
+
+
+# --- links ------------------------------------------------------------------------------------------------------------
+
+
+def _frame(tree: Path) -> Path:
+    frame = tree / "Town01/trajectory_1/ORI/frames_playback/frame_00000"
+    frame.mkdir(parents=True)
+    return frame
+
+
+def test_a_link_out_of_the_tree_is_refused(tmp_path, limited):
+    private = tmp_path / "private.npy"
+    private.write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
+    frame = _frame(tmp_path / "tree")
+    (frame / "depth.npy").symlink_to(private)
+    with pytest.raises(
+        InputError, match=r"a link leads out of its folder; got .*private\.npy; .*--set reading\.follow_links=true"
+    ):
+        read_depth(frame)
+    limited(follow_links=True)
+    assert read_depth(frame).shape == (4, 4)
+
+
+def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
+    frame = _frame(tmp_path / "disk/tree")
+    (frame.parents[4] / "one.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
+    (frame / "depth.npy").symlink_to(frame.parents[4] / "one.npy")
+    (tmp_path / "data").symlink_to(tmp_path / "disk/tree")
+    assert read_depth(tmp_path / "data" / frame.relative_to(frame.parents[4])).shape == (4, 4)
+
+
+def test_a_whole_folder_behind_a_link_is_refused_too(tmp_path):
+    elsewhere = _frame(tmp_path / "elsewhere")
+    (elsewhere / "depth.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
+    flight = tmp_path / "tree/Town01/trajectory_1/ORI"
+    flight.parent.mkdir(parents=True)
+    flight.symlink_to(elsewhere.parents[1])
+    with pytest.raises(InputError, match="leads out"):
+        read_depth(flight / "frames_playback/frame_00000")
+
+
+def test_the_cache_of_the_hub_is_one_tree(tmp_path):
+    repository = tmp_path / "hub/datasets--somebody--flights"
+    (repository / "blobs").mkdir(parents=True)
+    (repository / "blobs/abc").write_bytes(b"card")
+    snapshot = repository / "snapshots/0123"
+    (snapshot / "data").mkdir(parents=True)
+    (snapshot / "data/card").symlink_to("../../../blobs/abc")
+    (snapshot / "data/secret").symlink_to("../../../../secret")
+    (tmp_path / "hub/secret").write_bytes(b"secret")
+    assert files.read_bytes(inside(snapshot, "data/card"), tree=snapshot) == b"card"
+    with pytest.raises(InputError, match="leads out"):
+        inside(snapshot, "data/secret")
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "a\0b", "\ud800"])
+def test_names_that_lead_out_or_nowhere(tmp_path, name):
+    with pytest.raises(InputError):
+        files.read_bytes(inside(tmp_path, name))
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+HOSTILE_YAML = {
+    "aliases of aliases": "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
+    "an alias in itself": "a: &a [*a]",
+    "60,000 keys": "".join(f"k{i}: 1\n" for i in range(60_000)),
+    "deep": "[" * 20_000,
+    "deep blocks": "".join(" " * i + "a:\n" for i in range(500)),
+    "a tag": "a: !!binary aGk=",
+    "a tag of Python": "a: !!python/object/apply:os.system ['x']",
+    "a tagged date": "a: !!timestamp 2024-01-01",
+    "400 digits": "a: " + "1" * 400,
+    "5,000 digits": "a: " + "1" * 5000,
+    "half a surrogate pair": 'a: "\\ud800"',
+    "a NUL": 'a: "\\0"',
+    "a list as key": "? [a]\n: 1",
+    "two documents": "a: 1\n---\nb: 2",
+    "2 MB": "a: '" + "x" * 2_000_000 + "'",
+    "no UTF-8": b"a: \xff",
+}  # fmt: skip
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("case", HOSTILE_YAML)
+def test_hostile_settings_are_one_clear_line(tmp_path, case):
+    text = HOSTILE_YAML[case]
+    path = tmp_path / "run.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError, match=r"run\.yaml") as caught:
+        read_yaml(path)
+    assert len(str(caught.value)) < 500
+    if isinstance(text, str) and "\0" not in text:
+        with pytest.raises(ConfigError, match="--set a"):
+            apply_overrides({}, [f"a={text}"])
+
+
+class _Dated(Config):
+    name: str = ""
+
+
+def test_a_date_is_the_text_that_it_looks_like():
+    assert build(_Dated, apply_overrides({}, ["name=2026-11-22"]), "x").name == "2026-11-22"
+
+
+def test_anchors_that_stay_small_are_fine(tmp_path):
+    (tmp_path / "x.yaml").write_text("a: &a {b: 1}\nc:\n  <<: *a\n  d: *a\n")
+    assert read_yaml(tmp_path / "x.yaml") == {"a": {"b": 1}, "c": {"b": 1, "d": {"b": 1}}}
+
+
+def test_a_setting_of_very_many_parts():
+    with pytest.raises(ConfigError, match="not an assignment"):
+        apply_overrides({}, ["a" + ".a" * 5000 + "=1"])
+
+
+# --- polygons ---------------------------------------------------------------------------------------------------------
+
+
+def test_crossings_are_counted():
+    square = [(0, 0), (4, 0), (4, 4), (0, 4)]
+    assert num_crossings(Polygon(square), 10) == 0
+    assert num_crossings(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), 10) == 1
+    assert num_crossings(Polygon(square, [[(1, 1), (2, 1), (2, 1), (2, 2)]]), 10) == 0
+    assert num_crossings(Polygon(square, [[(3, 1), (5, 1), (5, 2)]]), 10) == 2
+    assert num_crossings(Polygon([(0, 0), (9, 0), (3, 0), (6, 0), (1, 5)]), 10) > 1  # back and forth
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("num_vertices", [300, 3_000])
+def test_a_tangled_outline_is_refused_at_once(num_vertices):
+    points = np.random.default_rng(0).random((num_vertices, 2)) * 1000
+    with pytest.raises(InputError, match=r"lawn: over the limit reading\.polygon_crossings"):
+        check_outline(Polygon(points), "lawn")
+
+
+def test_an_outline_that_crosses_itself_now_and_then_is_mended():
+    check_outline(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), "lawn")
+
+
+def test_a_polygon_of_too_many_vertices(tmp_path, limited):
+    limited(polygon_vertices=3)
+    (tmp_path / "roi.json").write_text(json.dumps({"points_world": [[0, 0], [9, 0], [9, 9], [0, 9]]}))
+    with pytest.raises(InputError, match=r"reading\.polygon_vertices; got 4 vertices"):
+        read_roi(tmp_path / "roi.json")
