@@ -128,7 +128,7 @@ def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", 
             f"the {what} holds half of a surrogate pair", where=where, expected="whole characters"
         ) from None
     except ValueError as error:
-        raise InputError(f"the {what} is not valid JSON", where=where, got=str(error)) from None
+        raise InputError("not valid JSON", where=where, got=str(error)) from None
     return value
 
 
