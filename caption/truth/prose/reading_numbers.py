@@ -209,11 +209,38 @@ class NumberReader:
         if self.in_scene and (not is_cued or numeral.unit in ("m", "mps")):
             self.left_out = True
             return
-        sure = (
-            self.sureness.names(numeral, self.naming.told_after(numeral)),
-            self.sureness.frames(numeral),
-            self.sureness.mode(numeral),
+        names, mode, trend = self._change(numeral, names)
+        side, vertical = self.beside.side(numeral)
+        sure_names = self.sureness.names(numeral, self.naming.told_after(numeral))
+        sure_frames = self.sureness.frames(numeral)
+        if frames == "":
+            frames = sure_frames if mode == "value" and sure_frames else self._frames(numeral, mode)
+        boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
+        if numeral.unit == "px" and (side or vertical) and not boxed:
+            names = ("offset_x",) if side else ("offset_y",)
+        found = Statement(
+            kind="range" if kind == "range" else "number",
+            clause=(self.clause.start, self.clause.end),
+            names=names,
+            numbers=tuple(members),
+            frames=frames,  # type: ignore[arg-type]
+            mode=mode,
+            hedge=self.beside.hedge(numeral),
+            side=side or vertical,
+            trend=trend,
+            word=self.beside.aggregate(numeral),
+            sure_names=sure_names,
+            sure_frames=sure_frames,
+            sure_mode=self.sureness.mode(numeral),
         )
+        found = self._angle(found) if numeral.unit == "deg" else found
+        if side and found.sure_names:
+            names = tuple([name for name in found.names if name in found.sure_names])
+            found = replace(found, names=names or found.names)
+        self.statements.append(self._surely(found, numeral))
+
+    def _change(self, numeral: Numeral, names: tuple[str, ...]) -> tuple[tuple[str, ...], Mode, int]:
+        """Say of what a number is, whether it is a change, and which way."""
         mode, trend = self.changing.change(numeral)
         before = self.statements[-1] if self.statements else None
         if mode == "value" and before is not None and before.mode == "change" and before.clause[0] == self.clause.start:
@@ -222,49 +249,24 @@ class NumberReader:
                 mode, trend = "change", before.trend  # "by 3 px in width and 8 px in height"
         if names and set(names) <= _WAYS and mode != "value" and not self.changing.is_partial():
             mode, trend = "value", 0
-        side, vertical = self.beside.side(numeral)
         if numeral.unit == "mps" and self.naming.differs_by(numeral):
-            names, is_cued, mode, trend = (*names, "speed_difference", "difference_mean"), True, "either", 0
+            names, mode, trend = (*names, "speed_difference", "difference_mean"), "either", 0
         if self.naming.is_difference(numeral, mode):
-            names, is_cued, mode, trend = ("speed_difference", "difference_mean"), True, "value", 0
-        if numeral.unit == "deg" and side and names and set(names) <= {"target_turn", "target_heading"}:
-            mode, frames = "change", None  # "has bent left by 45 degrees"
-        if set(names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
-            names = ("target_turn",)
-        if (
-            numeral.unit == "deg"
-            and side
-            and "yaw" in names
-            and not self.clause.has("who", "target")
-            and _FROM_START.search(self.text, self.clause.start, self.clause.end)
-        ):
-            names, mode = ("yaw",), "value"
-            named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]
-            frames = (NOW,) if not named else named[0] if len(named) == 1 else None
-            sure = (("yaw",), frames, "value")
-        boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
-        if numeral.unit == "px" and (side or vertical) and not boxed:
-            names, is_cued = (("offset_x",) if side else ("offset_y",)), True
-        if side and sure[0]:
-            names = tuple([name for name in names if name in sure[0]]) or names
-        found = Statement(
-            kind="range" if kind == "range" else "number",
-            clause=(self.clause.start, self.clause.end),
-            names=names,
-            numbers=tuple(members),
-            frames=(sure[1] if mode == "value" and sure[1] else self._frames(numeral, mode))
-            if frames == ""
-            else frames,  # type: ignore[arg-type]
-            mode=mode,
-            hedge=self.beside.hedge(numeral),
-            side=side or vertical,
-            trend=trend,
-            word=self.beside.aggregate(numeral),
-            sure_names=sure[0],
-            sure_frames=sure[1],
-            sure_mode=sure[2],
-        )
-        self.statements.append(self._surely(found, numeral))
+            names, mode, trend = ("speed_difference", "difference_mean"), "value", 0
+        return names, mode, trend
+
+    def _angle(self, s: Statement) -> Statement:
+        """Read an angle with a side as a turn: the target's, or the drone's from the window's start."""
+        if s.side and s.names and set(s.names) <= {"target_turn", "target_heading"}:
+            s = replace(s, mode="change", frames=None)  # "has bent left by 45 degrees"
+        if set(s.names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
+            s = replace(s, names=("target_turn",))
+        is_total = s.side and "yaw" in s.names and not self.clause.has("who", "target")
+        if not is_total or not _FROM_START.search(self.text, self.clause.start, self.clause.end):
+            return s
+        named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]
+        frames = (NOW,) if not named else named[0] if len(named) == 1 else None
+        return replace(s, names=("yaw",), mode="value", frames=frames, sure_names=("yaw",), sure_frames=frames, sure_mode="value")  # fmt: skip
 
     def _surely(self, s: Statement, numeral: Numeral) -> Statement:
         """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""
