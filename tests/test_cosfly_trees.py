@@ -168,6 +168,17 @@ def test_a_tree_of_before_is_read_and_converted(ours, older, tmp_path):
     assert json.loads((new / "manifest.json").read_text())["counts"]["kept"] == 2
 
 
+def test_a_conversion_takes_nothing_through_a_link_out_of_the_tree(older, tmp_path):
+    tree, private = copied(older, tmp_path / "tree"), tmp_path / "private"
+    private.write_bytes(b"mine")
+    picture = next(tree.glob("delft/*/aug_001/frames_playback/frame_00002/depth.npy"))
+    picture.unlink()
+    picture.symlink_to(private)
+    new = older_trees.run(tree, tmp_path / "new")
+    assert "a link leads out of its folder" in (new / "failures.jsonl").read_text()
+    assert [folder.name for folder in find_flights(new)] == ["ORI"]
+
+
 def test_a_conversion_that_was_killed_goes_on(older, tmp_path, monkeypatch):
     whole = older_trees.convert_flight
 
@@ -479,6 +490,12 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     assert failed("a", source) == ["ORI: the flight is not the one that was inspected"]
     picture.write_bytes(before)
     assert failed("a", source) == []
+    shutil.copy(picture, alone / "private.png")  # the same bytes, but who knows what stands there tomorrow
+    picture.unlink()
+    picture.symlink_to(alone / "private.png")
+    assert failed("d", source) == ["ORI/frames_playback/frame_00003/rgb.png: a link leads out of its folder"]
+    picture.unlink()
+    picture.write_bytes(before)
     value = read_json(inspected)
     one, two = value["flights"]
     one["sha256"], two["sha256"] = two["sha256"], one["sha256"]

@@ -16,7 +16,7 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, XYZ, read_meta
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.playback import find_flights, read_flight
-from cosfly.reading.files import sha256_file
+from cosfly.reading.files import check_stays_below, sha256_file
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder
 from cosfly.store import CHECKSUMS, atomic_folder, read_checksums, storage_errors, write_checksums, write_json
@@ -123,15 +123,20 @@ def convert_flight(source: Path, target: Path) -> int:
 
 
 def link_files(source: Path, target: Path, but: tuple[str, ...] = ()) -> list[Path]:
-    """Link the files of a folder, not those of folders in it, into another; copy where the disk cannot link."""
+    """Link the files of a folder, not those of folders in it, into another; copy where the disk cannot link.
+
+    Raises:
+        InputError: one is a symbolic link out of the folder. StorageError: the other cannot be written to.
+    """
     made = []
     with storage_errors(target):
         target.mkdir(parents=True, exist_ok=True)
         for file in sorted(path for path in source.iterdir() if path.is_file() and path.name not in but):
+            check_stays_below(file, source)
             made.append(target / file.name)
             made[-1].unlink(missing_ok=True)  # a kill may have left it
             try:
-                os.link(file, made[-1])
+                os.link(file.resolve(), made[-1])  # never a link to a link: nobody writes to such a folder again
             except OSError:  # another disk, or one without links
                 shutil.copyfile(file, made[-1])
     return made
