@@ -55,8 +55,8 @@ class StageResult:
     was_complete: bool
 
 
-def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Stage]:
-    """Give the stages of a run in order; each works in the folder of its name."""
+def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
+    """Give the stages of a run in order; each works in the folder of its name, in `into` if its products are not the run's."""
     seed, working = cfg.seed, manner_of_work(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
@@ -65,7 +65,9 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
     whole = [Source.of_files(tree, captions, inspected)]
 
     def stage(name: str, product: Path, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
-        return Stage(name, product, partial(run, getattr(cfg, name), *inputs, out / name, resume=resume, **options))
+        return Stage(
+            name, product, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options)
+        )
 
     return [
         stage("maps", boxes, cosfly.maps.stage.run, seed=seed),
@@ -75,7 +77,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[Sta
         stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, **working),
         stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
         stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
-        _release(cfg, whole, out, resume),
+        _release(cfg, whole, into or out, resume),
     ]
 
 

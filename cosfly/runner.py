@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from cosfly.console import progress_bar
-from cosfly.errors import EnvironmentMissing
+from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.items import Item, Outcome, Work, advance, attempt, counted_steps
 from cosfly.stage_events import EventLog
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
@@ -135,6 +135,9 @@ def _in_processes(
     pool = WorkerPool(*start, min(workers, len(items)), watch, events, on_steps)
     try:
         yield from pool.outcomes(items)
+    except CosflyError:
+        remove_partials(stage.path)  # on a full disk they hold the space that is needed
+        raise
     finally:
         events.close()
     if pool.num_lost:

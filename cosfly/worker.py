@@ -18,6 +18,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from typing import Any
 
 from cosfly.console import set_levels
 from cosfly.errors import CosflyError
@@ -48,15 +49,21 @@ Message = Sign | Broken | logging.LogRecord | ItemRecord
 
 
 @dataclass(frozen=True)
+class Manner:
+    """How a worker works, whatever it makes. Little: a process that starts its worker waits until this is read."""
+
+    parent_pid: int
+    heartbeat_s: float
+    log_level: int
+    reading: Limits
+
+
+@dataclass(frozen=True)
 class Start:
-    """What a worker needs to begin; `make_worker` is a module-level function."""
+    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
-    heartbeat_s: float
-    log_level: int
-    parent_pid: int
-    reading: Limits
 
 
 @contextlib.contextmanager
@@ -69,20 +76,21 @@ def signals_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def work_through(connection: Connection, start: Start) -> None:
-    """Do items until None comes. Everything that is to be said goes back through the pipe."""
-    _end_with_parent(start.parent_pid)
+def work_through(connection: Connection, manner: Manner) -> None:
+    """Take a Start, then do items until None comes. Everything that is to be said goes back through the pipe."""
+    _end_with_parent(manner.parent_pid)
     for number in LEFT_TO_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
     voice = _Voice(connection)
     logging.getLogger().handlers = [voice]
-    set_levels(start.log_level)
-    use_limits(start.reading)
-    threading.Thread(target=voice.tell_life, args=(start.heartbeat_s,), daemon=True).start()
+    set_levels(manner.log_level)
+    use_limits(manner.reading)
+    threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:
-        work = start.make_worker(*start.worker_args)
-        while (item := _next_item(connection)) is not None:
+        start: Start | None = _received(connection)
+        work = start.make_worker(*start.worker_args) if start else None
+        while work and (item := _received(connection)):
             voice.begin(item)
             with counted_steps(voice.count):
                 record = attempt(work, item)
@@ -93,7 +101,8 @@ def work_through(connection: Connection, start: Start) -> None:
         voice.send(Broken(error))
 
 
-def _next_item(connection: Connection) -> Item | None:
+def _received(connection: Connection) -> Any:
+    """Wait for what the parent sends; None: no more."""
     try:
         return connection.recv()
     except EOFError:

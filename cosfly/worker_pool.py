@@ -25,7 +25,7 @@ from cosfly.items import Item, Work
 from cosfly.reading.limits import limits
 from cosfly.stage_events import EventLog, cpu_seconds
 from cosfly.stage_folder import Failed, ItemRecord
-from cosfly.worker import Broken, Message, Sign, Start, signals_held_back, work_through
+from cosfly.worker import Broken, Manner, Message, Sign, Start, signals_held_back, work_through
 
 log = logging.getLogger(__name__)
 
@@ -181,14 +181,14 @@ class WorkerPool:
     def _start(self, place: int) -> _Worker:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         here, there = context.Pipe()
-        level = logging.getLogger().level
-        start = Start(self.make_worker, self.worker_args, self.watch.heartbeat_s, level, os.getpid(), limits())
-        process = context.Process(target=work_through, args=(there, start), daemon=True)
+        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, limits())
+        process = context.Process(target=work_through, args=(there, manner), daemon=True)
         with signals_held_back():
             process.start()
         there.close()
         worker = self._workers[place] = _Worker(place, process, queue.SimpleQueue())
-        threading.Thread(target=_attend, args=(worker, here, self._messages), daemon=True).start()
+        start = Start(self.make_worker, self.worker_args)
+        threading.Thread(target=_attend, args=(worker, start, here, self._messages), daemon=True).start()
         self.events.tell("restarted" if place in self._lost else "worker_started", worker=place, pid=process.pid)
         self._lost.discard(place)
         return worker
@@ -250,7 +250,8 @@ class WorkerPool:
             self.events.tell(loss, worker=worker.place, pid=worker.process.pid)
             return
         item = attempt.item
-        about = {"worker": worker.place, "item": item.item_id, "steps": worker.num_steps}
+        seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
+        about = {"worker": worker.place, "item": item.item_id, "seconds": seconds, "steps": worker.num_steps}
         self.events.tell(loss, pid=worker.process.pid, **about)
         self.on_steps(item.item_id, 0)
         if self.num_lost > self.watch.restarts + self._num_done:
@@ -286,10 +287,11 @@ class WorkerPool:
             self._stop(worker, patience_s)
 
 
-def _attend(worker: _Worker, connection: Connection, messages: queue.SimpleQueue) -> None:
+def _attend(worker: _Worker, start: Start, connection: Connection, messages: queue.SimpleQueue) -> None:
     """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is gone."""
     try:
         with connection:
+            connection.send(start)
             while (item := worker.inbox.get()) is not None:
                 connection.send(item)
                 while True:

@@ -15,7 +15,15 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 SHARED = ("kernels", "grid", "flight_metrics", "topview", "frame_views")  # what several stages use; knows products
-ASSEMBLY = ("cli", "pipeline", "settings", "doctor", "gallery", "__main__")  # what may know all stages and siblings
+ASSEMBLY = (
+    "cli",
+    "pipeline",
+    "settings",
+    "doctor",
+    "gallery",
+    "bench",
+    "__main__",
+)  # what may know all stages and siblings
 HEAVY = {
     "torch",
     "transformers",

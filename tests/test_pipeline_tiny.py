@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosfly import pipeline, provenance
+from cosfly.bench import measure
 from cosfly.cli import app
 from cosfly.config import load
 from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
@@ -411,6 +412,19 @@ def test_a_half_written_flight_is_a_counted_failure_that_can_be_mended(base, tmp
     work(tiny(), out, "inspect")
     assert read_json(out / "inspect/manifest.json")["counts"]["kept"] == 4
     assert products(out / "inspect") == products(base / "inspect")
+
+
+@pytest.mark.slow
+def test_bench_measures_a_stage_and_leaves_the_run_alone(base, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in base.rglob("*")}
+    bench = measure.run(tiny(), base, tmp_path / "bench", "render", [2], {"kill": 2})
+    undisturbed, killed = bench.rows
+    assert undisturbed.attempted == undisturbed.successful == read_json(base / "render/manifest.json")["num_frames"]
+    assert (killed.planted, killed.failed, killed.same_products) == (killed.noticed, 0, True)
+    assert sorted(path.name for path in (tmp_path / "bench").iterdir()) == [
+        "bench.json", "kill.events.jsonl", "kill.png", "workers_2.events.jsonl", "workers_2.png",
+    ]  # fmt: skip
+    assert {path: path.stat().st_mtime_ns for path in base.rglob("*")} == before
 
 
 # --- several towns ----------------------------------------------------------------------------------------------------

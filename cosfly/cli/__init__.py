@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from cosfly import __version__
+from cosfly.cli.bench import app as bench_app
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
 from cosfly.cli.release import app as release_app
@@ -28,7 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app):
+for group in (run_app, stages_app, bench_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (("caption", caption_app), ("distill", distill_app), ("release", release_app)):
     app.add_typer(named_group, name=name)

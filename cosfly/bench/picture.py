@@ -1,0 +1,109 @@
+"""The events of a stage as a picture: what each worker did when, memory and cores below."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cosfly.stage_events import Event
+from cosfly.topview import INK, PAPER, Color, draw_area, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.worker_pool import WORDS
+
+WIDTH_PX, LEFT_PX, RIGHT_PX, ROW_PX, TOP_PX, CURVE_PX = 1400, 110, 1370, 46, 84, 150
+FAINT: Color = (215, 215, 215)
+STARTING: Color = (225, 225, 225)
+COLORS: dict[str, Color] = {
+    "kept": (120, 170, 225),
+    "dropped": (190, 190, 140),
+    "failed": (150, 60, 170),
+    "worker_died": (215, 60, 50),
+    "heartbeat_lost": (240, 150, 40),
+    "timed_out": (190, 120, 20),
+}
+LABELS = {
+    "worker_died": "died",
+    "heartbeat_lost": "stood still",
+    "timed_out": "over its limit",
+    "failed": "failed item",
+}
+
+
+def draw_events(events: list[Event], title: str) -> bytes:
+    """Draw a row for each worker (grey: starting, blue: an item done, red and orange: lost) over time; PNG bytes."""
+    started = [event.at_s for event in events]
+    begin_s, end_s = min(started, default=0.0), max(started, default=1.0)
+    num_rows = 1 + max((event.worker or 0 for event in events), default=0)
+    bottom = TOP_PX + num_rows * ROW_PX
+    picture = np.full((bottom + 2 * (CURVE_PX + 60) + 20, WIDTH_PX, 3), PAPER, dtype=np.uint8)
+
+    def x_of(at_s: float) -> float:
+        return LEFT_PX + (RIGHT_PX - LEFT_PX) * (at_s - begin_s) / max(end_s - begin_s, 1e-9)
+
+    draw_text(picture, title, 20, 30, 0.65)
+    _legend(picture)
+    for tick in _ticks(end_s - begin_s):
+        x = x_of(begin_s + tick)
+        draw_line(picture, np.array([[x, TOP_PX], [x, bottom]]), FAINT)
+        draw_text(picture, f"{tick:g} s", x, bottom + 18, 0.45, align=0.5)
+    for row in range(num_rows):
+        draw_text(picture, f"worker {row}", 20, TOP_PX + row * ROW_PX + 28, 0.5)
+        _draw_worker(picture, [event for event in events if event.worker == row], TOP_PX + row * ROW_PX, x_of)
+    probes = [event for event in events if event.event == "probe"]
+    times = np.array([x_of(probe.at_s) for probe in probes])
+    memory = np.array([sum((probe.rss_mib or {}).values()) for probe in probes])
+    _draw_curve(picture, bottom + 56, "memory of all workers (MiB)", times, memory)
+    cores = np.array([probe.cores_used or 0.0 for probe in probes])
+    _draw_curve(picture, bottom + 56 + CURVE_PX + 50, "cores in use", times, cores)
+    return png_bytes(picture)
+
+
+def _legend(picture: np.ndarray) -> None:
+    x = float(LEFT_PX)
+    for name, color in (("starting", STARTING), *COLORS.items()):
+        draw_area(picture, _box(x, 48, x + 22, 64), color)
+        x = draw_text(picture, LABELS.get(name, name), x + 28, 61, 0.45) + 22
+
+
+def _box(left: float, top: float, right: float, bottom: float) -> np.ndarray:
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+
+
+def _draw_worker(picture, events: list[Event], top: float, x_of) -> None:
+    free_s = None  # since when the process has been there without an item
+    for event in events:
+        if event.event in ("worker_started", "restarted"):
+            free_s = event.at_s
+        if event.event != "item_done" and event.event not in WORDS:
+            continue
+        begun_s = event.at_s - (event.seconds or 0.0)
+        if free_s is not None:
+            draw_area(picture, _box(x_of(free_s), top + 12, x_of(begun_s), top + ROW_PX - 12), STARTING)
+            free_s = None
+        kind = event.status if event.event == "item_done" else event.event
+        bar = _box(x_of(begun_s), top + 6, x_of(event.at_s), top + ROW_PX - 6)
+        draw_area(picture, bar, COLORS[str(kind)])
+        draw_line(picture, bar, PAPER, closed=True)
+        name = event.item or ""
+        if bar[1, 0] - bar[0, 0] > 8 * len(name) + 8:
+            draw_text(picture, name, float(bar[0, 0]) + 5, top + 28, 0.42)
+    for event in events:
+        if event.event in WORDS:
+            draw_dot(picture, np.array([x_of(event.at_s), top + ROW_PX / 2]), 6, COLORS[event.event])
+
+
+def _draw_curve(picture, top: float, title: str, x: np.ndarray, values: np.ndarray) -> None:
+    """Draw values against zero, their greatest at the top."""
+    bottom, most = top + CURVE_PX, float(values.max(initial=0.0))
+    draw_line(picture, _box(LEFT_PX, top, RIGHT_PX, bottom), INK, closed=True)
+    draw_text(picture, title, LEFT_PX, top - 8, 0.5)
+    draw_text(picture, f"{most:.4g}", LEFT_PX - 8, top + 8, 0.45, align=1.0)
+    draw_text(picture, "0", LEFT_PX - 8, bottom + 4, 0.45, align=1.0)
+    if most:
+        draw_line(picture, np.stack([x, bottom - CURVE_PX * values / most], axis=1), COLORS["kept"], 2)
+
+
+def _ticks(span_s: float) -> np.ndarray:
+    """Give about eight round numbers of seconds from 0."""
+    rough = max(span_s, 1e-3) / 8.0
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = power * next(k for k in (1.0, 2.0, 5.0, 10.0) if k * power >= rough)
+    return np.arange(0.0, span_s + 1e-9, step)

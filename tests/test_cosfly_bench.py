@@ -1,0 +1,80 @@
+"""`cosfly bench`: figures and picture from events that are known."""
+
+import cv2
+import numpy as np
+import pytest
+from toy_workers import make_worker, stage_in
+from typer.testing import CliRunner
+
+from cosfly.bench.faults import Faults, planted
+from cosfly.bench.measure import row_of, run
+from cosfly.bench.picture import COLORS, draw_events
+from cosfly.cli import app
+from cosfly.errors import ConfigError, ResumeError
+from cosfly.runner import Item, Watch, run_items
+from cosfly.settings import RunConfig
+from cosfly.stage_events import Event, read_events
+from cosfly.stage_folder import Manifest, Tally
+from cosfly.worker_pool import WORDS
+
+
+def event(at_s: float, kind: str, **fields) -> Event:
+    return Event(at_s=at_s, event=kind, **fields)
+
+
+EVENTS = [
+    event(0, "began", workers=2),
+    event(0, "worker_started", worker=0, pid=1),
+    event(0, "worker_started", worker=1, pid=2),
+    event(4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0),
+    event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
+    event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
+    event(12, "retried", item="b", attempt=1),
+    event(13, "restarted", worker=1, pid=3),
+    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0),
+    event(20, "item_done", worker=1, item="b", status="kept", seconds=5.0, steps=40),
+    event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
+    event(20, "ended"),
+]
+MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dropped={"far": 1}), seconds=20.0)
+
+
+def test_figures_of_a_run():
+    row = row_of(EVENTS, MANIFEST, 2, counts_frames=True)
+    assert (row.attempted, row.successful, row.per_s) == (120, 80, 4.0)
+    assert (row.noticed, row.restarts, row.retries, row.recovered, row.failed) == (1, 1, 1, 1, 0)
+    assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
+    items = row_of(EVENTS, MANIFEST, 2, counts_frames=False)
+    assert (items.attempted, items.successful) == (4, 2)
+
+
+def test_the_picture_shows_a_worker_that_died():
+    def num_red(events: list[Event]) -> int:
+        picture = cv2.imdecode(np.frombuffer(draw_events(events, "render"), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        return int((picture[80:] == COLORS["worker_died"]).all(axis=2).sum())  # below the legend
+
+    assert num_red(EVENTS) > 5000, "nine seconds of twenty"
+    assert num_red([e for e in EVENTS if e.event not in WORDS]) == 0
+    assert draw_events([], "nothing").startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_measured(tmp_path):
+    with pytest.raises(ConfigError, match=r"not a stage that can be measured.*simplify.*render"):
+        run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1], {})
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine").touch()
+    with pytest.raises(ResumeError, match="not empty"):
+        run(RunConfig(), tmp_path, tmp_path / "out", "render", [1], {})
+    for counts in ("two", "0,1", ""):
+        answer = CliRunner().invoke(app, ["bench", str(tmp_path), "--out", str(tmp_path / "o"), "--workers", counts])
+        assert answer.exit_code == 2
+
+
+def test_planted_faults_hit_workers_and_are_noticed(tmp_path):
+    items = [Item(f"i{k}", ("slow", b"")) for k in range(2)]
+    watch = Watch(heartbeat_s=0.2, check_s=0.5)
+    with planted(Faults("kill", 1, 1.0, seed=0), tmp_path / "s") as moments_s:
+        finished = run_items(stage_in(tmp_path), items, make_worker, (tmp_path / "s",), workers=2, watch=watch)
+    assert finished.tally.kept == 2
+    assert len(moments_s) == 1
+    assert [e.event for e in read_events(tmp_path / "s") if e.event in WORDS] == ["worker_died"]
