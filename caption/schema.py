@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
+from cosfly.chat.protocol import check_url
 from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.config import Config, MayDiffer
 from cosfly.frame_views import DEPTH_RANGE_M, Layout, View
@@ -178,12 +179,12 @@ class JudgeConfig(Config):
 
     @model_validator(mode="after")
     def _is_url(self) -> Self:
-        if self.url is not None and not self.url.startswith(("http://", "https://")):
-            raise ValueError(f"judge.url must begin with http:// or https://, got {self.url!r}")
+        if self.url is not None:
+            check_url(self.url)
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """The address may hold a password, so it is not put on record."""
+        """Where a judge is asked does not decide what it says."""
         return super().recorded() | {"url": None if self.url is None else "endpoint"}
 
 
@@ -252,11 +253,12 @@ class CaptionConfig(Config):
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:
-        if self.teacher_kind == "endpoint" and not self.teacher.startswith(("http://", "https://")):
-            raise ValueError(
-                "teacher must be `rules`, a URL that begins with http:// or https://, vllm:MODEL_DIR, file:PATH or "
-                f"student:PATH, got {self.teacher!r}"
-            )
+        if self.teacher_kind == "endpoint":
+            try:
+                check_url(self.teacher)
+            except ValueError as error:
+                others = "`rules`, vllm:MODEL_DIR, file:PATH or student:PATH"
+                raise ValueError(f"teacher: {error}; a teacher that is no URL is {others}") from None
         return self
 
     @property
@@ -289,5 +291,5 @@ class CaptionConfig(Config):
         return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
-        """A teacher's address may hold a password, so its kind is put on record."""
+        """Where a teacher is asked does not decide what it says, so its kind is put on record."""
         return super().recorded() | {"teacher": self.teacher_kind}

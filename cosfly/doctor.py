@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.metadata
 import importlib.util
 import os
@@ -10,13 +11,11 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import httpx
-
-from cosfly.chat.client import KEY_VARIABLE
-from cosfly.chat.protocol import base_url, read_models, shown_url
-from cosfly.errors import EnvironmentMissing
+from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.refusals import Refusal
+from cosfly.errors import EnvironmentMissing, TeacherError
 
 State = Literal["ok", "missing", "optional"]
 
@@ -99,16 +98,18 @@ def _package(name: str) -> Check:
 
 def _endpoint(url: str) -> Check:
     """Ask an OpenAI-compatible server for its models. The key comes from the environment and is not shown."""
-    key, root = os.environ.get(KEY_VARIABLE), base_url(url)
-    shown = shown_url(root)
     try:
-        answer = httpx.get(f"{root}/models", headers={"Authorization": f"Bearer {key}"} if key else {}, timeout=10)
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        return Check("endpoint", "missing", f"{shown}: {type(error).__name__}: {error}")
-    if answer.status_code != 200:
-        hint = f"; set {KEY_VARIABLE}" if answer.status_code in (401, 403) and not key else ""
-        return Check("endpoint", "missing", f"{shown}: HTTP {answer.status_code} for /models{hint}")
-    models = read_models(answer)
-    if models is None:
-        return Check("endpoint", "missing", f"{shown}: answers, but not as an OpenAI-compatible server")
-    return Check("endpoint", "ok", f"{shown}: {', '.join(model['id'] for model in models) or 'no models'}")
+        where, found = asyncio.run(_models(url))
+    except TeacherError as error:
+        return Check("endpoint", "missing", str(error))
+    if isinstance(found, Refusal):
+        return Check("endpoint", "missing", f"{where}: no list of models here: {found.said}")
+    return Check("endpoint", "ok", f"{where}: {', '.join(model['id'] for model in found) or 'no models'}")
+
+
+async def _models(url: str) -> tuple[str, list[dict[str, Any]] | Refusal]:
+    client = ChatClient(url, EndpointConfig(timeout_s=10.0))
+    try:
+        return client.where, await client.models()
+    finally:
+        await client.close()

@@ -6,15 +6,21 @@ import contextlib
 import mmap
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import ValidationError
+
+from cosfly.errors import InputError
 from cosfly.reading.documents import parse_json
 from cosfly.reading.files import open_file, read_lines
-from cosfly.store import dump_json, sha256_bytes, storage_errors
+from cosfly.store import dump_json, sha256_bytes, storage_errors, write_bytes
 
 TAIL = 65_536  # bytes at the end in which `last` looks
+ASIDE = ".aside"  # what is added to the name of a journal for the file that holds its broken lines
+
+T = TypeVar("T")
 
 
 class Journal:
@@ -22,12 +28,12 @@ class Journal:
 
     A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this process does
     not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by `read` and
-    counted in `num_damaged`; what stood in it is done again.
+    counted in `num_damaged`; what stood in it is done again. `line_num` is the number of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.num_damaged = 0
+        self.num_damaged = self.line_num = 0
         self._file: Any = None
         self._lock = threading.Lock()
 
@@ -36,12 +42,50 @@ class Journal:
         self.num_damaged = 0
         if not self.path.exists():
             return
-        for line in read_lines(self.path, what="journal"):
+        for self.line_num, line in enumerate(read_lines(self.path, what="journal"), 1):
             record = _record_of(line)
             if record is None:
                 self.num_damaged += 1
             else:
                 yield record
+
+    def read_as(self, read_record: Callable[[dict], T]) -> Iterator[T]:
+        """Yield what `read_record` makes of the records.
+
+        Raises:
+            InputError: it finds one that cannot be used, by a ValidationError; names the line.
+        """
+        for record in self.read():
+            try:
+                found = read_record(record)
+            except ValidationError as error:
+                raise self._unusable(error) from None
+            yield found
+
+    def _unusable(self, error: ValidationError) -> InputError:
+        detail = error.errors(include_url=False, include_input=False)[0]
+        field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
+        return InputError(
+            "a line that cannot be used",
+            where=f"{self.path}:{self.line_num}",
+            got=f"{field}: {detail['msg'][:200]}",
+            fix=f"run the same command with --repair: such lines go into {self.path.name}{ASIDE}, and what stood in them is done again",
+        )
+
+    def set_aside(self, is_usable: Callable[[dict], bool]) -> int:
+        """Move the lines that are damaged or cannot be used to the end of a file beside, `<name>.aside`; gives their number."""
+        kept, broken = list[bytes](), list[bytes]()
+        for line in read_lines(self.path, what="journal"):
+            record = _record_of(line)
+            (broken if record is None or not is_usable(record) else kept).append(line)
+        if broken:
+            aside = self.path.with_name(self.path.name + ASIDE)
+            with storage_errors(aside), open(aside, "ab") as file:
+                file.write(b"".join(line.rstrip(b"\n") + b"\n" for line in broken))
+                file.flush()
+                os.fsync(file.fileno())
+            write_bytes(self.path, b"".join(kept))
+        return len(broken)
 
     def last(self) -> dict | None:
         """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""
@@ -90,9 +134,9 @@ def _record_of(line: bytes) -> dict | None:
         if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
             return None
         record = parse_json(body)
-        return record if isinstance(record, dict) else None
     except ValueError:
         return None
+    return record if isinstance(record, dict) else None
 
 
 def _cut_torn_line(path: Path) -> None:

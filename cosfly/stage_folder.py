@@ -30,7 +30,7 @@ from cosfly.provenance import (
     checked_inputs,
     read_stage_record,
 )
-from cosfly.reading.documents import model_lines, read_model, validation_errors
+from cosfly.reading.documents import model_lines, read_model
 from cosfly.reading.files import sha256_file
 from cosfly.store import dump_json, inside, refuse_links, remove_partials, sha256_bytes, write_bytes, write_model
 
@@ -79,6 +79,11 @@ class Failed(_Record):
 
 ItemRecord = Kept | Dropped | Failed
 _ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discriminator="status")])
+
+
+def read_item(record: dict) -> ItemRecord:
+    """Read a line of `items.jsonl`; one that cannot be used is a ValidationError."""
+    return _ITEM.validate_python(record)
 
 
 def write_failures(path: Path, failures: Iterable[Failed]) -> None:
@@ -225,10 +230,12 @@ class StageFolder:
         return Journal(self.path / "items.jsonl")
 
     def items(self) -> Iterator[ItemRecord]:
-        """Yield the outcomes in the journal; an item that failed and was tried again has several."""
-        with validation_errors(self.journal.path):
-            for record in self.journal.read():
-                yield _ITEM.validate_python(record)
+        """Yield the outcomes in the journal; an item that failed and was tried again has several.
+
+        Raises:
+            InputError: a line of the journal cannot be used.
+        """
+        return self.journal.read_as(read_item)
 
     def finish(self, outputs: Iterable[Path], tally: Tally, **facts: Any) -> None:
         """Write the manifest: the stage is complete.
@@ -306,7 +313,7 @@ def _may_continue(out: Path, record: StageRecord, resume: Resume) -> list[str]:
 
 def _holds_work(out: Path) -> bool:
     """Tell whether a stage folder holds anything that was finished, and not only the records of failures."""
-    if any(record["status"] != "failed" for record in Journal(out / "items.jsonl").read()):
+    if any(not isinstance(item, Failed) for item in Journal(out / "items.jsonl").read_as(read_item)):
         return True
     files = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
     return any(

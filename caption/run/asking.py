@@ -24,7 +24,6 @@ from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer, Troubles, Usage
-from cosfly.chat.protocol import shown_url
 from cosfly.console import SECONDS_BETWEEN_LINES
 from cosfly.errors import CosflyError, InputError, TeacherError
 from cosfly.products.captions import Caption, write_captions
@@ -224,7 +223,7 @@ class Asking:
         if self.failed_in_row >= self.cfg.endpoint.stop_after_failures:
             raise TeacherError(
                 f"{self.failed_in_row} windows in a row got no answer",
-                where=shown_url(self.cfg.teacher),
+                where=self.cfg.teacher,
                 got=f"{common_causes(self.asked.unanswered)}; the last: {failure.message}",
                 fix="see to the server, then run the same command again: nothing answered is asked twice",
             )

@@ -24,7 +24,6 @@ from caption.truth import actions
 from caption.truth.glossary import GLOSSARY_FILE
 from caption.window_loop import caption_window
 from cosfly.chat.answers import refuse_one_file
-from cosfly.chat.protocol import shown_url
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.products.playback import flight_of
@@ -169,14 +168,14 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
     if asked.stopped:
         raise TeacherError(
             "stopped before the budget was passed",
-            where=shown_url(cfg.teacher),
+            where=cfg.teacher,
             got=f"{asked.stopped}; {tally.kept} windows accepted so far",
             fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
         )
     if missed:
         raise TeacherError(
             f"{len(missed)} of {tally.input} windows got no answer",
-            where=shown_url(cfg.teacher),
+            where=cfg.teacher,
             got=f"{common_causes(missed)}; the last: {missed[-1].message}",
             fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
         )

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import httpx
@@ -30,8 +30,8 @@ from caption.teachers.prompts import (
 )
 from caption.teachers.trials import NO_ANSWER, best_way, try_ways
 from caption.writing.contract import WAYS, more_fields, way_of
-from cosfly.chat.client import RETRIED_STATUS, ChatClient
-from cosfly.chat.protocol import response_format
+from cosfly.chat.client import ChatClient
+from cosfly.chat.protocol import request_body, response_format
 from cosfly.chat.refusals import MEANINGS
 from cosfly.errors import TeacherError
 from cosfly.frame_views import VIEW_FILES
@@ -95,8 +95,9 @@ class _Examination:
         self.findings.append(Finding(name, state, detail))
 
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Probe:
-        body: dict[str, Any] = {"model": self.client.model, "messages": messages}
-        body |= self.cfg.endpoint.with_extra({"temperature": 0.0, "max_tokens": max_tokens})
+        endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
+        request = endpoint.request(messages, [], schema or {}, seed=0)  # sampled as a run samples
+        body = request_body(self.client.model, request)
         if schema is not None:
             body["response_format"] = response_format(schema)
         probe = Probe(None, "", 0.0)
@@ -104,12 +105,11 @@ class _Examination:
             start_s = time.monotonic()
             try:
                 response = await self.client.send(body)
-            except (TimeoutError, httpx.HTTPError) as error:
+            except (TimeoutError, httpx.RequestError) as error:
                 probe = Probe(None, self.client.clean(f"{type(error).__name__} {error}"), time.monotonic() - start_s)
             else:
-                probe = read_probe(response, self.client, time.monotonic() - start_s)
-                is_passing = probe.refusal is not None and probe.refusal.kind == "unknown"
-                if not (is_passing and response.status_code in RETRIED_STATUS):
+                probe = read_probe(response, request, self.client, time.monotonic() - start_s)
+                if probe.refusal is None or not probe.refusal.may_pass:
                     return probe
             if attempt + 1 < TRIES:
                 await asyncio.sleep(self.cfg.endpoint.backoff_s)

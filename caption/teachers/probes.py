@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import httpx
-
 from cosfly.chat.client import ChatClient
+from cosfly.chat.contract import Request
 from cosfly.chat.protocol import ERROR_INSTEAD, THOUGHT_FIELDS, final_text, read_body
 from cosfly.chat.refusals import Refusal
+from cosfly.chat.wire import Response
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class Probe:
 
     @property
     def finish_reason(self) -> str | None:
-        return self._choice.get("finish_reason")
+        reason = self._choice.get("finish_reason")
+        return reason if isinstance(reason, str) else None
 
     @property
     def prompt_tokens(self) -> int | None:
@@ -64,16 +65,16 @@ class Probe:
         return count if type(count) is int else None
 
 
-def read_probe(response: httpx.Response, client: ChatClient, seconds: float) -> Probe:
+def read_probe(response: Response, request: Request, client: ChatClient, seconds: float) -> Probe:
     """Read a response; `seconds`: what it took."""
-    found = client.read(response, is_structured=False)
+    found = client.read(response, request, is_structured=False)
     if isinstance(found, Refusal):
         fix = "" if found.kind == "unknown" else f"; {found.meaning.fix}"
         return Probe(None, found.said + fix, seconds, found)
-    if isinstance(found, str) and found.startswith(ERROR_INSTEAD):
-        return Probe(None, found, seconds)
+    if response.is_cut or (isinstance(found, str) and found.startswith(ERROR_INSTEAD)):
+        return Probe(None, str(found), seconds)
     try:
-        value = read_body(response.content)
+        value = read_body(response.body)
     except ValueError:
         return Probe(None, "the body is not JSON", seconds)
     if not isinstance(value, dict):

@@ -27,6 +27,7 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
+from cosfly.chat.protocol import BYTES_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
@@ -35,9 +36,8 @@ from cosfly.products.playback import flight_of
 from cosfly.store import dump_json
 
 ENCODING_THREADS = 4
-CHARACTERS_PER_TOKEN = 3  # a low guess: it only bounds the first requests of a limited budget
 NUM_TRIALS = 2
-PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders; the same
+PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders: it only bounds the first requests of a limited budget
 
 
 class Teacher(Protocol):
@@ -125,7 +125,7 @@ def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
         counts: `totals` of each book of answers.
     """
     pictures = 16 * cfg.image.max_side_px * cfg.image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
-    first = pictures + 16_000 // CHARACTERS_PER_TOKEN
+    first = pictures + 16_000 // BYTES_PER_TOKEN
     return Budget(cfg.budget, *counts, first_prompt=first, first_completion=cfg.endpoint.max_tokens)
 
 

@@ -16,11 +16,13 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 from weakref import WeakValueDictionary
 
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
 from cosfly.chat.budget import Budget
-from cosfly.chat.contract import CONTEXT_FULL, Engine, NoAnswer, Reply, Request, Usage
+from cosfly.chat.contract import CONTEXT_FULL, MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request, Usage
 from cosfly.chat.protocol import answer_key
 from cosfly.errors import CosflyError, ResumeError
 from cosfly.journal import Journal
@@ -54,12 +56,56 @@ def refuse_one_file(folder: Path) -> None:
         )
 
 
+Count = Annotated[int, Field(strict=True, ge=0)]
+
+
+class Answer(BaseModel):
+    """A line of a journal: what an engine answered.
+
+    usage: empty where a server does not count. counted: counts of it that are ours. served_by: the model that answered, where the server
+    names another one than was asked for.
+    """
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    key: str
+    sample_id: str
+    purpose: str
+    model: str = ""
+    text: str
+    usage: dict[CountName, Annotated[Count, Field(le=MOST_TOKENS)]]
+    counted: tuple[CountName, ...] = Field((), exclude_if=lambda names: not names)
+    structured: str = ""
+    finish_reason: str | None = None
+    served_by: str | None = Field(None, exclude_if=lambda name: name is None)
+    latency_s: float = Field(0.0, ge=0)
+    time: float = 0.0
+
+    @property
+    def reply(self) -> Reply:
+        usage = Usage(**self.usage) if self.usage else None
+        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, self.served_by)
+
+
+class Totals(BaseModel):
+    """The last line of a flight that is done: its answers and their tokens."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    totals: dict[Literal["answers"] | CountName, Count]
+
+
+def read_line(record: dict) -> Answer | Totals:
+    """Read a line of a journal of answers; one that cannot be used is a ValidationError."""
+    return (Totals if TOTALS in record else Answer).model_validate(record)
+
+
 @dataclass
 class _Flight:
     """One flight's journal, its answers by key, and what it says of their number and tokens."""
 
     journal: Journal
-    answers: dict[str, dict[str, Any]]
+    answers: dict[str, Answer]
     totals: Counter[str]
     is_closed: bool  # its last line is one of totals
 
@@ -72,37 +118,37 @@ class AnswerBook:
 
         Raises:
             ResumeError: an earlier version kept the answers in one file.
+            InputError: a journal holds a line that cannot be used.
         """
         refuse_one_file(folder)
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):
-            last = Journal(path).last() or {}
-            self.totals.update(last[TOTALS] if TOTALS in last else _read(path).totals)
+            self.totals.update(_last_totals(path) or _read(path).totals)
         self._flights: dict[str, _Flight] = {}
         self._waiting: list[tuple[Journal, asyncio.Future]] = []  # for the disk
         self._disk = ThreadPoolExecutor(1, "journal")
         self._syncing: asyncio.Task | None = None
 
-    def get(self, flight: str, key: str) -> dict[str, Any] | None:
+    def get(self, flight: str, key: str) -> Answer | None:
         return self._open(flight).answers.get(key)
 
     def latency_s(self, flight: str, sample_id: str) -> float:
         """Give the time that the answers about one window took, one after the other."""
         kept = self._open(flight).answers.values()
-        return sum(record["latency_s"] for record in kept if record["sample_id"] == sample_id)
+        return sum(answer.latency_s for answer in kept if answer.sample_id == sample_id)
 
-    async def put(self, flight: str, record: dict[str, Any]) -> None:
+    async def put(self, flight: str, answer: Answer) -> None:
         """Write an answer to the disk; it is there when this returns.
 
         Raises:
             StorageError: the disk is full or not writable.
         """
         opened = self._open(flight)
-        opened.journal.append(record, sync=False)
-        opened.answers[record["key"]], opened.is_closed = record, False
+        opened.journal.append(answer.model_dump(mode="json"), sync=False)
+        opened.answers[answer.key], opened.is_closed = answer, False
         for totals in (opened.totals, self.totals):
-            _count(totals, record)
+            _count(totals, answer)
         on_disk = asyncio.get_running_loop().create_future()
         self._waiting.append((opened.journal, on_disk))
         if self._syncing is None or self._syncing.done():
@@ -157,21 +203,30 @@ class AnswerBook:
                 opened.journal.close()
 
 
+def _last_totals(path: Path) -> dict[str, int] | None:
+    """Give the totals that a journal ends with; None where it does not, or with some that cannot be."""
+    try:
+        last = read_line(Journal(path).last() or {})
+    except ValidationError:
+        return None
+    return {**last.totals} if isinstance(last, Totals) else None
+
+
 def _read(path: Path) -> _Flight:
     found = _Flight(Journal(path), {}, Counter(), is_closed=True)
-    for record in found.journal.read():
-        found.is_closed = TOTALS in record
-        if found.is_closed:
-            found.totals = Counter(record[TOTALS])
+    for line in found.journal.read_as(read_line):
+        found.is_closed = isinstance(line, Totals)
+        if isinstance(line, Totals):
+            found.totals = Counter(line.totals)
         else:
-            found.answers[record["key"]] = record
-            _count(found.totals, record)
+            found.answers[line.key] = line
+            _count(found.totals, line)
     return found
 
 
-def _count(totals: Counter[str], record: dict[str, Any]) -> None:
+def _count(totals: Counter[str], answer: Answer) -> None:
     totals["answers"] += 1
-    totals.update(record["usage"])
+    totals.update(answer.usage)
 
 
 def _sync_all(journals: set[Journal]) -> None:
@@ -203,9 +258,8 @@ class KeptAnswers:
         async with lock:  # two windows may ask the same: the second takes the answer of the first
             known = None if self.book is None else self.book.get(flight, key)
             is_again = self.only is not None and sample_id in self.only  # perhaps by a server with a larger context
-            if known is not None and not (is_again and known.get("finish_reason") == CONTEXT_FULL):
-                usage = Usage(**known["usage"]) if known["usage"] else None
-                return Reply(known["text"], usage, known.get("structured", ""), known.get("finish_reason"))
+            if known is not None and not (is_again and known.finish_reason == CONTEXT_FULL):
+                return known.reply
             if self.only is not None and sample_id not in self.only:
                 raise NoAnswer("not_asked", "this run asks about other windows only")
             if self.budget is None:
@@ -219,13 +273,19 @@ class KeptAnswers:
         start_s = time.monotonic()
         reply = await self.engine.answer(request)
         if self.book is not None:
-            record: dict[str, Any] = {"key": key, "sample_id": sample_id, "purpose": purpose}
-            record |= {
-                "model": self.engine.model,
-                "text": reply.text,
-                "usage": reply.usage.model_dump() if reply.usage else {},
-            }
-            record |= {"structured": reply.structured, "finish_reason": reply.finish_reason}
-            record |= {"latency_s": round(time.monotonic() - start_s, 3), "time": round(time.time(), 3)}
-            await self.book.put(flight, record)  # on the disk before anything is derived from it
+            answer = Answer(
+                key=key,
+                sample_id=sample_id,
+                purpose=purpose,
+                model=self.engine.model,
+                text=reply.text,
+                usage=reply.usage.model_dump() if reply.usage else {},
+                counted=reply.counted,
+                structured=reply.structured,
+                finish_reason=reply.finish_reason,
+                served_by=None if reply.model == self.engine.model else reply.model,
+                latency_s=round(time.monotonic() - start_s, 3),
+                time=round(time.time(), 3),
+            )
+            await self.book.put(flight, answer)  # on the disk before anything is derived from it
         return reply

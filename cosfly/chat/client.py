@@ -6,15 +6,12 @@ The key comes from the environment variable COSFLY_API_KEY and goes into the req
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import random
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
-from urllib.parse import urlsplit
 
 import httpx
 from pydantic import Field
@@ -23,6 +20,7 @@ from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Request, Trouble
 from cosfly.chat.protocol import (
     ERROR_INSTEAD,
     base_url,
+    check_url,
     encode_body,
     error_words,
     read_body,
@@ -30,20 +28,16 @@ from cosfly.chat.protocol import (
     read_models,
     request_body,
     response_format,
-    retry_after_s,
-    shown_url,
 )
 from cosfly.chat.refusals import MEANINGS, Refusal, kind_of
 from cosfly.chat.throttle import Throttle
+from cosfly.chat.wire import KEY_VARIABLE, Connections, Response
 from cosfly.config import Config, MayDiffer
 from cosfly.errors import TeacherError
 
 log = logging.getLogger(__name__)
 
-KEY_VARIABLE = "COSFLY_API_KEY"
 BUSY_STATUS = frozenset({429, 503, 529})
-RETRIED_STATUS = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 529})
-HEADERS = {"Content-Type": "application/json"}
 MOST_SAID = 300  # characters of a server's words that are kept
 SCHEMA_DOUBTS = 3  # refusals in words that the table does not know
 POISONED = "after a prompt that was too long vLLM answers so to any with the same pictures, its issue 43941: restart it"
@@ -66,6 +60,9 @@ class EndpointConfig(Config):
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
     backoff_s: MayDiffer[float] = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
     max_backoff_s: MayDiffer[float] = Field(60.0, gt=0, description="longest wait between two tries")
+    max_reply_mb: MayDiffer[float] = Field(
+        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
+    )
     stop_after_failures: MayDiffer[int] = Field(
         20, ge=1, description="windows in a row without an answer that end the run"
     )
@@ -118,57 +115,41 @@ class ChatClient:
     kind: Literal["endpoint"] = "endpoint"
 
     def __init__(self, url: str, cfg: EndpointConfig, troubles: Troubles | None = None) -> None:
-        self.url, self.where, self.model = base_url(url), shown_url(base_url(url)), ""
-        self.cfg = cfg
+        """
+        Raises:
+            TeacherError: it is no URL that can be asked, or holds a secret.
+        """
+        try:
+            check_url(url)
+        except ValueError as error:
+            raise TeacherError(str(error)) from None
+        self.url = self.where = base_url(url)
+        self.cfg, self.model = cfg, ""
         self.throttle = Throttle(cfg.concurrency)
         self.troubles = troubles or Troubles()
         self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
         self._is_schema_refused = not cfg.json_schema
         self._num_doubts = 0  # refusals in a row that went away without the schema
-        self._was_too_long = self._was_cut = False
+        self._was_too_long = False
+        self._warned: set[str] = set()
         self._key = os.environ.get(KEY_VARIABLE, "")
+        most_bytes = int(cfg.max_reply_mb * 1e6)
+        self._connections = Connections(self._key, timeout_s=cfg.timeout_s, most_bytes=most_bytes)
         self._jitter = random.Random()  # times of retries only: no product depends on it
-        # A connection to each request in flight, each in a client of its own: one pool of 64 connections looks through all of them at
-        # every request, and all at each of those, which takes longer than to send fifteen pictures.
-        self._tls = httpx.create_ssl_context()
-        self._free = [self._connect()]
 
     async def close(self) -> None:
         """Close all connections; none may be in use."""
-        for connection in self._free:
-            await connection.aclose()
-
-    @contextlib.contextmanager
-    def _connection(self) -> Iterator[httpx.AsyncClient]:
-        """Lend the connection that was used last, or a new one where all are in use."""
-        connection = self._free.pop() if self._free else self._connect()
-        try:
-            yield connection
-        finally:
-            self._free.append(connection)
-
-    def _connect(self) -> httpx.AsyncClient:
-        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
-        try:
-            return httpx.AsyncClient(headers=headers, timeout=self.cfg.timeout_s, limits=limits, verify=self._tls)
-        except (httpx.InvalidURL, ValueError, UnicodeError) as error:
-            raise TeacherError("the key cannot be sent", where=KEY_VARIABLE, got=type(error).__name__) from None
+        await self._connections.close()
 
     # --- one answer ---
 
-    async def send(self, payload: dict) -> httpx.Response:
+    async def send(self, payload: dict) -> Response:
         """Send one request once.
 
         Raises:
-            TimeoutError: the whole answer was not there within `timeout_s`, however steadily it dripped.
-            httpx.RequestError: no connection, or it broke.
+            TimeoutError, httpx.RequestError: as `exchange`.
         """
-        with self._connection() as connection:
-            async with asyncio.timeout(self.cfg.timeout_s):
-                return await connection.post(
-                    f"{self.url}/chat/completions", content=encode_body(payload), headers=HEADERS
-                )
+        return await self._connections.exchange(f"{self.url}/chat/completions", encode_body(payload))
 
     async def answer(self, request: Request) -> Reply:
         """Send a request until it is answered.
@@ -186,17 +167,17 @@ class ChatClient:
                 self.troubles.answered()
                 return answered
             found = answered
-            if self.troubles.failed(found.detail):
-                log.warning(
-                    "%s: %s; trying again, failed tries so far: %d", self.where, found.detail, self.troubles.num
-                )
-            if attempt + 1 == self.cfg.max_tries:
-                break
+            is_last = attempt + 1 == self.cfg.max_tries
             pause_s = self._wait_s(attempt) if found.wait_s is None else found.wait_s
-            if time.monotonic() + pause_s >= ask.deadline_s:
+            is_late = not is_last and time.monotonic() + pause_s >= ask.deadline_s
+            if self.troubles.failed(found.detail):
+                what = "given up" if is_last or is_late else "trying again"
+                log.warning("%s: %s; %s, failed tries so far: %d", self.where, found.detail, what, self.troubles.num)
+            if is_late:
                 words = f"no answer within {self.cfg.total_timeout_s:g} s; the last: {found.detail}"
                 raise NoAnswer("total_timeout", words)
-            await asyncio.sleep(pause_s)
+            if not is_last:
+                await asyncio.sleep(pause_s)
         raise NoAnswer(found.cause, found.detail)
 
     async def _try(self, ask: _Ask) -> Reply | _Failure:
@@ -206,6 +187,7 @@ class ChatClient:
         if isinstance(found, _Failure):
             return found
         self._judge_schema(ask)
+        self._warn_of_oddities(found)
         return self._with_full_context(found, ask.request)
 
     async def _send_in_turn(self, ask: _Ask) -> Reply | Refusal | _Failure:
@@ -217,22 +199,20 @@ class ChatClient:
                 # Another answer may have told meanwhile.
                 ask.is_structured = not (self._is_schema_refused or ask.suspect)
                 response = await self.send(ask.payload)
-                found = self.read(response, is_structured=ask.is_structured)
+                found = self.read(response, ask.request, is_structured=ask.is_structured)
                 if ask.is_structured and isinstance(found, Refusal) and found.may_be_schema:
                     ask.suspect, ask.is_structured = found, False
                     response = await self.send(ask.payload)
-                    found = self.read(response, is_structured=False)
+                    found = self.read(response, ask.request, is_structured=False)
         except (TimeoutError, httpx.TimeoutException):
             self.throttle.failed()
             return _Failure("timeout", f"no answer within {self.cfg.timeout_s:g} s")
         except httpx.RequestError as error:  # also a body that is not compressed as it claims
             self.throttle.failed()
             return _Failure("connection", self.clean(f"{type(error).__name__} {error}"))
-        except httpx.InvalidURL:
-            raise self.error("not a URL that can be asked", fix="check --teacher") from None
         if isinstance(found, str):
             return _Failure("bad_reply", found)
-        return found if isinstance(found, Reply) else self._refused(found, ask, given_s, retry_after_s(response))
+        return found if isinstance(found, Reply) else self._refused(found, ask, given_s, response.retry_after_s)
 
     def _refused(self, refusal: Refusal, ask: _Ask, given_s: float, wait_s: float | None = None) -> Refusal | _Failure:
         """Tell what a refusal means; wait_s: as the server says.
@@ -243,13 +223,17 @@ class ChatClient:
         status = refusal.status
         if refusal.meaning.ends_run:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
-        if status in RETRIED_STATUS and refusal.kind == "unknown":
+        if refusal.may_pass:
+            is_long = (
+                wait_s is not None and wait_s > self.cfg.total_timeout_s
+            )  # this one is given up, the others are not held
             if status in BUSY_STATUS:
-                self.throttle.was_busy(given_s, wait_s)
+                self.throttle.was_busy(given_s, None if is_long else wait_s)
             else:
                 self.throttle.failed()
             poisoned = f" ({POISONED})" if status == 500 and self._was_too_long and ask.request.digests else ""
-            return _Failure(f"http_{status}", refusal.said + poisoned, wait_s)
+            asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
+            return _Failure(f"http_{status}", refusal.said + asked + poisoned, wait_s)
         if refusal.kind != "content":
             self.stop_if_fatal(refusal)
         self._was_too_long |= refusal.kind == "too_long"
@@ -275,15 +259,25 @@ class ChatClient:
         vLLM shortens `max_tokens` to what is left of the context, and says no more than "length".
         """
         most, usage = request.sampling.get("max_tokens"), reply.usage
-        if reply.finish_reason != "length" or usage is None or type(most) is not int:
+        if reply.finish_reason != "length" or usage is None or reply.counted or type(most) is not int:
             return reply
         if not 0 < usage.completion_tokens < most or (self.context and usage.total < self.context - 1):
             return reply
-        if not self._was_cut:
-            self._was_cut = True
-            log.warning("%s: an answer was cut after %d of %d tokens: %s; %s", self.where, usage.completion_tokens, most,
-                        MEANINGS["too_long"].what, MEANINGS["too_long"].fix)  # fmt: skip
+        what = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
+        self._warn_once("cut", f"{what}: {MEANINGS['too_long'].what}; {MEANINGS['too_long'].fix}")
         return replace(reply, finish_reason=CONTEXT_FULL)
+
+    def _warn_of_oddities(self, reply: Reply) -> None:
+        """Say once of a run what is odd about its server's answers and no fault of any."""
+        if reply.counted:
+            self._warn_once("count", f"its count of {' and '.join(reply.counted)} cannot be, so they are counted here")
+        if reply.model is not None and not _are_alike(reply.model, self.model):
+            self._warn_once("model", f"asked for the model {self.model}, and says that {reply.model} answered")
+
+    def _warn_once(self, oddity: str, words: str) -> None:
+        if oddity not in self._warned:
+            self._warned.add(oddity)
+            log.warning("%s: %s", self.where, words)
 
     def _wait_s(self, attempt: int) -> float:
         longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0**attempt)
@@ -303,24 +297,13 @@ class ChatClient:
         Raises:
             TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
         """
-        try:
-            with self._connection() as connection:
-                response = await connection.get(f"{self.url}/models")
-        except httpx.InvalidURL:
-            raise self.error("not a URL that can be asked", fix="check --teacher") from None
-        except httpx.HTTPError as error:
-            why = self.clean(f"{type(error).__name__} {error}")
-            raise self.error("cannot reach the teacher", got=why, fix="start the server or check --teacher") from None
-        wanted = self.cfg.model
-        if response.status_code in (401, 403):
-            self.stop_if_fatal(self.refusal(response))
-        entries = read_models(response)
-        if entries is None:
+        wanted, entries = self.cfg.model, await self.models()
+        if isinstance(entries, Refusal):
             if wanted:
                 self.model = wanted  # some hosts list no models; the first request will tell
                 return
             what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
-            raise self.error(what, got=self.refusal(response).said, fix="check the URL, or give --model")
+            raise self.error(what, got=entries.said, fix="check the URL, or give --model")
         names = [entry["id"] for entry in entries]
         if wanted in names or (wanted is None and len(names) == 1):
             self.model = wanted or names[0]
@@ -334,20 +317,40 @@ class ChatClient:
             fix="give --model",
         )
 
-    def read(self, response: httpx.Response, *, is_structured: bool) -> Reply | Refusal | str:
+    async def models(self) -> list[dict[str, Any]] | Refusal:
+        """Ask which models there are; gives what is said in place of a list.
+
+        Raises:
+            TeacherError: unreachable, or refuses the key.
+        """
+        try:
+            response = await self._connections.exchange(f"{self.url}/models")
+        except (TimeoutError, httpx.RequestError) as error:
+            is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
+            why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
+            fix = "start the server or check --teacher"
+            raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
+        if response.status in (401, 403):
+            self.stop_if_fatal(self.refusal(response))
+        entries = None if response.is_cut else read_models(response)
+        return self.refusal(response) if entries is None else entries
+
+    def read(self, response: Response, request: Request, *, is_structured: bool) -> Reply | Refusal | str:
         """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what is wrong with it."""
-        if response.status_code != 200:
+        if response.status != 200:
             return self.refusal(response)
-        found = read_completion(response, "json_schema" if is_structured else "plain")
+        if response.is_cut:
+            return f"longer than endpoint.max_reply_mb={self.cfg.max_reply_mb:g}"
+        found = read_completion(response, request, "json_schema" if is_structured else "plain")
         if isinstance(found, Reply):
             return found
         kind = kind_of(200, found) if found.startswith(ERROR_INSTEAD) else "unknown"
         return self.clean(found) if kind == "unknown" else Refusal(200, kind, self.clean(found))
 
-    def refusal(self, response: httpx.Response) -> Refusal:
+    def refusal(self, response: Response) -> Refusal:
         """Read what a response of another status than 200 refuses."""
-        text = response.content.decode("utf-8", "replace")
-        return Refusal(response.status_code, kind_of(response.status_code, text), self.detail(response))
+        text = response.body.decode("utf-8", "replace")
+        return Refusal(response.status, kind_of(response.status, text), self.detail(response))
 
     def stop_if_fatal(self, refusal: Refusal) -> None:
         """Raise for a status that would be every window's."""
@@ -362,18 +365,23 @@ class ChatClient:
     def error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)
 
-    def detail(self, response: httpx.Response) -> str:
+    def detail(self, response: Response) -> str:
         """Give a server's error text, short and without the key."""
         try:
-            text = error_words(read_body(response.content))
+            text = error_words(read_body(response.body))
         except ValueError:
-            text = response.content.decode("utf-8", "replace")  # whatever charset it claims
+            text = response.body.decode("utf-8", "replace")  # whatever charset it claims
         return self.clean(text)
 
     def clean(self, text: str) -> str:
         """Cut a server's text short and take out what no line can hold, and the key, should the server echo it."""
         text = " ".join(text.split())
-        secrets = [self._key, urlsplit(self.url).password or ""]
-        for secret in filter(None, secrets):
-            text = text.replace(secret, "***")
+        if self._key:
+            text = text.replace(self._key, "***")
         return "".join(character if character.isprintable() else "?" for character in text[:MOST_SAID])
+
+
+def _are_alike(one: str, two: str) -> bool:
+    """Tell whether two names may be of one model: a server may add a date, a folder or a file's ending."""
+    one, two = one.lower(), two.lower()
+    return one in two or two in one

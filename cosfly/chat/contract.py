@@ -13,6 +13,9 @@ from typing import Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
+CountName = Literal["prompt_tokens", "completion_tokens"]
+MOST_TOKENS = 10_000_000  # of one answer: the longest context of any model that is served
+
 
 class Usage(BaseModel):
     """Tokens of one answer or of several; 0 where a server does not count them."""
@@ -54,13 +57,16 @@ CONTEXT_FULL = "context_full"  # why an answer ended: prompt and answer fill the
 class Reply:
     """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
 
-    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL.
+    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. counted: counts of `usage` that
+    are ours, since the server's cannot be. model: who answered, as the server says.
     """
 
     text: str
     usage: Usage | None
     structured: str
     finish_reason: str | None = None
+    counted: tuple[CountName, ...] = ()
+    model: str | None = None
 
 
 class NoAnswer(Exception):

@@ -4,34 +4,56 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Any
-from urllib.parse import urlsplit, urlunsplit
+from typing import Any, get_args
 
 import httpx
 
-from cosfly.chat.contract import Reply, Request, Usage
+from cosfly.chat.contract import MOST_TOKENS, CountName, Reply, Request, Usage
+from cosfly.chat.wire import KEY_VARIABLE, Response
 from cosfly.reading.documents import parse_json
 from cosfly.store import dump_json, sha256_bytes
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content
 ERROR_INSTEAD = "an error in place of an answer"  # with status 200
-MOST_TOKENS = 10**12  # of one answer: what is more is no count
+ENDED = (
+    "error",
+    "abort",
+)  # finish reasons of an answer that a server gave up, SGLang with status 200 and nothing in it
+MOST_NAME = 256  # characters of a name that is kept: of a model, of why an answer ended
+BYTES_PER_TOKEN = 3  # a low guess, as the next is a high one: a budget that counts with them is kept
+TOKENS_PER_PICTURE = 1000  # a megapixel at 28 x 28 px a token takes 1337, one of 640 x 360 px 293
+
+
+def check_url(url: str) -> None:
+    """Check that a URL can be asked, and holds no secret: it is written into `run.yaml` and shown in messages.
+
+    Raises:
+        ValueError: says what is wrong, and nothing of the URL that may be a secret.
+    """
+    shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
+    if not re.match(r"https?://", url, re.IGNORECASE):
+        raise ValueError(f"a URL must begin with http:// or https://{shown}")
+    if re.search(r"[\s\x00-\x1f\x7f]", url):
+        raise ValueError(f"a URL must not hold blanks{shown}")
+    if re.search("[@?#]", url):
+        what = "a URL must hold no user, password, query or fragment, since it is written down"
+        raise ValueError(f"{what}; a key goes into the environment variable {KEY_VARIABLE}{shown}")
+    try:
+        parts = httpx.URL(url)
+        parts.raw_host.decode("ascii").encode("idna")  # as the system's resolver will
+    except (httpx.InvalidURL, ValueError) as error:
+        raise ValueError(f"not a URL that can be asked{shown} ({' '.join(str(error).split())[:100]})") from None
+    if not parts.host or "%" in parts.host:
+        raise ValueError(f"a URL must name a host{shown}")
+    if parts.port is not None and not 0 < parts.port < 65_536:
+        raise ValueError(f"the port must be from 1 to 65535{shown}")
 
 
 def base_url(url: str) -> str:
     """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
     root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
     return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
-
-
-def shown_url(url: str) -> str:
-    """Give a URL without user, password and query, for messages and records."""
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https"):
-        return url  # vllm:MODEL_DIR
-    host = parts.hostname or ""
-    return urlunsplit((parts.scheme, f"{host}:{parts.port}" if parts.port else host, parts.path, "", ""))
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
@@ -113,10 +135,13 @@ def error_words(value: Any) -> str:
     return str(error.get("message", error) if isinstance(error, dict) else error)
 
 
-def read_completion(response: httpx.Response, structured: str) -> Reply | str:
-    """Give the reply of a completion that was asked for in this way, or a word on what is wrong with it."""
+def read_completion(response: Response, request: Request, structured: str) -> Reply | str:
+    """Give the reply to a request that was sent in this way, or a word on what is wrong with it.
+
+    Nothing of it is taken on trust: what is kept has the type and size that it should have.
+    """
     try:
-        value = read_body(response.content)
+        value = read_body(response.body)
     except ValueError:
         return "the body is not JSON"
     choices = value.get("choices") if isinstance(value, dict) else None
@@ -124,14 +149,19 @@ def read_completion(response: httpx.Response, structured: str) -> Reply | str:
         has_error = isinstance(value, dict) and value.get("error")
         return f"{ERROR_INSTEAD}: {error_words(value)}" if has_error else "no choices"
     choice, finish_reason = choices[0], choices[0].get("finish_reason")
-    if choice.get("error") or finish_reason == "error":
-        return f"{ERROR_INSTEAD}: {error_words(choice)}"
-    message = choice.get("message")
-    text = final_text(message) if isinstance(message, dict) else None
+    message = choice["message"] if isinstance(choice.get("message"), dict) else {}
+    text = final_text(message)
+    if choice.get("error") or finish_reason in ENDED:
+        return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
     if text is None:
         return "no text in the message"
-    reason = finish_reason if isinstance(finish_reason, str) else None
-    return Reply(text, _usage(value.get("usage")), structured, reason)
+    usage, counted = _usage(value.get("usage"), own_count(request, message))
+    return Reply(text, usage, structured, _name(finish_reason), counted, _name(value.get("model")))
+
+
+def _name(value: Any) -> str | None:
+    """Give a name that can stand in a record, None where it is none."""
+    return value if isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_NAME else None
 
 
 def final_text(message: dict[str, Any]) -> str | None:
@@ -172,31 +202,50 @@ def _objects(value: Any) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _usage(value: Any) -> Usage | None:
-    """Read the counts of tokens; one that cannot be a count is left out."""
+def _usage(value: Any, own: Usage) -> tuple[Usage | None, tuple[CountName, ...]]:
+    """Read the counts of tokens.
+
+    Args:
+        own: what we count.
+    Returns:
+        None where the server counts nothing; the names of the counts that are ours, since the server's cannot be.
+    """
     found = value if isinstance(value, dict) else {}
-    counts = {name: found.get(name) for name in Usage.model_fields}
-    good = {name: count for name, count in counts.items() if type(count) is int and 0 <= count <= MOST_TOKENS}
-    return Usage(**good) if good else None
+    names = get_args(CountName)
+    if all(found.get(name) is None for name in names):
+        return None, ()
+    ours = own.model_dump()
+    wrong = tuple(name for name in names if not _is_count(found.get(name), least=min(1, ours[name])))
+    return Usage(**{name: ours[name] if name in wrong else found[name] for name in names}), wrong
 
 
-def read_models(response: httpx.Response) -> list[dict[str, Any]] | None:
-    """Read the list of models, each an object with `id`; None where there is none."""
-    if response.status_code != 200:
+def _is_count(value: Any, least: int) -> bool:
+    """Tell whether this can be a number of tokens: of what is there it is not 0."""
+    return type(value) is int and least <= value <= MOST_TOKENS
+
+
+def own_count(request: Request, message: dict[str, Any]) -> Usage:
+    """Count the tokens of a request and of the message that answers it, rather too high than too low."""
+    contents = [asked["content"] for asked in request.messages]
+    parts = [part for content in contents for part in ([{"text": content}] if isinstance(content, str) else content)]
+    prompt = _tokens(*(part.get("text", "") for part in parts)) + TOKENS_PER_PICTURE * len(request.digests)
+    said = (final_text(message), *(message.get(name) for name in THOUGHT_FIELDS))
+    return Usage(prompt_tokens=max(1, prompt), completion_tokens=_tokens(*(s for s in said if isinstance(s, str))))
+
+
+def _tokens(*texts: str) -> int:
+    return -(-sum(len(text.encode()) for text in texts) // BYTES_PER_TOKEN)
+
+
+def read_models(response: Response) -> list[dict[str, Any]] | None:
+    """Read the list of models, each an object with `id`, a name; None where there is none."""
+    if response.status != 200:
         return None
     try:
-        value = read_body(response.content)
+        value = read_body(response.body)
     except ValueError:
         return None
     listed = value.get("data") if isinstance(value, dict) else None
     if not isinstance(listed, list):
         return None
-    return [entry for entry in _objects(listed) if isinstance(entry.get("id"), str)]
-
-
-def retry_after_s(response: httpx.Response) -> float | None:
-    """Read Retry-After in seconds, bounded; None where absent or a date."""
-    try:
-        return min(600.0, max(0.0, float(response.headers.get("retry-after", ""))))
-    except ValueError:
-        return None
+    return [entry for entry in _objects(listed) if _name(entry.get("id"))]

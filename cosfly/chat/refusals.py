@@ -106,8 +106,15 @@ _PATTERNS: tuple[tuple[Kind, str], ...] = (
     ),
 )
 _TABLE = tuple((kind, re.compile(pattern, re.IGNORECASE | re.DOTALL)) for kind, pattern in _PATTERNS)
-# Statuses of a server that is busy or away: whatever else their texts say, only an empty account is more than that.
-_PASSING = frozenset({408, 409, 425, 429, 502, 503, 504, 529})
+# Statuses of a server that is busy or away, those above 511 Cloudflare's: whatever else their texts say, only an empty account is more
+# than that. 424 is what TGI says of a generation that broke.
+AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
+# What a server says with 5xx of a schema that it does not take; that a grammar stands in its words does not tell it from one that broke.
+_REFUSES = r"unimplemented|unsupported|not support|invalid|unavailable|failed to (parse|compile|convert|initialize)"
+_NAMES = r"response_?format|schema|grammar"
+_SCHEMA_REFUSED = re.compile(
+    rf"({_REFUSES}).{{0,80}}({_NAMES})|({_NAMES}).{{0,80}}({_REFUSES})", re.IGNORECASE | re.DOTALL
+)
 
 
 def kind_of(status: int, text: str) -> Kind:
@@ -116,11 +123,14 @@ def kind_of(status: int, text: str) -> Kind:
     Args:
         text: the body as it came.
     """
-    found = (kind for kind, pattern in _TABLE if pattern.search(text[:MOST_CHARACTERS]))
+    text = text[:MOST_CHARACTERS]
+    found = (kind for kind, pattern in _TABLE if pattern.search(text))
     kind: Kind = "account" if status == 402 else next(found, "unknown")
-    if kind == "content" and status >= 500:
+    if status >= 500 and kind == "content":
         return "unknown"  # a filter refuses with 4xx; "safety" in the text of a server that failed is no verdict on the window
-    return "unknown" if status in _PASSING and kind != "account" else kind
+    if status >= 500 and kind == "schema" and not _SCHEMA_REFUSED.search(text):
+        return "unknown"
+    return "unknown" if status in AWAY and kind != "account" else kind
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,11 @@ class Refusal:
     @property
     def meaning(self) -> Meaning:
         return MEANINGS[self.kind]
+
+    @property
+    def may_pass(self) -> bool:
+        """Whether the same request may be answered later: the server is busy, away or broken."""
+        return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
 
     @property
     def may_be_schema(self) -> bool:

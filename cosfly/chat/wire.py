@@ -1,0 +1,145 @@
+"""One exchange with an HTTP server, in bounded time and memory whatever it sends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
+
+import httpx
+
+from cosfly.errors import TeacherError
+
+KEY_VARIABLE = "COSFLY_API_KEY"
+# All that we can unpack within a limit. `identity` alone would do, but some proxies pack whatever a client says.
+HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "gzip"}
+MOST_DATE = 64  # characters of a Retry-After
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a server answered. body: unpacked; of one that is longer than the limit its beginning (`is_cut`).
+
+    retry_after_s: how long it asks to wait; None where it does not say, or says what nobody can wait for.
+    """
+
+    status: int
+    body: bytes
+    is_cut: bool = False
+    retry_after_s: float | None = None
+
+
+class Connections:
+    """A connection to each request in flight, each in a client of its own.
+
+    One pool of 64 connections looks through all of them at every request, and all at each of those, which takes longer than to
+    send fifteen pictures.
+    """
+
+    def __init__(self, key: str, *, timeout_s: float, most_bytes: int) -> None:
+        """
+        Args:
+            key: sent with each request; "": none.
+            timeout_s: of one exchange. most_bytes: of one answer, unpacked.
+        Raises:
+            TeacherError: the key or the environment's proxy cannot be used.
+        """
+        if not (key.isascii() and key.isprintable()):  # an error of httpx would quote it
+            raise TeacherError("the key holds what no header can, perhaps the end of a line", where=KEY_VARIABLE)
+        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._timeout_s, self._most_bytes = timeout_s, most_bytes
+        self._tls = httpx.create_ssl_context()
+        self._free = [self._connect()]
+
+    async def close(self) -> None:
+        """Close all; none may be in use."""
+        for connection in self._free:
+            await connection.aclose()
+
+    async def exchange(self, url: str, content: bytes | None = None) -> Response:
+        """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key stays here.
+
+        Raises:
+            TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily it dripped.
+            httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
+        """
+        method = "GET" if content is None else "POST"
+        with self._connection() as connection:
+            async with (
+                asyncio.timeout(self._timeout_s),
+                connection.stream(method, url, content=content, headers=HEADERS) as response,
+            ):
+                body = _Body(response.headers.get("content-encoding", ""), self._most_bytes)
+                async for packed in response.aiter_raw():
+                    body.add(packed)
+                    if body.is_cut:  # the rest stays unread, and the connection is closed
+                        break
+                wait_s = retry_after_s(response.headers.get("retry-after", ""), time.time())
+                return Response(response.status_code, body.whole(), body.is_cut, wait_s)
+
+    @contextlib.contextmanager
+    def _connection(self) -> Iterator[httpx.AsyncClient]:
+        """Lend the connection that was used last, or a new one where all are in use."""
+        connection = self._free.pop() if self._free else self._connect()
+        try:
+            yield connection
+        finally:
+            self._free.append(connection)
+
+    def _connect(self) -> httpx.AsyncClient:
+        limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
+        try:
+            return httpx.AsyncClient(headers=self._headers, timeout=self._timeout_s, limits=limits, verify=self._tls)
+        except (httpx.InvalidURL, ValueError, ImportError) as error:
+            where = "HTTP_PROXY, HTTPS_PROXY, ALL_PROXY"
+            raise TeacherError("the proxy cannot be used", where=where, got=type(error).__name__) from None
+
+
+class _Body:
+    """A body as it arrives, unpacked up to a limit."""
+
+    def __init__(self, encoding: str, most_bytes: int) -> None:
+        encoding = encoding.strip().lower()
+        if encoding not in ("", "identity", "gzip", "x-gzip"):
+            raise httpx.DecodingError(f"packed with {encoding[:40]!r}, which was not asked for")
+        self._unzip = zlib.decompressobj(zlib.MAX_WBITS | 16) if encoding.endswith("gzip") else None
+        self._read, self._most = bytearray(), most_bytes
+        self.is_cut = False
+
+    def add(self, packed: bytes) -> None:
+        """Add what has arrived; of a bomb no more is unpacked than fits."""
+        room = self._most - len(self._read)
+        try:
+            found = packed if self._unzip is None else self._unzip.decompress(packed, room + 1)
+        except zlib.error as error:
+            raise httpx.DecodingError(str(error)) from None
+        self.is_cut = len(found) > room
+        self._read += found[:room]
+
+    def whole(self) -> bytes:
+        if self._unzip is not None and not (self._unzip.eof or self.is_cut):
+            raise httpx.DecodingError("packed as gzip, and not complete")
+        return bytes(self._read)
+
+
+def retry_after_s(header: str, now_s: float) -> float | None:
+    """Read Retry-After, seconds or a date; None where it is neither, or no time to come.
+
+    Args:
+        now_s: seconds since 1970.
+    """
+    if len(header) > MOST_DATE:
+        return None
+    try:
+        wait_s = float(header)
+    except ValueError:
+        try:
+            wait_s = max(0.0, parsedate_to_datetime(header).timestamp() - now_s)
+        except (ValueError, TypeError, IndexError, OverflowError):
+            return None
+    return wait_s if 0.0 <= wait_s < math.inf else None

@@ -1,0 +1,70 @@
+"""`--repair`: what cannot be used in the journals of a folder is set aside, counted, and done again by whoever comes next."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from cosfly.chat.answers import TOTALS, read_line
+from cosfly.folder_lock import hold_folder
+from cosfly.journal import ASIDE, Journal
+from cosfly.stage_folder import read_item
+
+log = logging.getLogger(__name__)
+
+# Of a stage folder: its journals, and what reads a line of them.
+JOURNALS: dict[str, Callable[[dict], object]] = {
+    "items.jsonl": read_item,
+    "answers/*.jsonl": read_line,
+    "judgements/*.jsonl": read_line,
+}
+
+
+def repair(folder: Path) -> int:
+    """Set aside what is broken in the journals of a stage folder, or of all stages of a run folder; gives the number of lines.
+
+    A finished stage of which something is set aside is open again. Links are left alone.
+
+    Raises:
+        ResumeError: another process is at work in it.
+    """
+    if not folder.is_dir():
+        return 0
+    return sum(_repair_stage(stage) for stage in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())))
+
+
+def _repair_stage(stage: Path) -> int:
+    found = [(path, read) for pattern, read in JOURNALS.items() for path in sorted(stage.glob(pattern))]
+    found = [(path, read) for path, read in found if path.is_file() and not path.is_symlink()]
+    if not found or stage.is_symlink():
+        return 0
+    lock = hold_folder(stage)
+    try:
+        num_lines = sum(_set_aside(path, read) for path, read in found)
+        if num_lines:
+            (stage / "manifest.json").unlink(missing_ok=True)
+    finally:
+        lock.release()
+    return num_lines
+
+
+def _set_aside(path: Path, read: Callable[[dict], object]) -> int:
+    journal = Journal(path)
+    num_lines = journal.set_aside(lambda record: _is_usable(record, read))
+    if num_lines:
+        journal.set_aside(
+            lambda record: TOTALS not in record
+        )  # they have counted what is broken; the next run counts anew
+        log.warning("%s: %d lines set aside in %s", path, num_lines, path.name + ASIDE)
+    return num_lines
+
+
+def _is_usable(record: dict, read: Callable[[dict], object]) -> bool:
+    try:
+        read(record)
+    except ValidationError:
+        return False
+    return True
