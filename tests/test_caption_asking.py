@@ -26,7 +26,7 @@ from caption.run.progress import Display, duration
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat import answers
-from cosfly.chat.answers import AnswerBook, journal_name
+from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
 from cosfly.chat.contract import Usage
 from cosfly.chat.protocol import encode_body, with_image_ids
@@ -370,10 +370,10 @@ def flight_name(flight: int) -> str:
     return f"trajectory_{flight}_ORI"
 
 
-def record(flight: int, window: int, purpose: str = "free/0") -> dict:
+def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
     sample_id = f"{flight_name(flight)}_frame_{window:05d}"
     usage = {"prompt_tokens": 10, "completion_tokens": 2}
-    return {"key": f"{sample_id}/{purpose}", "sample_id": sample_id, "purpose": purpose, "usage": usage, "text": "t"}
+    return Answer(key=f"{sample_id}/{purpose}", sample_id=sample_id, purpose=purpose, usage=usage, text="t")
 
 
 def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int]) -> None:
@@ -414,9 +414,9 @@ def test_a_start_reads_the_last_line_of_finished_flights(tmp_path, monkeypatch):
     with AnswerBook(tmp_path) as book:
         assert len(seen) == 20  # of 600
         assert book.totals == {"answers": 600, "prompt_tokens": 6000, "completion_tokens": 1200}
-        assert book.get(flight_name(28), record(28, 7)["key"]) == record(28, 7)
+        assert book.get(flight_name(28), record(28, 7).key) == record(28, 7)
         # A part that was removed by hand makes its flight unfinished again: its answers are found all the same.
-        assert book.get(flight_name(3), record(3, 7)["key"]) == record(3, 7)
+        assert book.get(flight_name(3), record(3, 7).key) == record(3, 7)
         assert len(seen) == 20 + 20 + 21
         assert book.get(flight_name(99), "no such key") is None
 
@@ -448,7 +448,7 @@ def test_a_lost_line_of_totals_costs_time_only(tmp_path, damage):
         path.write_bytes(b"".join(lines))
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 20
-        assert book.get(flight_name(3), record(3, 2)["key"]) == record(3, 2)
+        assert book.get(flight_name(3), record(3, 2).key) == record(3, 2)
 
 
 def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):
@@ -468,7 +468,7 @@ def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):
             "completion_tokens": 2 * window + 2,
         }
     with AnswerBook(tmp_path) as book:
-        assert all(book.get(flight_name(0), record(0, window)["key"]) for window in range(6))
+        assert all(book.get(flight_name(0), record(0, window).key) for window in range(6))
     assert list(Journal(path).read())[-1]["totals"]["answers"] == 6
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 6
@@ -488,7 +488,7 @@ def test_a_torn_line_is_not_an_answer_and_the_journal_goes_on(tmp_path):
     asyncio.run(go_on())
     journal = Journal(tmp_path / journal_name(flight_name(1)))
     *kept, last = journal.read()
-    assert sorted(line["key"] for line in kept) == [record(1, window)["key"] for window in range(8)]
+    assert sorted(line["key"] for line in kept) == [record(1, window).key for window in range(8)]
     assert last == {"totals": {"answers": 8, "prompt_tokens": 80, "completion_tokens": 16}}
     assert journal.num_damaged == 0
     with AnswerBook(tmp_path) as book:
@@ -507,7 +507,7 @@ def test_many_flights_at_once_do_not_use_up_the_open_files(tmp_path, monkeypatch
     assert asyncio.run(write()) <= 4
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 120
-        assert book.get(flight_name(39), record(39, 2)["key"]) == record(39, 2)
+        assert book.get(flight_name(39), record(39, 2).key) == record(39, 2)
 
 
 @pytest.mark.parametrize(
@@ -525,7 +525,7 @@ def test_any_flight_has_a_journal_inside_its_folder(tmp_path, flight):
 
     asyncio.run(write())
     with AnswerBook(tmp_path) as book:
-        assert book.get(flight, record(0, 0)["key"]) == record(0, 0)
+        assert book.get(flight, record(0, 0).key) == record(0, 0)
 
 
 # --- kills ------------------------------------------------------------------------------------------------------------

@@ -16,13 +16,15 @@ from pathlib import Path
 
 import pytest
 from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers
+from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
-from cosfly.chat.protocol import base_url, shown_url
+from cosfly.chat.protocol import base_url, check_url
 from cosfly.chat.throttle import Throttle
-from cosfly.errors import NothingKept, ResumeError, TeacherError
+from cosfly.cli import app
+from cosfly.errors import CosflyError, NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -135,13 +137,11 @@ ENDING_FAULTS = [("401", "refuses the key"), ("404", "no such model"), ("500", "
 
 @pytest.mark.parametrize(("fault", "words"), ENDING_FAULTS)
 def test_a_lasting_server_fault_ends_the_run(tree, tmp_path, fault, words):
-    cfg = settings("http://user:hunter2@127.0.0.1:1", endpoint={"stop_after_failures": 3})
     with TeacherServer(lambda number, body: fault) as server:
-        cfg = cfg.model_copy(update={"teacher": server.url.replace("http://", "http://user:hunter2@")})
+        cfg = settings(server.url, endpoint={"stop_after_failures": 3})
         with pytest.raises(TeacherError, match=words) as caught:
             run(cfg, tree, tmp_path / "out")
     assert "\n" not in str(caught.value)
-    assert "hunter2" not in str(caught.value)
     assert "127.0.0.1" in str(caught.value)
     assert not (tmp_path / "out" / "manifest.json").exists()
 
@@ -315,8 +315,52 @@ def test_base_url(url, expected):
     assert base_url(url) == expected
 
 
-def test_shown_url_has_no_secrets():
-    assert shown_url("https://me:pw@h:1/v1?key=abc") == "https://h:1/v1"
+# What is no URL that can be asked, and what is said of it.
+BAD_URLS = [
+    ("http://", "must name a host"), ("http://:80/v1", "must name a host"), ("http://h%zz/v1", "must name a host"),
+    ("htp://x", "begin with http"), ("localhost:8000", "begin with http"), ("ftp://h/v1", "begin with http"),
+    ("http:/h", "begin with http"), ("http://[::1", "can be asked"), ("http://h:x/v1", "can be asked"),
+    ("http://a..b/v1", "can be asked"), (f"http://{'a' * 70}.com/v1", "can be asked"), ("http://xn--/v1", "can be asked"),
+    ("http://1.2.3.999/v1", "can be asked"), ("http://h:99999/v1", "port"), ("http://h:0/v1", "port"),
+    ("http://my host/v1", "blanks"), ("http://h/v1 ", "blanks"), ("http://h/\x00", "blanks"), ("http://h/\nv1", "blanks"),
+    ("http://user:hunter2@h/v1", KEY_VARIABLE), ("http://hunter2@h/v1", KEY_VARIABLE), ("http://u:hunter2/x@h", KEY_VARIABLE),
+    ("http://h/v1?api_key=hunter2", KEY_VARIABLE), ("http://h/v1?key=hunter2", KEY_VARIABLE), ("http://h/v1#hunter2", KEY_VARIABLE),
+    ("http://u:hunter2@h:99999", KEY_VARIABLE), ("htp://u:hunter2@h", "begin with http"), ("http://u:hunter 2@h", "blanks"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("url", "words"), BAD_URLS, ids=range(len(BAD_URLS)))
+def test_what_is_wrong_with_a_url_is_one_line_without_a_secret(url, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        check_url(url)
+    assert "hunter" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url", ["http://[::1", "http://user:hunter2@h/v1", "http://h/v1?api_key=hunter2", "http://u:hunter 2: 3@h"]
+)
+def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path, url):
+    at, data = ["--out", tmp_path / "out"], ["--data", tmp_path]
+    commands = [
+        ["caption", "--teacher", url, *data], ["caption", "--judge", url, *data], ["caption", "--plan", "--teacher", url, *data],
+        ["caption", "doctor", url], ["caption", "judge-check", url], ["caption", "compare-strategies", "--teacher", url, *at, *data],
+        ["run", "quickstart", "--set", f"caption.teacher={json.dumps(url)}", "--set", "caption.writing=prose", *at],
+    ]  # fmt: skip
+    for command in commands:
+        result = CliRunner().invoke(app, [str(word) for word in command])
+        assert result.exit_code == 1, command
+        assert isinstance(result.exception, CosflyError), (command, result.exception)
+        assert "URL" in str(result.exception)
+        assert "hunter" not in f"{result.output}{result.exception}", command
+    assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    "url", ["http://münchen.example/v1", "http://[::1]:8000", "HTTPS://H:443/v1", "http://a_b:8000"]
+)
+def test_other_urls_are_taken(url):
+    check_url(url)
 
 
 # --- the throttle ---

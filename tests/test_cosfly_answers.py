@@ -8,15 +8,15 @@ from __future__ import annotations
 import json
 import time
 
-import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from caption.truth.judge import parse_judgement
-from cosfly.chat.contract import Reply, Usage
+from cosfly.chat.contract import Reply, Request, Usage
 from cosfly.chat.objects import find_object
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
+from cosfly.chat.wire import Response
 from cosfly.products.captions import Coc, normalize_action, parse_answer
 
 GOOD = {
@@ -36,6 +36,13 @@ HALF = TEXT[:60]
 
 def changed(**fields: object) -> str:
     return json.dumps(GOOD | fields, ensure_ascii=False)
+
+
+REQUEST = Request([{"role": "user", "content": [{"type": "text", "text": "ab"}]}], ["one", "two"], {}, {})
+
+
+def completed(body: bytes) -> Reply | str:
+    return read_completion(Response(200, body), REQUEST, "plain")
 
 
 def completion(message: object, **choice: object) -> bytes:
@@ -112,7 +119,7 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
 
 @pytest.mark.parametrize(("body", "outcome"), [case[1:] for case in BODIES], ids=[case[0] for case in BODIES])
 def test_bodies(body, outcome):
-    found = read_completion(httpx.Response(200, content=body), "plain")
+    found = completed(body)
     if isinstance(outcome, str):
         assert isinstance(found, Reply), found
         assert found.text == outcome
@@ -122,29 +129,51 @@ def test_bodies(body, outcome):
         assert outcome[0] in found
 
 
-# What stands in `usage`; what is counted.
+OURS = Usage(prompt_tokens=1 + 2 * 1000, completion_tokens=-(-len(TEXT) // 3))  # "ab", two pictures, and the answer
+# What stands in `usage`; what is counted; which counts are ours.
 USAGES = [
-    ({"prompt_tokens": 10, "completion_tokens": 2, "total_tokens": 12}, Usage(prompt_tokens=10, completion_tokens=2)),
-    ({"prompt_tokens": 10, "completion_tokens": None}, Usage(prompt_tokens=10)),
-    ({"prompt_tokens": 10, "completion_tokens": 2.5}, Usage(prompt_tokens=10)),
-    ({"prompt_tokens": -1, "completion_tokens": 10**4200}, None),
-    ({"prompt_tokens": True, "completion_tokens": "2"}, None),
-    (None, None),
-    ([1], None),
-]
+    ({"prompt_tokens": 10, "completion_tokens": 2, "total_tokens": 12}, (10, 2), ()),
+    ({"prompt_tokens": 10, "completion_tokens": None}, (10, None), ("completion_tokens",)),
+    ({"prompt_tokens": 10, "completion_tokens": 2.5}, (10, None), ("completion_tokens",)),
+    ({"prompt_tokens": 1151, "completion_tokens": -35}, (1151, None), ("completion_tokens",)),
+    ({"prompt_tokens": 507, "completion_tokens": 0}, (507, None), ("completion_tokens",)),
+    ({"prompt_tokens": 0, "completion_tokens": 0}, (None, None), ("prompt_tokens", "completion_tokens")),
+    ({"prompt_tokens": -(10**30), "completion_tokens": 10**400}, (None, None), ("prompt_tokens", "completion_tokens")),
+    ({"prompt_tokens": -1, "completion_tokens": 10**4200}, (None, None), ("prompt_tokens", "completion_tokens")),
+    ({"prompt_tokens": True, "completion_tokens": "2"}, (None, None), ("prompt_tokens", "completion_tokens")),
+    ({"prompt_tokens": 10**8, "completion_tokens": 2}, (None, 2), ("prompt_tokens",)),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("usage", "counted"), USAGES, ids=range(len(USAGES)))
-def test_counts_that_are_none_are_left_out(usage, counted):
-    body = json.dumps({"choices": [{"message": {"content": TEXT}, "finish_reason": {}}], "usage": usage})
-    assert read_completion(httpx.Response(200, content=body), "plain") == Reply(TEXT, counted, "plain", None)
+@pytest.mark.parametrize(("usage", "expected", "counted"), USAGES, ids=range(len(USAGES)))
+def test_a_count_that_cannot_be_is_replaced_by_ours_and_marked(usage, expected, counted):
+    found = completed(
+        json.dumps({"choices": [{"message": {"content": TEXT}, "finish_reason": {}}], "usage": usage}).encode()
+    )
+    prompt, completion = (
+        ours if told is None else told for told, ours in zip(expected, OURS.model_dump().values(), strict=True)
+    )
+    assert found == Reply(TEXT, Usage(prompt_tokens=prompt, completion_tokens=completion), "plain", None, counted)
+
+
+@pytest.mark.parametrize("usage", [None, [1], "many", {}, {"prompt_tokens": None}], ids=range(5))
+def test_a_server_that_counts_nothing_is_not_counted_for(usage):
+    body = json.dumps({"choices": [{"message": {"content": TEXT}}], "usage": usage}).encode()
+    assert completed(body) == Reply(TEXT, None, "plain", None)
+
+
+def test_names_that_no_record_can_hold_are_left_out():
+    for name in ("", "x" * 300, "a\x1b[31m", "a\nb", 7, None, ["gpt"]):
+        body = json.dumps({"model": name, "choices": [{"message": {"content": TEXT}, "finish_reason": name}]}).encode()
+        assert completed(body) == Reply(TEXT, None, "plain", None)
+        assert read_models(Response(200, json.dumps({"data": [{"id": name}, {"id": "m"}]}).encode())) == [{"id": "m"}]
 
 
 @given(st.binary(max_size=200))
 def test_no_body_breaks_the_client(body):
     for content in (body, b'{"choices": [{"message": {"content": ' + body + b"}}]}"):
-        assert isinstance(read_completion(httpx.Response(200, content=content), "plain"), Reply | str)
-        read_models(httpx.Response(200, content=content))
+        assert isinstance(completed(content), Reply | str)
+        read_models(Response(200, content))
 
 
 JSON = st.recursive(
@@ -164,7 +193,7 @@ def test_whatever_json_a_server_sends_can_be_written(value):
     words = [error_words(read)]
     for name in ("content", "tool_calls", "refusal", "reasoning", "finish_reason", "error"):
         body = completion({name: value}, **({name: value} if name in ("finish_reason", "error") else {}))
-        found = read_completion(httpx.Response(200, content=body), "plain")
+        found = completed(body)
         words.append(found.text if isinstance(found, Reply) else found)
     assert [text.encode().decode() for text in words] == words  # no half of a surrogate pair, which no file takes
 

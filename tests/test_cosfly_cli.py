@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 
-import httpx
 import pytest
 
 from cosfly import cli, doctor
+from cosfly.chat.wire import Connections, Response
 from cosfly.cli.options import tell_product
 from cosfly.doctor import Check
 from cosfly.errors import InputError
@@ -108,19 +108,25 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
         ("http://h:8000", "http://h:8000/v1/models"),
         ("http://h:8000/v1/chat/completions", "http://h:8000/v1/models"),
         ("https://h/v1beta/openai", "https://h/v1beta/openai/models"),
-        ("https://me:pw@h/api/v3/", "https://me:pw@h/api/v3/models"),
+        ("https://h/api/v3/", "https://h/api/v3/models"),
     ],
 )
 def test_the_doctor_asks_for_the_models_where_captions_do(tmp_path, monkeypatch, teacher, asked):
     urls = []
 
-    def get(url, **_):
+    async def exchange(self, url, content=None):
         urls.append(url)
-        return httpx.Response(200, json={"data": [{"id": "one"}, {"id": "two"}]})
+        return Response(200, b'{"data": [{"id": "one"}, {"id": "two"}]}')
 
-    monkeypatch.setattr(httpx, "get", get)
+    monkeypatch.setattr(Connections, "exchange", exchange)
     found = doctor.examine(tmp_path, teacher)[-1]
     assert urls == [asked]
     assert found.state == "ok"
     assert found.detail.endswith(": one, two")
+
+
+@pytest.mark.parametrize("teacher", ["http://me:pw@h/v1", "http://h?key=pw", "http://[::1", "http://127.0.0.1:1"])
+def test_the_doctor_says_what_is_wrong_with_an_endpoint(tmp_path, teacher):
+    found = doctor.examine(tmp_path, teacher)[-1]
+    assert found.state == "missing"
     assert "pw" not in found.detail

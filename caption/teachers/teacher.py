@@ -149,6 +149,8 @@ class AskingTeacher:
         self.kept = KeptAnswers(self.engine, book, budget, only)
         self.frames = SharedFrames(cfg.image)
         self._trying, self._sound_s = asyncio.Lock(), float("-inf")  # when a trial prompt was answered last
+        self._refused_s: dict[str, float] = {}  # cause -> when the last window was refused for it
+        self._asked_s = float("-inf")  # when the last question was sent that the engine answered
 
     async def __aenter__(self) -> AskingTeacher:
         try:
@@ -166,7 +168,11 @@ class AskingTeacher:
         await self.engine.close()
 
     async def ask(self, question: Question) -> Reply:
-        return await self._kept_answer(question, await self.request(question), question.purpose)
+        request, asked_s = await self.request(question), time.monotonic()
+        reply = await self._kept_answer(question, request, question.purpose)
+        if not reply.is_kept:
+            self._asked_s = max(self._asked_s, asked_s)
+        return reply
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
@@ -187,7 +193,8 @@ class AskingTeacher:
     async def _find_fault(self, question: Question, refused: NoAnswer) -> None:
         """Find out whether a refusal is the window's: then a trial prompt with pictures of the same kind is answered.
 
-        One trial answers for all that were refused before it; two are tried, since a filter may stop one by chance.
+        One trial answers for all that were refused before it, and later for those between which windows are answered: a server that
+        answers is not at fault. Two are tried, since a filter may stop one by chance.
 
         Raises:
             TeacherError: it is the server's: both are refused alike.
@@ -195,7 +202,9 @@ class AskingTeacher:
         """
         refused_s = time.monotonic()
         async with self._trying:
-            if self._sound_s > refused_s:
+            before_s = self._refused_s.get(refused.cause, float("inf"))
+            self._refused_s[refused.cause] = refused_s
+            if self._sound_s > refused_s or self._asked_s > before_s:
                 return
             for scene in SCENES[:NUM_TRIALS]:
                 try:

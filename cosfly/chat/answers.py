@@ -16,7 +16,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 from weakref import WeakValueDictionary
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -84,7 +84,7 @@ class Answer(BaseModel):
     @property
     def reply(self) -> Reply:
         usage = Usage(**self.usage) if self.usage else None
-        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, self.served_by)
+        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, self.served_by, True)
 
 
 class Totals(BaseModel):
@@ -92,7 +92,7 @@ class Totals(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    totals: dict[Literal["answers"] | CountName, Count]
+    totals: dict[str, Count]
 
 
 def read_line(record: dict) -> Answer | Totals:
@@ -209,7 +209,7 @@ def _last_totals(path: Path) -> dict[str, int] | None:
         last = read_line(Journal(path).last() or {})
     except ValidationError:
         return None
-    return {**last.totals} if isinstance(last, Totals) else None
+    return last.totals if isinstance(last, Totals) else None
 
 
 def _read(path: Path) -> _Flight:

@@ -58,7 +58,7 @@ class Reply:
     """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
 
     usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. counted: counts of `usage` that
-    are ours, since the server's cannot be. model: who answered, as the server says.
+    are ours, since the server's cannot be. model: who answered, as the server says. is_kept: it was given before, and kept.
     """
 
     text: str
@@ -67,6 +67,7 @@ class Reply:
     finish_reason: str | None = None
     counted: tuple[CountName, ...] = ()
     model: str | None = None
+    is_kept: bool = False
 
 
 class NoAnswer(Exception):

@@ -41,10 +41,11 @@ def check_url(url: str) -> None:
         raise ValueError(f"{what}; a key goes into the environment variable {KEY_VARIABLE}{shown}")
     try:
         parts = httpx.URL(url)
+        host = parts.host
         parts.raw_host.decode("ascii").encode("idna")  # as the system's resolver will
     except (httpx.InvalidURL, ValueError) as error:
         raise ValueError(f"not a URL that can be asked{shown} ({' '.join(str(error).split())[:100]})") from None
-    if not parts.host or "%" in parts.host:
+    if not host or "%" in host:
         raise ValueError(f"a URL must name a host{shown}")
     if parts.port is not None and not 0 < parts.port < 65_536:
         raise ValueError(f"the port must be from 1 to 65535{shown}")

@@ -56,6 +56,7 @@ def caption(
     ] = True,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
     if context.invoked_subcommand is not None:
@@ -69,6 +70,7 @@ def caption(
     cfg = options.resolve(config, overrides, chosen)
     tree = options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
+    options.set_aside(target, repair)
     options.verify_first(verify, tree, target)
     if check and cfg.caption.teacher_kind == "endpoint" and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption, [cfg.caption.writing])
@@ -131,6 +133,7 @@ def caption_compare_strategies(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
+    repair: options.Repair = False,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
     from caption.run import compare
@@ -138,5 +141,6 @@ def caption_compare_strategies(
 
     chosen = {"caption.teacher": teacher, "caption.endpoint.model": model, "seed": seed}
     cfg = options.resolve(config, overrides, chosen)
+    options.set_aside(out, repair)
     comparisons = compare.run(cfg.caption, options.data_folder(data), out, seed=cfg.seed, conflicts=conflicts)
     console.print(compare.comparison_table(comparisons))

@@ -77,11 +77,13 @@ def distill_infer(
     overrides: options.Overrides = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Let the student answer a split; continues where it stopped."""
     from distill import infer
 
     cfg, tree = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folder(data)
+    options.set_aside(out, repair)
     options.verify_first(verify, dataset, tree, adapter, out)
     typer.echo(infer.run(cfg.distill.infer, dataset, tree, model, out, adapter=adapter, resume=resume))
 

@@ -42,16 +42,40 @@ Data = Annotated[
 ]
 
 
+Repair = Annotated[
+    bool,
+    typer.Option(
+        "--repair",
+        help="First set aside what cannot be used in the folder's journals (FILE.aside); it is done again.",
+    ),
+]
+
+
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings; None is not given."""
     from cosfly.config import load
     from cosfly.reading.limits import use_limits
     from cosfly.settings import RunConfig
+    from cosfly.store import dump_json
 
-    extra = [f"{name}={value}" for name, value in given.items() if value is not None]
+    texts = {
+        name: value if isinstance(value, int | float) else str(value)
+        for name, value in given.items()
+        if value is not None
+    }
+    # As YAML, which JSON is: a colon in a text is only a colon.
+    extra = [f"{name}={dump_json(value)}" for name, value in texts.items()]
     cfg = load(RunConfig, _config_path(config), [*(overrides or []), *extra])
     use_limits(cfg.reading)
     return cfg
+
+
+def set_aside(out: Path, asked: bool) -> None:
+    """Do what --repair asks for, before the folder is opened."""
+    if asked:
+        from cosfly.repair import repair
+
+        typer.echo(f"{out}: {repair(out)} lines set aside")
 
 
 def _config_path(config: Path | None) -> Path | None:

@@ -31,6 +31,7 @@ def release_build(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Select frames of one run or several, join captions, write parquet, data-set card and checksums."""
     from release import package
@@ -43,6 +44,7 @@ def release_build(
             raise typer.BadParameter("give --data, --captions and --inspect, one of each for a tree, or run folders")
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspected or [], strict=True)]
     cfg = options.resolve(config, overrides, {"workers": workers})
+    options.set_aside(out, repair)
     options.verify_first(verify, *(p for s in sources for p in (s.data, s.captions, s.inspect)), out)
     given = options.manner(cfg, resume)
     options.tell_product(package.run(cfg.release, sources, out, **given), out, cfg)

@@ -27,12 +27,14 @@ def run(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again to continue."""
     from cosfly import pipeline
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
+    options.set_aside(out, repair)
     options.verify_first(
         verify, *sorted(path.parent for depth in ("*", "*/*") for path in out.glob(f"{depth}/manifest.json"))
     )

@@ -58,11 +58,13 @@ def pedestrians(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
     from cosfly.pedestrians import stage
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.set_aside(out, repair)
     options.verify_first(verify, map_, roi, out)
     given = options.manner(cfg, resume) | {"seed": cfg.seed, "roi": roi or cfg.roi}
     options.tell_product(stage.run(cfg.pedestrians, map_, out, **given), out, cfg)
@@ -84,6 +86,7 @@ def plan(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Step 4: a drone flight for every walk, drone_trace.json."""
     if context.invoked_subcommand is not None:
@@ -92,6 +95,7 @@ def plan(
 
     box_map, walks, folder = _needed("--map", map_), _needed("--paths", paths), _needed("--out", out)
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.set_aside(folder, repair)
     options.verify_first(verify, box_map, walks, folder)
     product = stage.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **options.manner(cfg, resume))
     options.tell_product(product, folder, cfg)
@@ -119,6 +123,7 @@ def plan_compare(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from rich.table import Table
@@ -128,6 +133,7 @@ def plan_compare(
     from cosfly.planners import compare
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.set_aside(out, repair)
     settings = cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
     options.verify_first(verify, map_, paths, out)
@@ -154,11 +160,13 @@ def render(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
     from cosfly.render import stage
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.set_aside(out, repair)
     options.verify_first(verify, map_, simplified, traces, out)
     product = stage.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)
@@ -190,11 +198,13 @@ def convert_tree(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """An older playback tree to one that public readers of CosFly-Track take; pictures are linked, not copied."""
     from cosfly.render import older_trees
 
     cfg = options.resolve(config, overrides, {"workers": workers})
+    options.set_aside(out, repair)
     options.verify_first(verify, data, out)
     options.tell_product(older_trees.run(data, out, **options.manner(cfg, resume)), out, cfg)
 
@@ -215,11 +225,13 @@ def inspect(
     workers: options.Workers = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
+    repair: options.Repair = False,
 ) -> None:
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
     from cosfly.inspection import stage
 
     cfg, tree = options.resolve(config, overrides, {"workers": workers}), options.data_folder(data)
+    options.set_aside(out, repair)
     options.verify_first(verify, map_, traces, tree, out)
     product = stage.run(cfg.inspect, map_, traces, tree, out, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)

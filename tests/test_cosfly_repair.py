@@ -1,0 +1,172 @@
+"""Journals that hold what cannot be used: each says which line, and `--repair` sets it aside for whatever command reads it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+from teacher_server import TeacherServer, kept_answers
+from typer.testing import CliRunner
+
+from cosfly.chat.answers import Answer, AnswerBook
+from cosfly.cli import app
+from cosfly.errors import InputError
+from cosfly.journal import Journal
+from cosfly.repair import repair
+from cosfly.stage_folder import StageFolder
+from specimens import make_playback_tree
+
+ANSWER = {"key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t", "usage": {"prompt_tokens": 10, "completion_tokens": 2},
+          "structured": "plain", "finish_reason": "stop", "latency_s": 1.0, "time": 5.0}  # fmt: skip
+# Lines of answers that are whole and cannot be used, as earlier versions kept them; and the field that is named.
+BROKEN_ANSWERS = {
+    "a usage of -10^30": (ANSWER | {"usage": {"prompt_tokens": -(10**30), "completion_tokens": 2}}, "usage.prompt_tokens"),
+    "a usage of 10^400": (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**400}}, "usage.completion_tokens"),
+    "a usage of texts": (ANSWER | {"usage": {"prompt_tokens": "10"}}, "usage.prompt_tokens"),
+    "a usage that is a list": (ANSWER | {"usage": [10, 2]}, "usage"),
+    "no key": ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
+    "a text that is none": (ANSWER | {"text": None}, "text"),
+    "a reason that is none": (ANSWER | {"finish_reason": {"deep": 1}}, "finish_reason"),
+    "a negative time": (ANSWER | {"latency_s": -1.0}, "latency_s"),
+    "totals of -1": ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
+    "totals that are none": ({"totals": 7}, "totals"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN_ANSWERS)
+def test_a_journal_of_answers_says_which_line_cannot_be_used_and_repair_sets_it_aside(tmp_path, name):
+    record, field = BROKEN_ANSWERS[name]
+    folder = tmp_path / "answers"
+    with Journal(folder / "a_ORI.jsonl") as journal:
+        for line in (ANSWER, record, ANSWER | {"key": "l"}):
+            journal.append(line)
+    with pytest.raises(
+        InputError, match=rf"a_ORI.jsonl:2: a line that cannot be used; got {field}: .*--repair"
+    ) as caught:
+        AnswerBook(folder)
+    assert len(str(caught.value)) < 1000
+    assert repair(tmp_path) == 1
+    assert len((folder / "a_ORI.jsonl.aside").read_bytes().splitlines()) == 1
+    with AnswerBook(folder) as book:
+        assert book.totals == {"answers": 2, "prompt_tokens": 20, "completion_tokens": 4}
+        assert book.get("a_ORI", "l") == Answer(**ANSWER | {"key": "l"})
+    assert repair(tmp_path) == 0
+
+
+def test_totals_that_have_counted_a_broken_answer_are_counted_anew(tmp_path):
+    with Journal(tmp_path / "answers/a_ORI.jsonl") as journal:
+        journal.append(ANSWER)
+        journal.append(ANSWER | {"key": "l", "usage": {"prompt_tokens": 10**12, "completion_tokens": 1}})
+        journal.append({"totals": {"answers": 2, "prompt_tokens": 10**12 + 10, "completion_tokens": 3}})
+    with AnswerBook(tmp_path / "answers") as book, pytest.raises(InputError, match=":2: "):
+        book.get("a_ORI", "k")
+    assert repair(tmp_path) == 1
+    assert AnswerBook(tmp_path / "answers").totals == {"answers": 1, "prompt_tokens": 10, "completion_tokens": 2}
+
+
+def test_what_an_older_version_kept_is_read(tmp_path):
+    """Without counts, with 0 for what a server does not count, and without the fields that came later."""
+    old = {name: ANSWER[name] for name in ("key", "sample_id", "purpose", "text")}
+    with Journal(tmp_path / "a_ORI.jsonl") as journal:
+        journal.append(old | {"usage": {}})
+        journal.append(old | {"key": "l", "usage": {"prompt_tokens": 0, "completion_tokens": 0}})
+    with AnswerBook(tmp_path) as book:
+        assert book.get("a_ORI", "k").reply.usage is None
+        assert book.get("a_ORI", "l").reply.usage.total == 0
+
+
+def test_an_answer_stands_in_the_journal_as_it_always_did(tmp_path):
+    async def put() -> None:
+        with AnswerBook(tmp_path) as book:
+            await book.put("a_ORI", Answer(**ANSWER))
+
+    asyncio.run(put())
+    first = (tmp_path / "a_ORI.jsonl").read_bytes().splitlines()[0]
+    assert first.partition(b" ")[2] == json.dumps(ANSWER, separators=(",", ":")).encode()
+
+
+def test_damaged_lines_are_set_aside_too_and_links_are_left_alone(tmp_path):
+    stage = tmp_path / "run/plan"
+    with Journal(stage / "items.jsonl") as journal:
+        journal.append({"id": "a", "status": "kept"})
+        journal.append({"id": "b", "status": "kept"})
+    lines = (stage / "items.jsonl").read_bytes().splitlines(keepends=True)
+    (stage / "items.jsonl").write_bytes(lines[0] + b"garbage\n" + lines[1] + b"0123456789abcdef {torn")
+    elsewhere = tmp_path / "elsewhere.jsonl"
+    elsewhere.write_bytes(b"garbage\n")
+    (tmp_path / "run/render").mkdir()
+    (tmp_path / "run/render/items.jsonl").symlink_to(elsewhere)
+    assert repair(tmp_path / "run") == 2
+    assert (stage / "items.jsonl").read_bytes() == b"".join(lines)
+    assert (stage / "items.jsonl.aside").read_bytes() == b"garbage\n0123456789abcdef {torn\n"
+    assert elsewhere.read_bytes() == b"garbage\n"
+    assert repair(tmp_path / "nowhere") == 0
+
+
+# Lines of items.jsonl that are whole and no record of an item.
+BROKEN_ITEMS = [
+    {},
+    {"id": 7, "status": "kept"},
+    {"id": "a", "status": "done"},
+    {"id": "a"},
+    {"status": "kept"},
+    {"id": "a", "status": "dropped"},
+]
+
+
+@pytest.mark.parametrize("record", BROKEN_ITEMS, ids=range(len(BROKEN_ITEMS)))
+def test_a_journal_of_items_says_which_line_cannot_be_used(tmp_path, record):
+    with Journal(tmp_path / "items.jsonl") as journal:
+        journal.append({"id": "a", "status": "kept"})
+        journal.append(record)
+    with pytest.raises(InputError, match=r"items.jsonl:2: a line that cannot be used; .*--repair"):
+        list(StageFolder(tmp_path, "plan", False).items())
+    assert repair(tmp_path) == 1
+    assert [item.id for item in StageFolder(tmp_path, "plan", False).items()] == ["a"]
+
+
+def test_a_run_with_an_answer_of_an_earlier_version_that_cannot_be_asks_for_that_one_alone(tmp_path):
+    tree, out = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False), tmp_path / "out"
+    with TeacherServer(decision=lambda body: "hover") as server:
+        command = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(out), "--no-check"]
+        command += ["--set", "caption.image.max_side_px=32", "--set", "caption.repair.hard_conflict=keep"]
+        assert CliRunner().invoke(app, command).exit_code == 0
+        whole, asked = (out / "captions.jsonl").read_bytes(), len(server.bodies)
+        [path] = (out / "answers").iterdir()
+        records = kept_answers(out)
+        records[2]["usage"]["prompt_tokens"] = -(10**30)
+        path.unlink()
+        (out / "manifest.json").unlink()
+        (out / "captions.jsonl").unlink()
+        with Journal(path) as journal:
+            for record in records:
+                journal.append(record)
+        result = CliRunner().invoke(app, command)
+        assert isinstance(result.exception, InputError)
+        assert f"{path.name}:3: a line that cannot be used; got usage.prompt_tokens" in str(result.exception)
+        assert len(server.bodies) == asked
+        assert CliRunner().invoke(app, [*command, "--repair"]).exit_code == 0
+        assert len(server.bodies) == asked + 1
+    assert (out / "captions.jsonl").read_bytes() == whole
+
+
+def test_the_same_command_with_repair_goes_on_and_opens_a_finished_stage(tmp_path):
+    tree, out = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False), tmp_path / "out"
+    command = ["caption", "--data", str(tree), "--out", str(out), "--set", "caption.window.stride=3"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    manifest, whole = (out / "manifest.json").read_bytes(), (out / "captions.jsonl").read_bytes()
+    assert CliRunner().invoke(app, [*command, "--repair"]).exit_code == 0
+    assert (out / "manifest.json").read_bytes() == manifest  # nothing to repair
+    with Journal(out / "items.jsonl") as journal:
+        journal.append({"id": "a"})
+    (out / "manifest.json").unlink()
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, InputError), result.output
+    assert "items.jsonl:2: a line that cannot be used" in str(result.exception)
+    (out / "manifest.json").write_bytes(manifest)
+    result = CliRunner().invoke(app, [*command, "--repair"])
+    assert result.exit_code == 0, result.output
+    assert "1 lines set aside" in result.output
+    assert (out / "captions.jsonl").read_bytes() == whole
+    assert (out / "manifest.json").read_bytes() != manifest  # it was opened again
