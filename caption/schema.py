@@ -257,8 +257,8 @@ class CaptionConfig(Config):
             try:
                 check_url(self.teacher)
             except ValueError as error:
-                others = "`rules`, vllm:MODEL_DIR, file:PATH or student:PATH"
-                raise ValueError(f"teacher: {error}; a teacher that is no URL is {others}") from None
+                kinds = "`rules`, a URL, vllm:MODEL_DIR, file:PATH or student:PATH"
+                raise ValueError(f"teacher must be {kinds}; {error}") from None
         return self
 
     @property

@@ -6,6 +6,7 @@ request by a function (number of the request, body) -> name or None; FAULTS list
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -14,8 +15,10 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import BinaryIO
 
 from cosfly.journal import Journal
 from cosfly.products.captions import ACTIONS
@@ -58,6 +61,19 @@ FAULTS = (
 Fault = Callable[[int, dict], str | None]
 
 
+@dataclass(frozen=True)
+class Sent:
+    """An answer to the byte."""
+
+    status: int
+    body: bytes
+    headers: dict[str, str] = field(default_factory=dict)
+
+
+# Writes what it likes to the connection, which is closed then.
+Wild = Callable[[BinaryIO], object]
+
+
 class TeacherServer:
     """Use as a context manager. `bodies` are the raw request bodies in order of arrival."""
 
@@ -68,17 +84,19 @@ class TeacherServer:
         models: tuple[str, ...] = (MODEL,),
         delay_s: float = 0.0,
         decision: Callable[[dict], str] | None = None,
-        respond: Callable[[dict], tuple[int, dict] | None] | None = None,
+        respond: Callable[[dict], tuple[int, dict] | Sent | Wild | None] | None = None,
         model_facts: dict | None = None,
+        list_models: Callable[[], Sent | Wild | None] | None = None,
     ) -> None:
         """
         Args:
             respond: gives status and body of an answer instead of ours; None: ours.
             model_facts: what the list of models says about each, beside its name.
+            list_models: gives what is sent in place of that list; None: the list.
         """
         self.fault, self.models, self.delay_s = fault or (lambda number, body: None), models, delay_s
         self.decision = decision or _decision_by_seed
-        self.respond, self.model_facts = respond, model_facts or {}
+        self.respond, self.model_facts, self.list_models = respond, model_facts or {}, list_models
         self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
         self.bodies: list[bytes] = []
         self.headers: list[dict[str, str]] = []
@@ -191,7 +209,10 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
         )
 
         def do_GET(self) -> None:
-            if self.path == "/v1/models":
+            sent = server.list_models() if server.list_models is not None else None
+            if sent is not None:
+                self._send_anything(sent)
+            elif self.path == "/v1/models":
                 entries = [{"id": name, "object": "model", **server.model_facts} for name in server.models]
                 self._send(200, {"object": "list", "data": entries})
             else:
@@ -215,7 +236,7 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             time.sleep(server.delay_s)
             responded = server.respond(body) if server.respond is not None else None
             if responded is not None:
-                self._send(*responded)
+                self._send_anything(responded)
             elif fault in STATUS_FAULTS:
                 extra = {"Retry-After": "0.05"} if fault == "429" else {}
                 self._send(STATUS_FAULTS[fault], {"error": {"message": f"planted {fault}"}}, extra)
@@ -276,6 +297,16 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
                     time.sleep(0.05)
             except OSError:
                 self.close_connection = True
+
+        def _send_anything(self, sent: tuple[int, dict] | Sent | Wild) -> None:
+            if isinstance(sent, Sent):
+                self._send_bytes(sent.status, sent.body, sent.headers)
+            elif isinstance(sent, tuple):
+                self._send(*sent)
+            else:
+                self.close_connection = True
+                with contextlib.suppress(OSError):
+                    sent(self.wfile)
 
         def _send(self, status: int, value: dict, headers: dict[str, str] | None = None) -> None:
             self._send_bytes(status, json.dumps(value).encode(), headers)

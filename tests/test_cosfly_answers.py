@@ -5,9 +5,11 @@ Each case names the kind of server or model that sends it, as public issue threa
 
 from __future__ import annotations
 
+import base64
 import json
 import time
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +19,7 @@ from cosfly.chat.contract import Reply, Request, Usage
 from cosfly.chat.objects import find_object
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
+from cosfly.frame_views import encode_picture
 from cosfly.products.captions import Coc, normalize_action, parse_answer
 
 GOOD = {
@@ -38,7 +41,13 @@ def changed(**fields: object) -> str:
     return json.dumps(GOOD | fields, ensure_ascii=False)
 
 
-REQUEST = Request([{"role": "user", "content": [{"type": "text", "text": "ab"}]}], ["one", "two"], {}, {})
+def picture(width: int, height: int) -> dict:
+    data = base64.b64encode(encode_picture(np.zeros((height, width, 3), np.uint8), "png", 0)).decode()
+    return {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{data}"}}
+
+
+CONTENT = [{"type": "text", "text": "ab"}, picture(640, 360), picture(8, 8)]
+REQUEST = Request([{"role": "user", "content": CONTENT}], ["one", "two"], {}, {})
 
 
 def completed(body: bytes) -> Reply | str:
@@ -129,7 +138,9 @@ def test_bodies(body, outcome):
         assert outcome[0] in found
 
 
-OURS = Usage(prompt_tokens=1 + 2 * 1000, completion_tokens=-(-len(TEXT) // 3))  # "ab", two pictures, and the answer
+OURS = Usage(
+    prompt_tokens=1 + 294 + 1, completion_tokens=-(-len(TEXT) // 3)
+)  # "ab", pictures of 640 x 360 and 8 x 8, the answer
 # What stands in `usage`; what is counted; which counts are ours.
 USAGES = [
     ({"prompt_tokens": 10, "completion_tokens": 2, "total_tokens": 12}, (10, 2), ()),

@@ -27,7 +27,7 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
-from cosfly.chat.protocol import BYTES_PER_TOKEN
+from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
@@ -37,7 +37,6 @@ from cosfly.store import dump_json
 
 ENCODING_THREADS = 4
 NUM_TRIALS = 2
-PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders: it only bounds the first requests of a limited budget
 
 
 class Teacher(Protocol):

@@ -84,7 +84,8 @@ class Answer(BaseModel):
     @property
     def reply(self) -> Reply:
         usage = Usage(**self.usage) if self.usage else None
-        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, self.served_by, True)
+        who = self.served_by or self.model
+        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, who, is_kept=True)
 
 
 class Totals(BaseModel):

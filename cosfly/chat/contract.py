@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict
@@ -66,8 +66,8 @@ class Reply:
     structured: str
     finish_reason: str | None = None
     counted: tuple[CountName, ...] = ()
-    model: str | None = None
-    is_kept: bool = False
+    model: str | None = field(default=None, compare=False)
+    is_kept: bool = field(default=False, compare=False)
 
 
 class NoAnswer(Exception):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 from collections.abc import Callable
 from typing import Any, get_args
@@ -21,8 +23,8 @@ ENDED = (
     "abort",
 )  # finish reasons of an answer that a server gave up, SGLang with status 200 and nothing in it
 MOST_NAME = 256  # characters of a name that is kept: of a model, of why an answer ended
-BYTES_PER_TOKEN = 3  # a low guess, as the next is a high one: a budget that counts with them is kept
-TOKENS_PER_PICTURE = 1000  # a megapixel at 28 x 28 px a token takes 1337, one of 640 x 360 px 293
+BYTES_PER_TOKEN = 3  # a low guess: a budget that counts with it is kept
+PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
 
 
 def check_url(url: str) -> None:
@@ -156,7 +158,7 @@ def read_completion(response: Response, request: Request, structured: str) -> Re
         return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
     if text is None:
         return "no text in the message"
-    usage, counted = _usage(value.get("usage"), own_count(request, message))
+    usage, counted = _usage(value.get("usage"), request, message)
     return Reply(text, usage, structured, _name(finish_reason), counted, _name(value.get("model")))
 
 
@@ -203,20 +205,18 @@ def _objects(value: Any) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _usage(value: Any, own: Usage) -> tuple[Usage | None, tuple[CountName, ...]]:
-    """Read the counts of tokens.
-
-    Args:
-        own: what we count.
-    Returns:
-        None where the server counts nothing; the names of the counts that are ours, since the server's cannot be.
-    """
+def _usage(value: Any, request: Request, message: dict[str, Any]) -> tuple[Usage | None, tuple[CountName, ...]]:
+    """Read the counts of tokens; gives None where the server counts nothing, and the names of those that are ours since its cannot be."""
     found = value if isinstance(value, dict) else {}
     names = get_args(CountName)
     if all(found.get(name) is None for name in names):
         return None, ()
-    ours = own.model_dump()
-    wrong = tuple(name for name in names if not _is_count(found.get(name), least=min(1, ours[name])))
+    said = [text for text in (final_text(message), *map(message.get, THOUGHT_FIELDS)) if isinstance(text, str)]
+    least: dict[CountName, int] = {"prompt_tokens": 1, "completion_tokens": min(1, _tokens(said))}
+    wrong = tuple(name for name in names if not _is_count(found.get(name), least[name]))
+    if not wrong:
+        return Usage(**{name: found[name] for name in names}), ()
+    ours = {"prompt_tokens": _prompt_tokens(request), "completion_tokens": _tokens(said)}
     return Usage(**{name: ours[name] if name in wrong else found[name] for name in names}), wrong
 
 
@@ -225,16 +225,23 @@ def _is_count(value: Any, least: int) -> bool:
     return type(value) is int and least <= value <= MOST_TOKENS
 
 
-def own_count(request: Request, message: dict[str, Any]) -> Usage:
-    """Count the tokens of a request and of the message that answers it, rather too high than too low."""
-    contents = [asked["content"] for asked in request.messages]
-    parts = [part for content in contents for part in ([{"text": content}] if isinstance(content, str) else content)]
-    prompt = _tokens(*(part.get("text", "") for part in parts)) + TOKENS_PER_PICTURE * len(request.digests)
-    said = (final_text(message), *(message.get(name) for name in THOUGHT_FIELDS))
-    return Usage(prompt_tokens=max(1, prompt), completion_tokens=_tokens(*(s for s in said if isinstance(s, str))))
+def _prompt_tokens(request: Request) -> int:
+    """Count the tokens of a request."""
+    parts: list[dict[str, Any]] = []
+    for content in (asked["content"] for asked in request.messages):
+        parts += [{"text": content}] if isinstance(content, str) else content
+    pixels = [_num_pixels(part["image_url"]["url"]) for part in parts if "image_url" in part]
+    return max(1, _tokens([part.get("text", "") for part in parts])) + sum(-(-n // PIXELS_PER_TOKEN) for n in pixels)
 
 
-def _tokens(*texts: str) -> int:
+def _num_pixels(data_url: str) -> int:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(base64.b64decode(data_url.partition(",")[2]))) as image:
+        return image.width * image.height
+
+
+def _tokens(texts: list[str]) -> int:
     return -(-sum(len(text.encode()) for text in texts) // BYTES_PER_TOKEN)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
+import ssl
 import time
 import zlib
 from collections.abc import Iterator
@@ -47,13 +49,12 @@ class Connections:
             key: sent with each request; "": none.
             timeout_s: of one exchange. most_bytes: of one answer, unpacked.
         Raises:
-            TeacherError: the key or the environment's proxy cannot be used.
+            TeacherError: the key, or the environment's proxy or certificates, cannot be used.
         """
         if not (key.isascii() and key.isprintable()):  # an error of httpx would quote it
             raise TeacherError("the key holds what no header can, perhaps the end of a line", where=KEY_VARIABLE)
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s, self._most_bytes = timeout_s, most_bytes
-        self._tls = httpx.create_ssl_context()
         self._free = [self._connect()]
 
     async def close(self) -> None:
@@ -94,10 +95,20 @@ class Connections:
     def _connect(self) -> httpx.AsyncClient:
         limits = httpx.Limits(max_connections=1, max_keepalive_connections=1)
         try:
-            return httpx.AsyncClient(headers=self._headers, timeout=self._timeout_s, limits=limits, verify=self._tls)
+            return httpx.AsyncClient(headers=self._headers, timeout=self._timeout_s, limits=limits, verify=_tls())
         except (httpx.InvalidURL, ValueError, ImportError) as error:
             where = "HTTP_PROXY, HTTPS_PROXY, ALL_PROXY"
             raise TeacherError("the proxy cannot be used", where=where, got=type(error).__name__) from None
+
+
+@functools.cache
+def _tls() -> ssl.SSLContext:
+    """Read the certificates, once: it takes longer than a request."""
+    try:
+        return httpx.create_ssl_context()
+    except OSError as error:
+        where = "SSL_CERT_FILE, SSL_CERT_DIR"
+        raise TeacherError("the certificates cannot be read", where=where, got=str(error)) from None
 
 
 class _Body:

@@ -1,0 +1,486 @@
+"""How servers misbehave, and what becomes of a whole run: the table. The next one that is met is a line in it.
+
+What stands before a colon is whose behaviour it is; where a public thread shows it, the thread is named beside. The others are what
+nobody sends by mistake. Each run asks about one window, in two languages, with two tries; then the server is mended, and the same
+command is run again.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import time
+import tracemalloc
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+from teacher_server import MODEL, Sent, TeacherServer, Wild, is_mirror, kept_answers, obedient_answer
+
+from caption.run.stage import run
+from caption.schema import CaptionConfig
+from cosfly.chat.client import KEY_VARIABLE
+from cosfly.chat.wire import retry_after_s
+from cosfly.errors import NothingKept, TeacherError
+from specimens import make_playback_tree
+
+TRIES = 2
+# Slow servers are slow for ever: the limit is what a good answer never takes here, however busy the machine is.
+ENDPOINT = {
+    "max_tries": TRIES,
+    "backoff_s": 0.01,
+    "max_backoff_s": 0.02,
+    "timeout_s": 20.0,
+    "concurrency": 1,
+    "max_reply_mb": 0.5,
+}
+
+
+def settings(url: str, **changes) -> CaptionConfig:
+    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
+    base = {
+        "teacher": url,
+        "endpoint": endpoint,
+        "repair": {"hard_conflict": "keep"},
+        "image": {"max_side_px": 32},
+        "limit": 1,
+    }
+    return CaptionConfig.model_validate(base | changes)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
+
+
+@pytest.fixture(scope="module")
+def whole(tree, tmp_path_factory) -> bytes:
+    with good_server() as server:
+        return run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out").read_bytes()
+
+
+def good_server(**options) -> TeacherServer:
+    return TeacherServer(decision=lambda body: "hover", **options)
+
+
+# --- what servers send ------------------------------------------------------------------------------------------------
+
+
+def answer(body: dict, **changes) -> dict:
+    """Give the completion that a good server sends, changed at the top."""
+    with_text = json.dumps(obedient_answer(_OBEDIENT, body), ensure_ascii=False)
+    choice = {"index": 0, "message": {"role": "assistant", "content": with_text}, "finish_reason": "stop"}
+    usage = {"prompt_tokens": 1000, "completion_tokens": 100}
+    return {
+        "id": "x",
+        "object": "chat.completion",
+        "model": body["model"],
+        "choices": [choice],
+        "usage": usage,
+    } | changes
+
+
+_OBEDIENT = good_server()
+
+
+def message(**fields) -> Callable[[dict], Sent]:
+    """Send a good completion whose message has these fields."""
+
+    def sent(body: dict) -> Sent:
+        value = answer(body)
+        value["choices"][0]["message"] |= fields
+        return as_json(value)
+
+    return sent
+
+
+def choice(**fields) -> Callable[[dict], Sent]:
+    def sent(body: dict) -> Sent:
+        value = answer(body)
+        value["choices"][0] |= fields
+        return as_json(value)
+
+    return sent
+
+
+def top(**fields) -> Callable[[dict], Sent]:
+    return lambda body: as_json(answer(body, **fields))
+
+
+def as_json(value: object) -> Sent:
+    return Sent(200, json.dumps(value).encode())
+
+
+def page(status: int, text: str, **headers: str) -> Callable[[dict], Sent]:
+    sent = Sent(status, text.encode(), {name.replace("_", "-"): value for name, value in headers.items()})
+    return lambda body: sent
+
+
+def error(status: int, text: str, **headers: str) -> Callable[[dict], Sent]:
+    return page(status, json.dumps({"error": {"message": text, "type": "server_error", "code": status}}), **headers)
+
+
+def around(before: bytes, after: bytes = b"") -> Callable[[dict], Sent]:
+    return lambda body: Sent(200, before + json.dumps(answer(body)).encode() + after)
+
+
+def replaced(old: bytes, new: bytes) -> Callable[[dict], Sent]:
+    return lambda body: Sent(200, json.dumps(answer(body)).encode().replace(old, new, 1))
+
+
+def packed(pack: Callable[[bytes], bytes], encoding: str) -> Callable[[dict], Sent]:
+    return lambda body: Sent(200, pack(json.dumps(answer(body)).encode()), {"Content-Encoding": encoding})
+
+
+def raw(*pieces: bytes, pause_s: float = 0.0, is_endless: bool = False) -> Callable[[dict], Wild]:
+    """Write these bytes to the connection and close it; endless: until the client goes away."""
+
+    def write(wire: BinaryIO) -> None:
+        for piece in pieces[:1] if is_endless else pieces:
+            wire.write(piece)
+            time.sleep(pause_s)
+        end_s = time.monotonic() + 30
+        while is_endless and time.monotonic() < end_s:
+            wire.write(pieces[-1])
+            wire.flush()
+            time.sleep(pause_s)
+
+    return lambda body: write
+
+
+BOMB = gzip.compress(bytes(20_000_000))
+HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
+CLOUDFLARE = "<!DOCTYPE html><html><head><title>h | {0}: error</title></head><body>The grammar of this schema was flagged</body></html>"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What becomes of a run. words: stand in its error, or of a run that succeeds in its log; num_asked: requests that it took."""
+
+    words: str = ""
+    num_asked: int | None = 2
+
+
+def fine(words: str = "") -> Outcome:
+    """The run finishes, all windows kept."""
+    return Outcome(words)
+
+
+@dataclass(frozen=True)
+class Silent(Outcome):
+    """The window has no answer, for this cause, and the run ends; it is asked again when the server is mended."""
+
+    cause: str = ""
+
+
+def silent(cause: str, words: str = "", num_asked: int | None = TRIES) -> Silent:
+    return Silent(words, num_asked, cause)
+
+
+@dataclass(frozen=True)
+class Ended(Outcome):
+    """The run ends with this error; nothing is put on record against the window."""
+
+
+@dataclass(frozen=True)
+class Dropped(Outcome):
+    """The window is dropped for good: the answer was one, and is not paid for twice."""
+
+    reason: str = ""
+
+
+def dropped(reason: str, num_asked: int = 3) -> Dropped:
+    return Dropped("", num_asked, reason)
+
+
+IMPATIENT = {"timeout_s": 0.3}
+FAULTS: dict[str, tuple] = {
+    # --- statuses
+    "Cloudflare: 524 after 120 s, QuantumNous/new-api 4972": (page(524, CLOUDFLARE.format(524)), silent("http_524")),
+    "Cloudflare: 520, anthropics/claude-code 3197": (page(520, CLOUDFLARE.format(520)), silent("http_520")),
+    "Cloudflare: 522, Helicone 798": (page(522, CLOUDFLARE.format(522)), silent("http_522")),
+    "nginx: 502, a page": (page(502, "<html><head><title>502 Bad Gateway</title></head></html>"), silent("http_502")),
+    "nginx: 504, a page": (page(504, "<html><head><title>504 Gateway Time-out</title></head></html>"), silent("http_504")),
+    "nginx: 413, a page": (page(413, "<html>413 Request Entity Too Large</html>"), Ended("refuses trial prompts", 3)),
+    "TGI: 424, text-generation-inference 3050": (error(424, "Incomplete generation"), silent("http_424", "Incomplete generation")),
+    "TGI: 429, text-generation-inference 439": (error(429, "Model is overloaded"), silent("http_429", "Model is overloaded")),
+    "Gemini: 503, gemini-cli 5191": (error(503, "The model is overloaded. Please try again later."), silent("http_503")),
+    "vLLM: 500, its engine is dead, vllm 20170": (error(500, "EngineCore encountered an issue."), silent("http_500", "EngineCore")),
+    "vLLM: 500, a grammar took the engine down, vllm 47312": (
+        error(500, "InternalServerError: EngineDeadError after grammar compilation thread ended"), silent("http_500")),
+    "vLLM: 500, a library of grammars is missing, vllm 16030": (
+        error(500, "xgrammar.so: cannot open shared object file: outlines is not installed either"), silent("http_500")),
+    "Ollama: 500, ollama 11710": (error(500, "llama runner process has terminated: error:fault"), silent("http_500")),
+    "llama.cpp: 500, bad UTF-8 of its own, llama.cpp 26325": (
+        error(500, "[json.exception.parse_error.101] invalid string: ill-formed UTF-8 byte"), silent("http_500")),
+    "a gateway: 307 elsewhere, letta 3189": (page(307, "", Location="http://127.0.0.1:1/v1/chat/completions"), Ended("not a chat endpoint", 1)),
+    "nobody: 302 to a file": (page(302, "", Location="file:///etc/passwd"), Ended("not a chat endpoint", 1)),
+    "nobody: 204": (raw(b"HTTP/1.1 204 No Content\r\n\r\n"), Ended("refuses trial prompts", 3)),
+    "nobody: status 999": (raw(b"HTTP/1.1 999 Odd\r\nContent-Length: 0\r\n\r\n"), silent("http_999")),
+    "nobody: a refusal without end": (raw(b"HTTP/1.1 500 No\r\n\r\n", b"no " * 99_999, is_endless=True), silent("http_500", "no no no")),
+    # --- how long to wait
+    "nobody: Retry-After 1e18": (error(429, "busy", Retry_After="1e18"), silent("total_timeout", "asks to wait 1000000000000000000 s", 1)),
+    "nobody: Retry-After in 9999": (
+        error(503, "busy", Retry_After="Fri, 31 Dec 9999 23:59:59 GMT"), silent("total_timeout", "asks to wait", 1)),
+    "clock skew: Retry-After in 2015, openai-java 878": (
+        error(429, "busy", Retry_After="Wed, 21 Oct 2015 07:28:00 GMT"), silent("http_429")),
+    "nobody: Retry-After -1, pydantic-ai 7065": (error(429, "busy", Retry_After="-1"), silent("http_429")),
+    "nobody: Retry-After NaN": (error(429, "busy", Retry_After="NaN"), silent("http_429")),
+    "nobody: Retry-After inf": (error(429, "busy", Retry_After="inf"), silent("http_429")),
+    "nobody: Retry-After soon": (error(429, "busy", Retry_After="soon"), silent("http_429")),
+    "nobody: Retry-After of 9,999 digits": (error(429, "busy", Retry_After="9" * 9999), silent("http_429")),
+    # --- bodies
+    "LM Studio: 200 for a wrong path, lmstudio-bug-tracker 618": (
+        page(200, '{"error":"Unexpected endpoint or method. (POST /chat/completions)"}'), silent("bad_reply", "Unexpected endpoint")),
+    "OpenRouter: 429 in a 200, vercel/ai 2698": (page(200, '{"error":{"message":"Resource has been exhausted","code":429}}'), silent("bad_reply")),
+    "OpenRouter: blanks while one waits, CLIProxyAPI 2690": (around(b"\n         \n\n    \n", b"\n\n"), fine()),
+    "OpenRouter: blanks and a dot, litellm 31413": (page(200, "\n      \n   ."), silent("bad_reply", "not JSON")),
+    "OpenRouter: a comment before it, CLIProxyAPI 417": (around(b": OPENROUTER PROCESSING\n\n"), silent("bad_reply", "not JSON")),
+    "a proxy: events though none were asked for": (around(b"data: ", b"\n\ndata: [DONE]\n"), silent("bad_reply", "not JSON")),
+    "NextChat: its own page, NextChat 3814": (page(200, "<!DOCTYPE html><html></html>"), silent("bad_reply", "not JSON")),
+    "LiteLLM: no choices, litellm 40477": (top(choices=[]), silent("bad_reply", "no choices")),
+    "nobody: choices of null": (top(choices=None), silent("bad_reply", "no choices")),
+    "nobody: choices of texts": (top(choices=["a"]), silent("bad_reply", "no choices")),
+    "nobody: choices that are an object": (top(choices={"0": 1}), silent("bad_reply", "no choices")),
+    "Ollama: nothing and no reason, ollama 13371": (
+        lambda body: as_json(answer(body, choices=[{"message": {"content": None}, "finish_reason": "stop"}],
+                                    usage={"prompt_tokens": 0, "completion_tokens": 0})), silent("bad_reply", "no text")),
+    "SGLang: aborted with 200, sglang 2956": (choice(finish_reason="abort", message={"content": ""}), silent("bad_reply", "abort")),
+    "vLLM: all in its thoughts, vllm 17349": (message(content=None, reasoning_content="{}"), dropped("structure_empty")),
+    "SGLang: finish_reason is empty, sglang 3912": (choice(finish_reason=""), fine()),
+    "SGLang: finish_reason is null, sglang 4550": (choice(finish_reason=None), fine()),
+    "nobody: finish_reason is an object": (choice(finish_reason={"deep": [1]}), fine()),
+    "NVIDIA: a key twice, openhuman 4204": (replaced(b'"role"', b'"reasoning_content": null, "reasoning_content": "a", "role"'), fine()),
+    "nobody: choices twice": (replaced(b'"choices"', b'"choices": [], "choices"'), fine()),
+    "LM Studio: another model answers, hermes-agent 64742": (top(model="ab-qwen3-32b"), fine("says that ab-qwen3-32b answered")),
+    "nobody: a model's name of 100,000 characters": (top(model="m" * 100_000), fine()),
+    "nobody: a model's name that a terminal obeys": (top(model="\x1b[2J"), fine()),
+    "nobody: an id of 100,000 characters": (top(id="x" * 100_000), fine()),
+    "nobody: created has 400 digits": (replaced(b'"id"', b'"created": ' + b"9" * 400 + b', "id"'), fine()),
+    "nobody: created has 5,000 digits": (replaced(b'"id"', b'"created": ' + b"9" * 5000 + b', "id"'), silent("bad_reply", "not JSON")),
+    "vLLM: NaN, vllm 19661": (replaced(b'"id"', b'"logprobs": NaN, "id"'), silent("bad_reply", "not JSON")),
+    "nobody: nested 100,000 deep": (replaced(b'"id"', b'"a": ' + b"[" * 100_000 + b"]" * 100_000 + b', "id"'), silent("bad_reply", "not JSON")),
+    "a server on Windows: a byte order mark": (around(b"\xef\xbb\xbf"), fine()),
+    "nobody: no UTF-8": (replaced(b"pedestrian", b"ped\xff\xfetrian"), silent("bad_reply", "not JSON")),
+    "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000), dropped("structure_too_long")),
+    "nobody: 400,000 characters": (message(content="a" * 400_000), dropped("structure_too_long")),
+    # --- counts of tokens
+    "OpenAI: -35 tokens, async-openai 404": (top(usage={"prompt_tokens": 1151, "completion_tokens": -35}), fine("completion_tokens cannot be")),
+    "nobody: -10^30 tokens": (top(usage={"prompt_tokens": -(10**30), "completion_tokens": 10**400}), fine("prompt_tokens and completion_tokens cannot be")),
+    "CLIProxyAPI: 0 tokens of an answer, CLIProxyAPI 5733": (top(usage={"prompt_tokens": 21, "completion_tokens": 0}), fine("completion_tokens cannot be")),
+    "nobody: tokens in words": (top(usage={"prompt_tokens": "many", "completion_tokens": [2]}), fine("cannot be")),
+    "nobody: a usage that is a list": (top(usage=[1000, 100]), fine()),
+    # --- the wire
+    "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply", "longer than endpoint.max_reply_mb=0.5")),
+    "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("bad_reply", "max_reply_mb=0.5")),
+    "nobody: a bomb in a bomb": (
+        lambda body: Sent(200, gzip.compress(BOMB), {"Content-Encoding": "gzip, gzip"}), silent("connection", "not asked for")),
+    "nobody: a stream without end": (raw(CHUNKED, b"1000\r\n" + b" " * 4096 + b"\r\n", is_endless=True), silent("bad_reply", "max_reply_mb")),
+    "a proxy: gzip": (packed(gzip.compress, "gzip"), fine()),
+    "a proxy: x-gzip, nab 591": (packed(gzip.compress, "x-gzip"), fine()),
+    "a proxy: gzip that is none, got 1964": (packed(bytes, "gzip"), silent("connection", "incorrect header check")),
+    "a proxy: gzip that ends early": (packed(lambda data: gzip.compress(data)[:-9], "gzip"), silent("connection", "not complete")),
+    "a proxy: Brotli": (packed(zlib.compress, "br"), silent("connection", "not asked for")),
+    "Langchain-Chatchat: chunks that end early, its 4383": (raw(CHUNKED, b"5\r\n{\"a\":\r\n"), silent("connection", "incomplete chunked read")),
+    "nobody: chunks that are none": (raw(CHUNKED, b"zz\r\nhello\r\n0\r\n\r\n"), silent("connection")),
+    "nobody: a body longer than it says": (raw(HEAD + b"Content-Length: 5\r\n\r\n", b'{"choices": []}'), silent("bad_reply", "not JSON")),
+    "nobody: a body shorter than it says": (raw(HEAD + b"Content-Length: 500\r\n\r\n", b"{}"), silent("connection")),
+    "nobody: a length of -1": (raw(HEAD + b"Content-Length: -1\r\n\r\n", b"{}"), silent("connection")),
+    "nobody: two lengths": (raw(HEAD + b"Content-Length: 2\r\nContent-Length: 9\r\n\r\n", b"{}"), silent("connection")),
+    "nobody: a header of 1 MB": (raw(HEAD + b"X: " + b"x" * 1_000_000 + b"\r\n\r\n"), silent("connection")),
+    "nobody: a header with NUL": (raw(HEAD + b"X: a\0b\r\nContent-Length: 2\r\n\r\n{}"), silent("connection")),
+    "llama.cpp: nothing at all, llama.cpp 11738": (raw(b""), silent("connection")),
+    "nobody: no HTTP": (raw(b"SSH-2.0-OpenSSH_9.2\r\n"), silent("connection")),
+    "nobody: headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True), silent("timeout", "0.3 s"), IMPATIENT),
+    "nobody: 100 Continue without end": (raw(b"HTTP/1.1 100 Continue\r\n\r\n", b"HTTP/1.1 100 Continue\r\n\r\n", pause_s=0.01, is_endless=True), silent("timeout"), IMPATIENT),
+    "nobody: a byte now and then": (raw(HEAD + b"Content-Length: 9999\r\n\r\n", b" ", pause_s=0.02, is_endless=True), silent("timeout", "0.3 s"), IMPATIENT),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, caplog, whole, name):
+    respond, outcome, *patience = FAULTS[name]
+    out = tmp_path / "out"
+    with good_server(respond=respond) as server:
+        if type(outcome) is Outcome:
+            assert run(settings(server.url), tree, out).exists()
+            assert outcome.words in caplog.text
+            assert without_tokens(out / "captions.jsonl") == [
+                line | {"usage": 0} for line in map(json.loads, whole.splitlines())
+            ]
+        else:
+            error_kind = NothingKept if isinstance(outcome, Dropped) else TeacherError
+            with pytest.raises(error_kind) as caught:
+                run(settings(server.url, endpoint=patience[0] if patience else {}), tree, out)
+            assert outcome.words in str(caught.value)
+            assert "\n" not in str(caught.value)
+            assert str(caught.value).isprintable()
+            assert len(str(caught.value)) < 2000
+        assert len(server.bodies) == outcome.num_asked
+        assert windows_of(out) == expected_windows(outcome)
+        server.respond = None  # it is mended
+        asked = len(server.bodies)
+        if isinstance(outcome, Dropped):
+            with pytest.raises(NothingKept):
+                run(settings(server.url), tree, out)
+            assert len(server.bodies) == asked
+        else:
+            path = run(settings(server.url), tree, out)
+            assert without_tokens(path) == [line | {"usage": 0} for line in map(json.loads, whole.splitlines())]
+            assert len(server.bodies) == asked + (0 if type(outcome) is Outcome else 2)
+
+
+def without_tokens(path: Path) -> list[dict]:
+    return [json.loads(line) | {"usage": 0} for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def windows_of(out: Path) -> Counter[str]:
+    """Count the windows of a run: kept, dropped by reason, and without an answer by cause."""
+    held = [json.loads(line)["code"] for line in (out / "quarantine.jsonl").read_text(encoding="utf-8").splitlines()]
+    if not (out / "caption_report.json").exists():
+        return Counter(held)
+    tally = json.loads((out / "caption_report.json").read_text(encoding="utf-8"))["windows"]
+    return Counter({"kept": tally["kept"]} if tally["kept"] else {}) + Counter(tally["dropped"]) + Counter(held)
+
+
+def expected_windows(outcome: Outcome) -> Counter[str]:
+    if isinstance(outcome, Ended):
+        return Counter()
+    if isinstance(outcome, Silent):
+        return Counter([outcome.cause])
+    return Counter([outcome.reason if isinstance(outcome, Dropped) else "kept"])
+
+
+# --- the list of models -----------------------------------------------------------------------------------------------
+
+# What is sent in place of the list of models, and what the run says; or that it goes on.
+LISTS: dict[str, tuple] = {
+    "LM Studio: 200 and an error, lmstudio-bug-tracker 2085": (page(200, '{"error":"Unexpected endpoint or method. (GET /v1/models)"}'), "no list of models here"),
+    "a page": (page(200, "<html></html>"), "no list of models here"),
+    "a gateway: 307": (page(307, "", Location="http://127.0.0.1:1/v1/models"), "no list of models here"),
+    "an error": (page(500, "broken"), "HTTP 500 broken"),
+    "401 that quotes the key": (page(401, "bad key sk-very-secret"), "refuses the key; got HTTP 401 bad key ***"),
+    "names of wrong types": (page(200, json.dumps({"data": [{"id": 7}, {"id": "a\x1b[2J"}, "b", {"id": "x" * 999}, {"id": MODEL}]})), None),
+    "ten thousand models": (page(200, json.dumps({"data": [{"id": f"m{i}"} for i in range(10_000)]})), "has several models; got 10000 models"),
+    "nested deeply": (page(200, "[" * 100_000), "no list of models here"),
+    "a body of 20 MB": (page(200, " " * 20_000_000), "no list of models here"),
+    "a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), "no list of models here"),
+    "no UTF-8": (lambda body: Sent(200, b'{"data": [{"id": "\xff"}]}'), "no list of models here"),
+    "no HTTP": (raw(b"220 mail.example ESMTP\r\n"), "cannot reach the teacher"),
+    "headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True), "cannot reach the teacher; got no answer within 0.3 s"),
+    "a byte now and then": (raw(HEAD + b"Content-Length: 9999\r\n\r\n", b" ", pause_s=0.02, is_endless=True), "got no answer within 0.3 s"),
+    "silence": (raw(b"", pause_s=1.0), "got no answer within 0.3 s"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LISTS)
+def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, monkeypatch, whole, name):
+    monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
+    respond, words = LISTS[name]
+    out = tmp_path / "out"
+    with good_server(list_models=lambda: respond({})) as server:
+        if words is not None:
+            impatient = {"timeout_s": 0.3} if "0.3 s" in words else {}
+            with pytest.raises(TeacherError) as caught:
+                run(settings(server.url, endpoint=impatient), tree, out)
+            assert words in str(caught.value)
+            assert str(caught.value).isprintable()
+            assert len(str(caught.value)) < 2000
+            assert "very-secret" not in str(caught.value)
+            assert not server.bodies
+            server.list_models = None  # it is mended
+        assert run(settings(server.url), tree, out).read_bytes() == whole
+    assert len(server.bodies) == 2
+
+
+# --- what is behind the table -----------------------------------------------------------------------------------------
+
+
+def test_of_a_bomb_no_more_is_unpacked_than_the_limit(tree, tmp_path):
+    bomb = gzip.compress(bytes(200_000_000))
+    with good_server(respond=lambda body: Sent(200, bomb, {"Content-Encoding": "gzip"})) as server:
+        tracemalloc.start()
+        with pytest.raises(TeacherError, match="max_reply_mb"):
+            run(settings(server.url), tree, tmp_path / "out")
+        peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+    assert peak_mb < 60  # 200 unpacked
+
+
+def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):
+    monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
+    with good_server() as elsewhere:
+        for status in (301, 302, 303, 307, 308):
+            sent = Sent(status, b"", {"Location": f"{elsewhere.url}/chat/completions"})
+            with good_server(respond=lambda body, sent=sent: sent) as server, pytest.raises(TeacherError):
+                run(settings(server.url), tree, tmp_path / str(status))
+            assert len(server.bodies) == 1
+        assert not elsewhere.bodies
+
+
+def test_a_key_that_no_header_can_hold_is_not_shown(tree, tmp_path, monkeypatch):
+    for key in ("sk-very-secret\n", "sk-very-sécret", "sk-very-\x1bsecret"):
+        monkeypatch.setenv(KEY_VARIABLE, key)
+        with good_server() as server, pytest.raises(TeacherError, match="the key holds what no header can") as caught:
+            run(settings(server.url), tree, tmp_path / "out")
+        assert "very" not in str(caught.value)
+
+
+@pytest.mark.parametrize("proxy", ["htp://u:hunter2@x", "http://[::1", "socks5://u:hunter2@x:1"])
+def test_a_proxy_that_cannot_be_used_is_one_line(tree, tmp_path, monkeypatch, proxy):
+    monkeypatch.setenv("HTTP_PROXY", proxy)
+    with (
+        good_server() as server,
+        pytest.raises(TeacherError, match=r"PROXY: the proxy cannot be used|cannot reach") as caught,
+    ):
+        run(settings(server.url), tree, tmp_path / "out")
+    assert "hunter2" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "usage",
+    [
+        {"prompt_tokens": -5000, "completion_tokens": -500},
+        {"prompt_tokens": 0, "completion_tokens": 0},
+        {"prompt_tokens": -(10**30)},
+    ],
+    ids=["negative", "zero", "huge"],
+)
+def test_a_budget_holds_where_the_servers_count_cannot_be(tmp_path, usage):
+    """By our own count, which the journal marks; and running it again does not spend the budget twice."""
+    most, tree = 15_000, make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+    with good_server(respond=top(usage=usage)) as server:
+        cfg = settings(server.url, limit=None, budget={"max_tokens": most})
+        for _ in range(2):
+            with pytest.raises(TeacherError, match="stopped before the budget was passed"):
+                run(cfg, tree, tmp_path / "out")
+        kept = kept_answers(tmp_path / "out")
+        assert (
+            0 < sum(record["usage"]["prompt_tokens"] + record["usage"]["completion_tokens"] for record in kept) <= most
+        )
+        assert {tuple(record["counted"]) for record in kept} == {("prompt_tokens", "completion_tokens")}
+        assert len(server.bodies) == len(kept)
+        run(settings(server.url, limit=None), tree, tmp_path / "out")  # without a limit it goes on
+
+
+def test_our_count_is_of_texts_and_pictures(tree, tmp_path):
+    with good_server(respond=top(usage={"prompt_tokens": 0, "completion_tokens": 0})) as server:
+        run(settings(server.url), tree, tmp_path / "out")
+    [english, chinese] = [record["usage"]["prompt_tokens"] for record in kept_answers(tmp_path / "out")]
+    assert 2000 < english < 6000  # 10 KB of text, and 15 pictures of a token each
+    assert 500 < chinese < english
+    assert [is_mirror(json.loads(body)) for body in server.bodies] == [False, True]
+
+
+@pytest.mark.parametrize(("header", "expected"), [
+    ("", None), ("7", 7.0), ("0.5", 0.5), (" 3 ", 3.0), ("-1", None), ("nan", None), ("inf", None), ("1e18", 1e18), ("soon", None),
+    ("Thu, 01 Jan 1970 00:02:00 GMT", 20.0), ("Thu, 01 Jan 1970 00:00:00 GMT", 0.0), ("Thu, 99 Jan 1970 00:00:00 GMT", None),
+    ("Fri, 31 Dec 9999 23:59:59 -2359", 253402387039.0), ("9" * 400, None), ("Thu, 01 Jan " + "9" * 40 + " 00:00:00 GMT", None), ("\x00", None),
+])  # fmt: skip
+def test_retry_after_is_seconds_or_a_date_or_nothing(header, expected):
+    assert retry_after_s(header, now_s=100.0) == expected
