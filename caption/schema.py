@@ -174,6 +174,9 @@ class JudgeConfig(Config):
     concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
     timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    max_reply_mb: MayDiffer[float] = Field(
+        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
+    )
     json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 

@@ -131,6 +131,19 @@ def test_a_sound_endpoint_passes_every_check():
     assert "15" in findings["images per prompt"].detail
 
 
+def test_the_doctor_samples_as_a_run_does():
+    endpoint = {"temperature": 0.7, "top_p": 0.9, "max_tokens": 300, "extra_body": {"min_p": 0.1}}
+    with TeacherServer(respond=patient(), model_facts={"max_model_len": CONTEXT}) as server:
+        examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": endpoint}))
+    for body in map(json.loads, server.bodies):
+        assert {name: body[name] for name in ("temperature", "top_p", "min_p")} == {
+            "temperature": 0.7,
+            "top_p": 0.9,
+            "min_p": 0.1,
+        }
+        assert type(body["seed"]) is int
+
+
 # defect, the finding it must show in, its state, words of the detail
 DEFECTS = [
     ({"obeys_schema": False}, "JSON schema", "warning", "accepted and ignored"),

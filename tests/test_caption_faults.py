@@ -231,6 +231,26 @@ def test_seven_windows_that_are_too_long_cost_seven(tree, tmp_path, caplog, whol
     )
 
 
+def test_refusals_between_which_windows_are_answered_cost_one_trial_prompt(tree, tmp_path, whole):
+    """Those after an answer: which of them are refused in a row shows in the order in which the run asks."""
+    order: list[int] = []
+    refused = Picky(400, TOO_LONG, [])
+
+    def respond(body):
+        if not is_mirror(body) and body["seed"] in whole.seeds and body["seed"] not in order:
+            order.append(body["seed"])
+            refused.seeds += order[-1:] if len(order) % 3 == 0 else []  # every third
+        return refused(body)
+
+    with hovering(respond) as server:
+        run(settings(server.url, endpoint={"concurrency": 1}), tree, tmp_path / "out")
+    assert report_of(tmp_path / "out")["windows"]["dropped"] == {"refused_too_long": 3}
+    trials = [
+        body for body in map(json.loads, server.bodies) if not is_mirror(body) and body["seed"] not in whole.seeds
+    ]
+    assert len(trials) == 1
+
+
 def test_a_filter_that_stops_a_trial_prompt_by_chance_ends_no_run(tree, tmp_path, whole):
     stopped: list[int] = []
 
@@ -419,6 +439,14 @@ def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, m
     assert [line for line in caplog.messages if "trying again" in line] == [
         f"{server.url}: HTTP 503 Loading model; trying again, failed tries so far: 1"
     ]  # one line for many tries
+
+
+def test_the_log_does_not_promise_a_try_that_does_not_come(caplog):
+    with hovering(lambda body: refusal(503, "Loading model")) as server:
+        assert isinstance(ask(server.url, max_tries=1), NoAnswer)
+        assert isinstance(ask(server.url, total_timeout_s=0.001, backoff_s=1.0, max_backoff_s=1.0), NoAnswer)
+    words = [f"{server.url}: HTTP 503 Loading model; given up, failed tries so far: 1"]
+    assert [line for line in caplog.messages if "failed tries" in line] == 2 * words
 
 
 def test_a_silent_server_is_shown_too(tree, tmp_path, caplog, monkeypatch):

@@ -276,7 +276,7 @@ FAULTS: dict[str, tuple] = {
     "nobody: tokens in words": (top(usage={"prompt_tokens": "many", "completion_tokens": [2]}), fine("cannot be")),
     "nobody: a usage that is a list": (top(usage=[1000, 100]), fine()),
     # --- the wire
-    "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply", "longer than endpoint.max_reply_mb=0.5")),
+    "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply", "longer than max_reply_mb=0.5")),
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("bad_reply", "max_reply_mb=0.5")),
     "nobody: a bomb in a bomb": (
         lambda body: Sent(200, gzip.compress(BOMB), {"Content-Encoding": "gzip, gzip"}), silent("connection", "not asked for")),

@@ -42,6 +42,33 @@ def test_a_server_that_failed_has_not_filtered_the_window():
     assert kind_of(400, text) == "content"
 
 
+# What servers say with 5xx of grammars and schemas: whether they refuse one, or broke.
+SCHEMAS_IN_500 = [
+    ("Grammar error: Unimplemented keys: [\"propertyNames\"]", "schema"), ("failed to parse grammar", "schema"),
+    ("response_format json_schema is not supported by this backend", "schema"), ("Unsupported JSON schema keyword", "schema"),
+    ("EngineDeadError after grammar compilation thread ended", "unknown"), ("outlines cache: database is locked", "unknown"),
+    ("xgrammar.so: cannot open shared object file", "unknown"), ("worker of structured_outputs was killed", "unknown"),
+    ("llguidance: out of memory", "unknown"), ("an exception while handling response_format", "unknown"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "kind"), SCHEMAS_IN_500, ids=range(len(SCHEMAS_IN_500)))
+def test_a_server_that_broke_over_a_schema_has_not_refused_it(text, kind):
+    assert kind_of(500, text) == kind
+    assert kind_of(400, text) != "unknown" or kind == "unknown"
+    assert Refusal(500, kind, text).may_pass is (kind == "unknown")
+
+
+@pytest.mark.parametrize("status", [408, 424, 429, 500, 502, 503, 504, 520, 522, 524, 529, 530, 599])
+def test_a_server_that_is_away_may_come_back(status):
+    assert Refusal(status, kind_of(status, "<html>Error</html>"), "").may_pass
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 413, 422, 451])
+def test_a_request_that_is_refused_stays_refused(status):
+    assert not Refusal(status, "unknown", "").may_pass
+
+
 def test_the_code_of_an_unknown_refusal_is_its_status():
     assert Refusal(400, "unknown", "no").code == "refused_400"
     assert Refusal(400, "too_long", "no").code == "refused_too_long"

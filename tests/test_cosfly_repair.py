@@ -30,6 +30,7 @@ BROKEN_ANSWERS = {
     "a reason that is none": (ANSWER | {"finish_reason": {"deep": 1}}, "finish_reason"),
     "a negative time": (ANSWER | {"latency_s": -1.0}, "latency_s"),
     "totals of -1": ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
+    "totals of 10^400": ({"totals": {"answers": 2, "prompt_tokens": 10**400, "completion_tokens": 4}}, "totals.prompt_tokens"),
     "totals that are none": ({"totals": 7}, "totals"),
 }  # fmt: skip
 

@@ -148,8 +148,10 @@ class AskingTeacher:
         self.kept = KeptAnswers(self.engine, book, budget, only)
         self.frames = SharedFrames(cfg.image)
         self._trying, self._sound_s = asyncio.Lock(), float("-inf")  # when a trial prompt was answered last
-        self._refused_s: dict[str, float] = {}  # cause -> when the last window was refused for it
-        self._asked_s = float("-inf")  # when the last question was sent that the engine answered
+        self._num_answered = 0  # questions that the engine answered
+        self._answered_before: dict[
+            str, int
+        ] = {}  # cause -> how many of them before the last window that was refused for it
 
     async def __aenter__(self) -> AskingTeacher:
         try:
@@ -167,10 +169,8 @@ class AskingTeacher:
         await self.engine.close()
 
     async def ask(self, question: Question) -> Reply:
-        request, asked_s = await self.request(question), time.monotonic()
-        reply = await self._kept_answer(question, request, question.purpose)
-        if not reply.is_kept:
-            self._asked_s = max(self._asked_s, asked_s)
+        reply = await self._kept_answer(question, await self.request(question), question.purpose)
+        self._num_answered += not reply.is_kept
         return reply
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
@@ -192,7 +192,7 @@ class AskingTeacher:
     async def _find_fault(self, question: Question, refused: NoAnswer) -> None:
         """Find out whether a refusal is the window's: then a trial prompt with pictures of the same kind is answered.
 
-        One trial answers for all that were refused before it, and later for those between which windows are answered: a server that
+        One trial answers for all that were refused before it, and later for those between which enough windows are answered: a server that
         answers is not at fault. Two are tried, since a filter may stop one by chance.
 
         Raises:
@@ -201,9 +201,10 @@ class AskingTeacher:
         """
         refused_s = time.monotonic()
         async with self._trying:
-            before_s = self._refused_s.get(refused.cause, float("inf"))
-            self._refused_s[refused.cause] = refused_s
-            if self._sound_s > refused_s or self._asked_s > before_s:
+            before = self._answered_before.get(refused.cause, self._num_answered)
+            self._answered_before[refused.cause] = self._num_answered
+            # As many as can be in flight: one of them at least was sent after the last refusal.
+            if self._sound_s > refused_s or self._num_answered - before >= self.all_cfg.most_in_flight:
                 return
             for scene in SCENES[:NUM_TRIALS]:
                 try:

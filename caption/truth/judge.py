@@ -120,7 +120,7 @@ async def open_judge(
     if cfg.url is None:
         yield None
         return
-    settings = {name: getattr(cfg, name) for name in ("model", "concurrency", "timeout_s", "max_tries", "json_schema")}
+    settings = cfg.model_dump(include=EndpointConfig.model_fields.keys() - {"max_tokens", "extra_body"})
     client = ChatClient(cfg.url, EndpointConfig(**settings), troubles)
     async with started(client):
         yield Judge(KeptAnswers(client, book, budget), cfg, seed)

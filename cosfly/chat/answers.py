@@ -56,7 +56,7 @@ def refuse_one_file(folder: Path) -> None:
         )
 
 
-Count = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into a folder
 
 
 class Answer(BaseModel):

@@ -224,9 +224,8 @@ class ChatClient:
         if refusal.meaning.ends_run:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
         if refusal.may_pass:
-            is_long = (
-                wait_s is not None and wait_s > self.cfg.total_timeout_s
-            )  # this one is given up, the others are not held
+            # Where nobody can wait as long as that, this request is given up and the others are not held.
+            is_long = wait_s is not None and wait_s > self.cfg.total_timeout_s
             if status in BUSY_STATUS:
                 self.throttle.was_busy(given_s, None if is_long else wait_s)
             else:
@@ -340,7 +339,7 @@ class ChatClient:
         if response.status != 200:
             return self.refusal(response)
         if response.is_cut:
-            return f"longer than endpoint.max_reply_mb={self.cfg.max_reply_mb:g}"
+            return f"longer than max_reply_mb={self.cfg.max_reply_mb:g}"
         found = read_completion(response, request, "json_schema" if is_structured else "plain")
         if isinstance(found, Reply):
             return found
