@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from cosfly.errors import InputError
 from cosfly.reading.documents import parse_json
 from cosfly.reading.files import open_file, read_lines
-from cosfly.store import dump_json, sha256_bytes, storage_errors, write_bytes
+from cosfly.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
 
 TAIL = 65_536  # bytes at the end in which `last` looks
 ASIDE = ".aside"  # what is added to the name of a journal for the file that holds its broken lines
@@ -80,6 +80,7 @@ class Journal:
             (broken if record is None or not is_usable(record) else kept).append(line)
         if broken:
             aside = self.path.with_name(self.path.name + ASIDE)
+            refuse_link(aside)
             with storage_errors(aside), open(aside, "ab") as file:
                 file.write(b"".join(line.rstrip(b"\n") + b"\n" for line in broken))
                 file.flush()

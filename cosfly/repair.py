@@ -33,7 +33,10 @@ def repair(folder: Path) -> int:
     """
     if not folder.is_dir():
         return 0
-    return sum(_repair_stage(stage) for stage in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())))
+    below = sorted(
+        path for depth in ("*", "*/*") for path in folder.glob(depth) if path.is_dir()
+    )  # stages; those of towns
+    return sum(_repair_stage(stage) for stage in (folder, *below))
 
 
 def _repair_stage(stage: Path) -> int:

@@ -88,7 +88,7 @@ def test_an_answer_stands_in_the_journal_as_it_always_did(tmp_path):
 
 
 def test_damaged_lines_are_set_aside_too_and_links_are_left_alone(tmp_path):
-    stage = tmp_path / "run/plan"
+    stage = tmp_path / "run/one town/plan"
     with Journal(stage / "items.jsonl") as journal:
         journal.append({"id": "a", "status": "kept"})
         journal.append({"id": "b", "status": "kept"})
