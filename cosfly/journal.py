@@ -42,8 +42,8 @@ class Journal:
         self.num_damaged = 0
         if not self.path.exists():
             return
-        for self.line_num, line in enumerate(read_lines(self.path, what="journal"), 1):
-            record = _record_of(line)
+        for number, line in enumerate(read_lines(self.path, what="journal"), 1):
+            self.line_num, record = number, _record_of(line)
             if record is None:
                 self.num_damaged += 1
             else:

@@ -139,6 +139,9 @@ ALLOWED_TO_READ = {
     ("cosfly.folder_lock", "open"),  # a lock, opened to be written
     ("cosfly.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.chat.objects", "loads"),  # a string of a server's reply
+    ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
+    ("cosfly.chat.protocol", "open"),  # a picture that we made, for its size
+    ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
     ("distill.student", "loads"),  # what the tokenizer's own library gives
     ("distill.checkpoint", "load"),  # tensors, whose checksums were compared
     ("distill.checkpoint", "load_file"),

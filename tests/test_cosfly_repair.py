@@ -22,7 +22,7 @@ ANSWER = {"key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "mo
 # Lines of answers that are whole and cannot be used, as earlier versions kept them; and the field that is named.
 BROKEN_ANSWERS = {
     "a usage of -10^30": (ANSWER | {"usage": {"prompt_tokens": -(10**30), "completion_tokens": 2}}, "usage.prompt_tokens"),
-    "a usage of 10^400": (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**400}}, "usage.completion_tokens"),
+    "a usage of 10^30": (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**30}}, "usage.completion_tokens"),
     "a usage of texts": (ANSWER | {"usage": {"prompt_tokens": "10"}}, "usage.prompt_tokens"),
     "a usage that is a list": (ANSWER | {"usage": [10, 2]}, "usage"),
     "no key": ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
@@ -30,7 +30,7 @@ BROKEN_ANSWERS = {
     "a reason that is none": (ANSWER | {"finish_reason": {"deep": 1}}, "finish_reason"),
     "a negative time": (ANSWER | {"latency_s": -1.0}, "latency_s"),
     "totals of -1": ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
-    "totals of 10^400": ({"totals": {"answers": 2, "prompt_tokens": 10**400, "completion_tokens": 4}}, "totals.prompt_tokens"),
+    "totals of 10^30": ({"totals": {"answers": 2, "prompt_tokens": 10**30, "completion_tokens": 4}}, "totals.prompt_tokens"),
     "totals that are none": ({"totals": 7}, "totals"),
 }  # fmt: skip
 
@@ -64,6 +64,16 @@ def test_totals_that_have_counted_a_broken_answer_are_counted_anew(tmp_path):
         book.get("a_ORI", "k")
     assert repair(tmp_path) == 1
     assert AnswerBook(tmp_path / "answers").totals == {"answers": 1, "prompt_tokens": 10, "completion_tokens": 2}
+
+
+def test_a_number_that_no_file_may_hold_makes_a_line_a_damaged_one(tmp_path):
+    with Journal(tmp_path / "answers/a_ORI.jsonl") as journal:
+        journal.append(ANSWER | {"usage": {"prompt_tokens": 10**400, "completion_tokens": 1}})
+        journal.append(ANSWER | {"key": "l"})
+    with AnswerBook(tmp_path / "answers") as book:
+        assert book.totals["answers"] == 1
+        assert book.get("a_ORI", "k") is None  # it is asked again
+    assert repair(tmp_path) == 1
 
 
 def test_what_an_older_version_kept_is_read(tmp_path):
