@@ -37,7 +37,8 @@ class ObservedWindow:
     indices: frame indices (n,). time_s (n,); positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll;
     targets_m (n, 3) NaN where unknown; target_uv (n, 2) px and target_bbox (n, 4) px of what is
     seen of the target (where a tree does not say, of its projected 3D box), NaN where unknown; target_depth_m (n,);
-    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; frame_folders: n folders; frame_files:
+    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; mission: what the drone knows at the current frame of an order
+    that ends the pursuit, its kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files:
     the names that each holds.
     """
 
@@ -60,6 +61,7 @@ class ObservedWindow:
     visibility: np.ndarray
     frame_folders: tuple[Path, ...]
     frame_files: tuple[frozenset[str], ...]
+    mission: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class FutureMotion:
 
     indices: the future frames' indices (m,). time_s, yaw_deg, visible (m + 1,); positions_m, targets_m (m + 1, 3).
     speed_before_mps: over the last observed step, the reference of a speed change. label_from: whose motion this is.
+    order: the decision that the mission orders at the current frame, None without an order.
     """
 
     indices: tuple[int, ...]
@@ -78,6 +81,7 @@ class FutureMotion:
     visible: np.ndarray
     speed_before_mps: float
     label_from: LabelFrom = "flight"
+    order: str | None = None
 
 
 @dataclass(frozen=True)

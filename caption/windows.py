@@ -15,6 +15,7 @@ from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Window, Wi
 from caption.truth.actions import label_of, measure
 from cosfly.products.captions import KeyframeRecord
 from cosfly.products.playback import Flight, sample_id
+from cosfly.products.segments import Mission
 
 DEFAULT_LABEL = LabelConfig()
 
@@ -105,7 +106,13 @@ def _observe(flight: Flight, span: slice, folders: list[Path], files: list[froze
         visibility=flight.visibility[span].copy(),
         frame_folders=tuple(folders[span]),
         frame_files=tuple(files[span]),
+        mission=known_of(flight.mission, span.stop - 1),
     )
+
+
+def known_of(mission: Mission | None, frame: int) -> str | None:
+    """Give the kind of a mission at a frame at which its order stands; before, nobody knows that there will be one."""
+    return None if mission is None or mission.order_at(frame) is None else mission.kind
 
 
 def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:
@@ -129,4 +136,5 @@ def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames:
         visible=flight.target_visible[span],
         speed_before_mps=math.dist(now_m, before_m) / float(step_s),
         label_from=motion.label_from,
+        order=None if flight.mission is None else flight.mission.order_at(current),
     )

@@ -1,6 +1,7 @@
 """The playback tree: strict and tolerant reading, axes at the door, unknown keys in a round trip."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.playback import find_flights, read_flight, sample_id, write_flight
+from cosfly.products.segments import Mission, Segment
 from specimens import PERSON_ID, make_playback_tree
 
 
@@ -97,6 +99,34 @@ def test_round_trip_keeps_unknown_keys_and_numbers(clean, tmp_path):
     assert len(columns) == 15
     for name in columns:
         assert_array_equal(getattr(again, name), getattr(flight, name))
+
+
+def test_styles_and_mission_survive_and_home_is_in_carlas_axes(clean, tmp_path):
+    flight = read_flight(clean)
+    parts, mission = (
+        (Segment("follow", 0, 4), Segment("return_home", 4, 6, keeps_sight=False)),
+        Mission("time_over", 4, 5, (1.0, 2.0, 30.0)),
+    )
+    folder = rewrite(clean, tmp_path, lambda value: None)
+    before = (folder / "trajectory.json").read_text()
+    write_flight(folder, read_flight(folder))
+    assert json.loads((folder / "trajectory.json").read_text()).keys() == json.loads(before).keys()
+    write_flight(folder, replace(flight, segments=parts, mission=mission))
+    assert json.loads((folder / "trajectory.json").read_text())["mission"]["home"] == {"x": 1.0, "y": -2.0, "z": 30.0}
+    again = read_flight(folder)
+    assert (again.segments, again.mission) == (parts, mission)
+    assert again.keeps_sight.tolist() == [True] * 4 + [False] * 2
+
+
+def test_somebody_elses_mission_is_noted_and_left(clean, tmp_path):
+    folder = rewrite(clean, tmp_path, lambda value: value.update(mission="survey", segments={"a": 1}))
+    with pytest.raises(InputError, match="segments"):
+        read_flight(folder)
+    flight = read_flight(folder, strict=False)
+    assert (flight.segments, flight.mission) == ((), None)
+    assert "segments" in flight.issues[0]
+    write_flight(folder, flight)
+    assert json.loads((folder / "trajectory.json").read_text())["mission"] == "survey"
 
 
 def test_any_even_time_step_is_read(clean, tmp_path):

@@ -19,6 +19,7 @@ from caption.truth.glossary import load_glossary
 from caption.writing.contract import Draft, way_of
 from cosfly.frame_views import Pictures, frame_label
 from cosfly.products.captions import ACTIONS, PICTURES_MARK, Language, Prompt, Writing
+from cosfly.products.segments import MISSION_KINDS
 from cosfly.reading.files import read_text
 from cosfly.store import dump_json, sha256_bytes
 
@@ -129,8 +130,24 @@ def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, 
         "visibility": ", ".join([words[word][language] for word in facts.visibility]),
         "target": "; ".join([_target_text(*p) or unknown for p in window.targets_m.tolist()]),
     }
-    return _filled(f"user_{language}") % (numbers | own)
+    told = _filled(f"user_{language}") % (numbers | own)
+    return told if window.mission is None else f"{told}\n{_MISSION[language][window.mission]}"
 
+
+# A state of the drone like its speed: told from the frame on at which it knows, and not what follows from it.
+_MISSION: dict[Language, dict[str, str]] = {
+    "en": {
+        "geofence": "Mission: the border of the permitted area is reached; the pursuit may not go on.",
+        "battery": "Mission: the battery is down to the reserve for the way home.",
+        "time_over": "Mission: the time of the mission is over.",
+    },
+    "zh": {
+        "geofence": "任务状态：已到达允许飞行区域的边界，不得继续跟踪。",
+        "battery": "任务状态：电池电量已降至返航储备。",
+        "time_over": "任务状态：任务时间已到。",
+    },
+}
+assert all(set(told) == set(MISSION_KINDS) for told in _MISSION.values())
 
 _WORDS_OF_NUMBERS: dict[Language, tuple[str, str]] = {"en": ("unknown", " m/s"), "zh": ("未知", " 米/秒")}
 

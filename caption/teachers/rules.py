@@ -77,6 +77,8 @@ def _decided(facts: Facts, cues: Cues) -> str:
     # A shaken camera goes up and down, near and far; who climbs or closes in goes one way.
     turn_deg, climb_m = cues.turn_deg, cues.climb_m if _goes_one_way(facts.altitude_m) else 0.0
     gap_m = cues.gap_m if _goes_one_way(facts.distance_m) else 0.0
+    if facts.mission is not None:  # who has turned away already is on the way home
+        return "return_to_home" if facts.visibility[-1] == "out_of_view" else "break_off"
     if not facts.is_visible_now:
         return "search_to_reacquire_target"
     if cues.speed_now_mps < STILL_MPS and abs(turn_deg) < MIN_TURN_DEG and abs(climb_m) < MIN_CLIMB_M:
@@ -220,6 +222,17 @@ def _standing(f: Facts, c: Cues) -> Both | None:
     )
 
 
+_ORDERS: dict[str, Both] = {
+    "geofence": ("The border of the permitted area ends the pursuit here.", "允许飞行区域的边界使跟踪到此为止。"),
+    "battery": ("The battery is down to the reserve for the way home.", "电池电量已降至返航储备。"),
+    "time_over": ("The time of the mission is over.", "任务时间已到。"),
+}
+
+
+def _order(f: Facts, c: Cues) -> Both | None:
+    return None if f.mission is None else _ORDERS[f.mission]
+
+
 _EVIDENCE: dict[str, tuple[Cause, ...]] = {
     "track_straight": (_steady,),
     "yaw_left_to_follow": (partial(_offset, 1), partial(_turn, 1), partial(_bend, 1)),
@@ -234,6 +247,8 @@ _EVIDENCE: dict[str, tuple[Cause, ...]] = {
     "strafe_right": (partial(_offset, -1), partial(_bend, -1)),
     "hover": (_standing,),
     "search_to_reacquire_target": (_lost,),
+    "break_off": (_order,),
+    "return_to_home": (_order,),
 }
 
 # Reasons that claim nothing measurable: for a decision that the facts alone do not explain.

@@ -2,7 +2,7 @@
 
 The first group of `TABLE` in which an action is `implied` by the actual future gives the label: in it the action of which there is
 most, in units of its own threshold. A decision of which the future shows next to nothing is contradicted. `break_off` and
-`return_to_home` are orders of a mission; geometry never implies them. Signs: left, up and forward are positive.
+`return_to_home` are orders of a mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class Motion:
     target_path_m: float
     visible_now: bool
     visible_share: float  # of the future frames
+    order: str | None = None  # the decision that the mission orders at the current frame
 
 
 def measure(future: FutureMotion) -> Motion:
@@ -64,6 +65,7 @@ def measure(future: FutureMotion) -> Motion:
         target_path_m=math.hypot(last_target[0] - first_target[0], last_target[1] - first_target[1]),
         visible_now=bool(visible[0]),
         visible_share=sum(map(bool, visible[1:])) / len(visible[1:]),
+        order=future.order,
     )
 
 
@@ -75,13 +77,12 @@ class Action:
     """One row. Sizes are in units of the action's own threshold; what holds or not is 1 or -1.
 
     shown: how much of the action the motion shows, negative for its opposite; less than `hard_below` contradicts it (None: than
-    the setting `absent_share`). implied: how much there is of what makes it the label, from 1 on, where 1 is shown too; None:
-    geometry never gives this label.
+    the setting `absent_share`). implied: how much there is of what makes it the label, from 1 on, where 1 is shown too.
     """
 
     token: str
     shown: Size
-    implied: Size | None
+    implied: Size
     hard_below: float | None = None
 
 
@@ -148,6 +149,14 @@ def _loses_target(m: Motion, c: LabelConfig) -> float:
     return _yes(not (m.visible_now and m.visible_share == 1.0 and m.approach_m > -c.approach_m))
 
 
+def _ordered(token: str) -> Action:
+    return Action(
+        token,
+        lambda m, c: _yes(m.order == token or _loses_target(m, c) > 0.0),
+        lambda m, c: _yes(m.order == token),
+    )
+
+
 def _both_sides(left: str, right: str, shown: Callable, implied: Callable, **more: float) -> tuple[Action, Action]:
     return (
         Action(left, partial(shown, 1), partial(implied, 1), **more),
@@ -155,8 +164,9 @@ def _both_sides(left: str, right: str, shown: Callable, implied: Callable, **mor
     )
 
 
-# In order of precedence: states, then a manoeuvre that has the following ones as its parts, then these, then the neutral one.
+# In order of precedence: orders, states, then a manoeuvre that has the following ones as its parts, then these, then the neutral one.
 TABLE: tuple[tuple[Action, ...], ...] = (
+    (_ordered("break_off"), _ordered("return_to_home")),
     (
         Action(
             "search_to_reacquire_target",
@@ -182,20 +192,16 @@ TABLE: tuple[tuple[Action, ...], ...] = (
         Action("move_backward", partial(_forward, -1), _backward),
         Action("move_forward", partial(_forward, 1), _closing),
     ),
-    (
-        Action("track_straight", _goes_straight, partial(_forward, 1)),
-        Action("break_off", _loses_target, None),
-        Action("return_to_home", _loses_target, None),
-    ),
+    (Action("track_straight", _goes_straight, partial(_forward, 1)),),
 )
 BY_TOKEN = {action.token: action for group in TABLE for action in group}
 assert set(BY_TOKEN) == set(ACTIONS)
 
 
 def label_of(motion: Motion, cfg: LabelConfig) -> str | None:
-    """Give the ground-truth decision, None where geometry cannot tell."""
+    """Give the ground-truth decision, None where neither an order nor geometry tells."""
     for group in TABLE:
-        sizes = [(action.implied(motion, cfg), action.token) for action in group if action.implied is not None]
+        sizes = [(action.implied(motion, cfg), action.token) for action in group]
         found = [pair for pair in sizes if pair[0] >= 1.0]
         if found:
             return max(found, key=lambda pair: pair[0])[1]  # the earlier row of two equal ones

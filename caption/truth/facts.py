@@ -33,6 +33,7 @@ class Facts:
     ground from the oldest frame.
     Between them: distance_m is horizontal, slant_m in 3D, height_over_target_m from the person's hip; bearing_deg: where the person
     is, against the drone's heading, positive to the left; depression_deg: of the line of sight below the horizon.
+    mission: the kind of the order that ends the pursuit, once it stands.
     In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image centre, positive to the right and down.
     """
 
@@ -61,6 +62,7 @@ class Facts:
     height_over_target_m: tuple[float | None, ...] = ()
     bearing_deg: tuple[float | None, ...] = ()
     depression_deg: tuple[float | None, ...] = ()
+    mission: str | None = None
 
     def __len__(self) -> int:
         return len(self.yaw_deg)
@@ -127,6 +129,7 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         height_over_target_m=height,
         bearing_deg=bearing,
         depression_deg=depression,
+        mission=window.mission,
     )
 
 

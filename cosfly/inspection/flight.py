@@ -220,9 +220,11 @@ def check_surroundings(
         report.error(
             "collision", f"trajectory.json: points[{i}].target.world_location", "in an obstacle", "free ground"
         )
-    five_ray = float(visibility(obstacles, flight.positions_m[known], flight.targets_m[known]).mean())
+    judged = known[flight.keeps_sight[known]]
+    rows = judged if len(judged) else known
+    five_ray = float(visibility(obstacles, flight.positions_m[rows], flight.targets_m[rows]).mean())
     metrics.update(five_ray_mean=five_ray)
-    if five_ray < cfg.five_ray_mean_min:
+    if len(judged) and five_ray < cfg.five_ray_mean_min:
         expected = f"a mean of at least {cfg.five_ray_mean_min:g}"
         report.error("five_ray_visibility", "trajectory.json: points", f"{five_ray:.3f}", expected)
 

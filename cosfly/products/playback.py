@@ -21,6 +21,7 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
 from cosfly.products.places import tree_of_flight
+from cosfly.products.segments import Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
     BBOX,
     SCHEMA,
@@ -53,6 +54,7 @@ class Flight:
     visibility (n,) rendered score in [0, 1], NaN where the file has none; is_perturbed (n,) bool;
     drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to each point, zero where none,
     NaN where the file has none for a perturbed point (public files say only that there was one).
+    segments, mission: the styles of its parts and the order that ended it, as its plan has them.
     """
 
     town: str
@@ -80,6 +82,8 @@ class Flight:
     raw: dict = field(default_factory=dict)
     issues: tuple[str, ...] = ()  # what a tolerant reader let pass
     run: str = ""  # where flights of several runs are put together
+    segments: tuple[Segment, ...] = ()
+    mission: Mission | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -89,6 +93,14 @@ class Flight:
     def flight_id(self) -> str:
         """`trajectory_1776047127_ORI`, the stem of its sample ids."""
         return self.given_id or f"{self.trajectory}_{self.variant}"
+
+    @property
+    def keeps_sight(self) -> np.ndarray:
+        """Tell of each frame whether it is judged by how much it sees of the target, (n,) bool."""
+        keeps = np.ones(len(self), dtype=bool)
+        for part in self.segments:
+            keeps[part.begin : part.end] = part.keeps_sight
+        return keeps
 
     @property
     def is_ours(self) -> bool:
@@ -166,6 +178,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     targets = [object_of(p, "target") for p in points]
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
+    segments, mission = reader.flown(raw, len(points))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     drone, turn, walker = (
         offsets_of(points, name, axes, is_original)
@@ -196,6 +209,8 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         folder=folder,
         raw=raw,
         issues=tuple(reader.issues),
+        segments=segments,
+        mission=mirrored(mission),
     )
 
 
@@ -243,6 +258,7 @@ def write_flight(folder: Path, flight: Flight) -> None:
     raw.setdefault("frames_dir", FRAMES_DIR)
     raw.setdefault("coordinates", COORDINATES)
     raw["source"] = flight.source
+    raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
     camera = flight.camera
     raw["camera"] = {
         **object_of(raw, "camera"),

@@ -5,11 +5,12 @@ A file without them holds a flight that follows the walker, as the paper's do, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from cosfly.errors import InputError
 
+LARGEST_M = 1e9
 MISSION_KINDS = ("geofence", "battery", "time_over")
 
 
@@ -53,6 +54,14 @@ def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dic
     return record | ({"mission": mission.as_json()} if mission is not None else {})
 
 
+def mirrored(mission: Mission | None) -> Mission | None:
+    """Change a mission between right-handed and CARLA axes."""
+    if mission is None:
+        return None
+    x, y, z = mission.home_m
+    return replace(mission, home_m=(x, -y, z))
+
+
 def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
     """Read segments; none is no segment.
 
@@ -81,7 +90,7 @@ def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
     if value is None:
         return None
     home = value.get("home") if isinstance(value, dict) else None
-    if not isinstance(home, dict) or not all(type(home.get(axis)) in (int, float) for axis in "xyz"):
+    if not isinstance(home, dict) or not all(_is_number(home.get(axis)) for axis in "xyz"):
         raise InputError("not a mission", where=f"{where}.home", got=repr(home)[:60], expected="numbers x, y, z")
     if value.get("kind") not in MISSION_KINDS:
         raise InputError(
@@ -89,6 +98,10 @@ def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
         )
     at, home_frame = (_frame(value, name, num_frames, where) for name in ("at_frame", "home_frame"))
     return Mission(value["kind"], at, home_frame, (float(home["x"]), float(home["y"]), float(home["z"])))
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= LARGEST_M
 
 
 def _frame(group: dict, name: str, num_frames: int, where: str) -> int:

@@ -11,6 +11,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import LARGEST, is_in_range
 from cosfly.products.frames import ANGLES, XYZ, Camera
+from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.reading.arrays import check_pixels
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
@@ -100,6 +101,17 @@ class FieldReader:
             if np.isnan(vector).any() or np.abs(vector - positions[i + 1]).max() > WAYPOINT_TOLERANCE_M:
                 self.issue(where, repr(found)[:60], f"the next point's position {positions[i + 1].tolist()}")
                 return  # one note is enough
+
+    def flown(self, raw: dict, num_points: int) -> tuple[tuple[Segment, ...], Mission | None]:
+        """Styles of the parts, and mission; somebody else's fields of these names are noted and left."""
+        try:
+            segments = read_segments(raw.get("segments"), num_points, f"{self.path}: segments")
+            return segments, read_mission(raw.get("mission"), num_points, f"{self.path}: mission")
+        except InputError as error:
+            if self.strict:
+                raise
+            self.issues.append(str(error))
+            return (), None
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):

@@ -16,6 +16,7 @@ from cosfly.products import frames
 from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
+from cosfly.products.segments import Mission, Segment
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, rendered_visibility, view_target
@@ -32,7 +33,7 @@ FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 M
 
 @dataclass(frozen=True)
 class FlightScript:
-    """All that is drawn in one flight, n frames, before a pixel is drawn. source: who planned it."""
+    """All that is drawn in one flight, n frames, before a pixel is drawn. source: who planned it; segments, mission: what it was to be."""
 
     town: str
     trajectory: str
@@ -45,6 +46,8 @@ class FlightScript:
     look: Look
     is_original: bool
     source: dict
+    segments: tuple[Segment, ...] = ()
+    mission: Mission | None = None
 
 
 @dataclass(frozen=True)
@@ -222,6 +225,8 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         rotation_offsets_deg=perturbed.rotation_offsets_deg,
         target_offsets_m=perturbed.target_offsets_m,
         source=script.source,
+        segments=script.segments,
+        mission=script.mission,
         is_original=script.is_original,
         raw={"points": [{"perturbation": dict(state)} for state in perturbed.states]},
     )

@@ -148,6 +148,8 @@ def script_flight(
         clothes=clothes,
         look=cfg.look,
         is_original=track == "clean",
+        segments=trace.segments,
+        mission=trace.mission,
         source={
             "path_index": number,
             "scenario_id": trace.path_id,
