@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cosfly.errors import InputError
+from cosfly.products.columns import LARGEST
 
-LARGEST_M = 1e9
 MISSION_KINDS = ("geofence", "battery", "time_over")
 
 
@@ -101,7 +101,7 @@ def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= LARGEST_M
+    return type(value) in (int, float) and abs(value) <= LARGEST
 
 
 def _frame(group: dict, name: str, num_frames: int, where: str) -> int:
