@@ -9,8 +9,9 @@ from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenar
 import cosfly.planners.stage as planners
 from cosfly import flight_metrics, kernels
 from cosfly.errors import NoPathError
+from cosfly.planners import sight
 from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
-from cosfly.planners.track_astar import sight, smooth, track_astar
+from cosfly.planners.track_astar import smooth, track_astar
 from cosfly.planners.wish import follow
 
 CFG = PlanConfig(planner="track_astar")
@@ -33,7 +34,9 @@ def test_a_look_sees_what_the_kernel_sees(seed):
     target = np.array([*rng.uniform(-30, 30, 2), 1.0])
     points = target + np.column_stack([rng.uniform(-60, 60, (800, 2)), rng.uniform(19, 90, 800)])
     points[0] = target + np.array([0, 0, 30])  # straight above
-    horizon = sight.make_horizon(obstacles, target, np.hypot(*(points - target)[:, :2].T).max())
+    away = np.hypot(*(points - target)[:, :2].T)
+    slopes = (points[:, 2] - target[2] - sight.FOOT_LOW_M) / np.maximum(away, 1.0)
+    horizon = sight.make_horizon(obstacles, target, away.max(), slopes.min())
     seen = [sight.look(obstacles, horizon, target, *point) for point in points]
     expected = kernels.visibility(obstacles, points, np.repeat(target[None], len(points), axis=0))
     np.testing.assert_array_equal(seen, expected)
@@ -42,7 +45,7 @@ def test_a_look_sees_what_the_kernel_sees(seed):
 
 def test_without_boxes_everything_is_seen():
     obstacles, target = kernels.obstacle_index(town_of()), np.array([0.0, 0.0, 1.0])
-    horizon = sight.make_horizon(obstacles, target, 50.0)
+    horizon = sight.make_horizon(obstacles, target, 50.0, 0.0)
     assert sight.look(obstacles, horizon, target, 10.0, 0.0, 20.0) == 1.0
 
 

@@ -35,7 +35,11 @@ if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
 
 # In the order of comparisons, which hold the first against each of the others.
-PLANNERS = {"track_astar": "cosfly.planners.track_astar.track_astar:plan", "muco": "cosfly.planners.muco.muco:plan"}
+PLANNERS = {
+    "foresight": "cosfly.planners.foresight.foresight:plan",
+    "track_astar": "cosfly.planners.track_astar.track_astar:plan",
+    "muco": "cosfly.planners.muco.muco:plan",
+}
 TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}  # in tables and pictures; others go by their names
 
 

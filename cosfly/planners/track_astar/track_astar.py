@@ -27,7 +27,7 @@ from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
 from cosfly.kernels import BoxIndex, collect_hits, nearest_box
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.track_astar.sight import look, make_horizon
+from cosfly.planners.sight import look, make_horizon
 from cosfly.planners.track_astar.smooth import smooth_flight
 
 ROUNDING_M = 1e-6  # of altitudes
@@ -329,7 +329,7 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
         near = max(0.0, 1.0 - gap / costs.influence_m)
         off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
         bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
-    horizon = make_horizon(index, target, reach_m)
+    horizon = make_horizon(index, target, reach_m, 0.0)
     total, num = np.full(len(touched), np.inf), 0
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
     for k in range(len(touched)):  # those that would stay if all saw everything

@@ -31,6 +31,7 @@ NUM_SECTORS = 128  # of the horizon round a target
 # Feet of the five rays (RAY_OFFSETS_M): the lowest relative to the hip, and how far to the side.
 FOOT_LOW_M, FOOT_SIDE_M = -0.6, 0.3
 ALL_BLOCKED = 0b11111
+ROUNDING = 1e-6
 
 
 class Horizon(NamedTuple):
@@ -49,13 +50,14 @@ class Horizon(NamedTuple):
 
 
 @njit(cache=True)
-def make_horizon(index, target, reach_m):
+def make_horizon(index, target, reach_m, least_slope):
     """Sort the boxes round a target by direction, so that a look from above tests the few that can hide it.
 
-    A ray that starts at height `low` or above and ends d away at p_z has risen to low + (p_z - low) t at the share t of its way,
+    Good for looks from within `reach_m` in the plane, from places that rise at least `least_slope` per horizontal metre above the
+    lowest foot: lower boxes are left out. A ray that starts at height `low` or above and ends d away at p_z has risen to low + (p_z - low) t at the share t of its way,
     and it is no nearer to a box at horizontal distance r than t = (r - FOOT_SIDE_M) / d.
     """
-    boxes, near, slopes, spans = _boxes_round(index, target, reach_m)
+    boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
     counts = np.zeros(NUM_SECTORS, dtype=np.int64)
     lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
     steepest = np.full(NUM_SECTORS, -np.inf)
@@ -71,8 +73,8 @@ def make_horizon(index, target, reach_m):
 
 
 @njit(cache=True)
-def _boxes_round(index, target, reach_m):
-    """Give the boxes within `reach_m`, their horizontal distance, slope, and span of azimuth (2,), first <= last."""
+def _boxes_round(index, target, reach_m, least_slope):
+    """Give the boxes within `reach_m` that are steep enough, their horizontal distance, slope, and span of azimuth (2,), first <= last."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
     near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
     if len(index.rows) == 0:
@@ -98,6 +100,8 @@ def _boxes_round(index, target, reach_m):
                     continue
                 boxes[num], near[num] = box, max(distance - FOOT_SIDE_M, 0.0)
                 slopes[num] = (rows[HIGH_Z] - low) / near[num] if near[num] > 1e-6 else np.inf
+                if slopes[num] < least_slope - ROUNDING:
+                    continue
                 spans[num, 0], spans[num, 1] = _span(rows, target, distance)
                 num += 1
     return boxes[:num], near[:num], slopes[:num], spans[:num]

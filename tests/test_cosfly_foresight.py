@@ -1,0 +1,243 @@
+"""Foresight: lattice, search and smoothing against slow plain versions, and whole flights where looking ahead pays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from specimens_planning import WORLDS, scenario_of, town_of, walk_along
+
+from cosfly import flight_metrics, kernels
+from cosfly.chance import rng_for
+from cosfly.planners.contract import PlanConfig, load_planner
+from cosfly.planners.foresight import foresight, lattice, search, smooth
+from cosfly.planners.stage import make_scenario
+
+CFG = PlanConfig()
+
+
+def random_town(seed):
+    """Forty turned boxes round the origin, some taller than a drone flies, none on the x axis, where the walker goes."""
+    rng = np.random.default_rng(seed)
+    side = np.where(rng.random(40) < 0.5, -1.0, 1.0)
+    centers = np.column_stack([rng.uniform(-70, 90, 40), side * rng.uniform(16, 60, 40), rng.uniform(0, 15, 40)])
+    halves = np.column_stack([rng.uniform(0.5, 8, (40, 2)), rng.uniform(0.5, 15, 40)])
+    return kernels.obstacle_index(town_of(*zip(centers, halves, rng.uniform(-180, 180, 40), strict=True)))
+
+
+def straight_scenario(obstacles, length_m=30.0):
+    return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
+
+
+# --- lattice ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("climbing", [False, True])
+def test_the_wished_places_are_in_the_lattice_and_cost_nothing(climbing):
+    scenario, _ = scenario_of("corner")
+    made = lattice.make_lattice(scenario, climbing=climbing)
+    wished = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
+    ring = lattice.RINGS.index((0, 0))
+    np.testing.assert_allclose(made.places_m[:, ring, 0], wished, atol=1e-9)
+    assert (made.costs[:, ring, 0] == 0).all()
+    assert (np.delete(made.costs.reshape(len(wished), -1), ring * lattice.NUM_AZIMUTHS, axis=1) > 0).all()
+    assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
+    away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
+    assert made.radius_max_m == pytest.approx(away_m.max())
+
+
+def test_places_keep_the_altitudes_also_on_a_slope():
+    scenario, _ = scenario_of("corner")
+    ground_m = np.linspace(0.0, 12.0, len(scenario.targets_m))
+    scenario = replace(scenario, ground_m=ground_m, targets_m=scenario.targets_m + [[0, 0, z] for z in ground_m])
+    made = lattice.make_lattice(scenario, climbing=True)
+    for k, frame in enumerate(made.frames):
+        low, high = made.places_m[k, ..., 2].min(), made.places_m[k, ..., 2].max()
+        between = slice(max(frame - 3, 0), frame + 4)
+        assert low >= (ground_m + scenario.wish.altitude_min_m)[between].max() - 1e-9
+        assert high <= (ground_m + scenario.wish.altitude_max_m)[between].min() + 1e-9
+
+
+def test_a_link_leads_both_ways_and_every_ring_can_be_reached():
+    scenario, _ = scenario_of("corner")
+    links = lattice.make_lattice(scenario, climbing=True).links
+    pairs = {(ring, other) for ring, row in enumerate(links) for other in row if other >= 0}
+    assert pairs == {(b, a) for a, b in pairs}
+    assert [row[0] for row in links] == list(range(len(links)))
+    reached = {0}
+    for _ in links:
+        reached |= {b for a, b in pairs if a in reached}
+    assert len(reached) == len(links)
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_survey_measures_what_the_kernels_measure(seed):
+    obstacles = random_town(seed)
+    scenario = straight_scenario(obstacles)
+    made = lattice.make_lattice(scenario, climbing=seed % 2 == 1)
+    places, targets = made.places_m.reshape(len(made.frames), -1, 3), scenario.targets_m[made.frames]
+    aloft = search.boxes_aloft(obstacles, scenario.targets_m, made)
+    gaps, hidden = np.zeros(places.shape[:2]), np.full(places.shape[:2], -1.0)
+    search._survey(places, targets, obstacles, aloft.rows, 3.0, search.REACH_M, gaps, hidden)
+    flat = places.reshape(-1, 3)
+    expected, _ = kernels.signed_distances(obstacles, flat, search.REACH_M)
+    free = expected >= 3.0
+    np.testing.assert_array_equal(gaps.ravel() >= 3.0, free)
+    np.testing.assert_allclose(gaps.ravel()[free], expected[free], atol=1e-9)
+    seen = kernels.visibility(obstacles, flat, np.repeat(targets, places.shape[1], axis=0))
+    np.testing.assert_allclose(hidden.ravel()[free], 1.0 - seen[free])
+    assert (hidden.ravel()[~free] == -1.0).all()
+    assert 0 < free.mean() < 1
+    assert 0 < seen.mean() < 1
+
+
+def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
+    """The least cost of any sequence of places, each step asked of the kernels."""
+    free = kernels.signed_distances(index, places.reshape(-1, 3), 50.0)[0].reshape(own.shape) >= clearance_m
+    cost = np.where(free[0], own[0], np.inf)
+    for key in range(1, len(places)):
+        now = np.full(len(cost), np.inf)
+        for c in np.flatnonzero(free[key]):
+            for b in np.flatnonzero(np.isfinite(cost)):
+                turn = abs(c % num_azimuths - b % num_azimuths)
+                length = np.linalg.norm(places[key, c] - places[key - 1, b])
+                if min(turn, num_azimuths - turn) > max_turn or b // num_azimuths not in links[c // num_azimuths]:
+                    continue
+                line = places[key - 1, b][None], places[key, c][None]
+                if length > longest_m[key] or kernels.segments_hit(index, *line, clearance_m)[0]:
+                    continue
+                now[c] = min(now[c], cost[b] + way_cost * length + own[key, c])
+        cost = now
+    return cost.min()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_sequence_of_places_is_cheaper(seed):
+    rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
+    made = lattice.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
+    places = np.ascontiguousarray(made.places_m[:, :4, ::-4][:, :, :num_azimuths].reshape(len(made.frames), -1, 3))
+    own, links = rng.random(places.shape[:2]), made.links[:4, :].clip(max=4)
+    links = np.where(links < 4, links, -1)
+    links = np.array([sorted(row, key=lambda ring: ring < 0) for row in links])
+    gaps = kernels.signed_distances(obstacles, places.reshape(-1, 3), 12.0)[0].reshape(own.shape)
+    longest_m = np.full(len(places), 18.0)
+    settings = links, num_azimuths, 1, 0.02
+    chosen = search._cheapest(places, own, gaps, longest_m, obstacles, 3.0, *settings)
+    way, keys = places[np.arange(len(places)), chosen], np.arange(len(places))
+    cost = own[keys, chosen].sum() + 0.02 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+    assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
+
+
+def test_where_no_way_is_fast_enough_there_is_none():
+    scenario, obstacles = scenario_of("corner")
+    made = lattice.make_lattice(scenario, climbing=False)
+    slow = PlanConfig(speed_max_mps=0.05)
+    assert search.search_flight(scenario, made, obstacles, slow, 3.0) is None
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num", [1, 2, 3, 4, 9])
+@pytest.mark.parametrize("dt_s", [0.5, 0.2])
+def test_the_band_is_that_of_the_squared_derivatives(num, dt_s):
+    points = np.random.default_rng(num).normal(size=num)
+    band = smooth.smoothness_band(num, dt_s)
+    full = sum(np.diag(band[k, : num - k], -k) for k in range(min(4, num)))
+    full = full + full.T - np.diag(np.diag(full))
+    weights = (smooth.VELOCITY_S2, smooth.ACCELERATION_S4, smooth.JERK_S6)
+    expected = sum(w * (np.diff(points, n=k + 1) ** 2).sum() / dt_s ** (2 * k + 2) for k, w in enumerate(weights))
+    assert points @ full @ points == pytest.approx(expected)
+
+
+def test_waypoints_are_unsafe_that_are_near_or_at_the_ends_of_a_bad_step():
+    box = kernels.obstacle_index(town_of(((0, 0, 20), (2, 2, 20))))
+    points = np.array([[-30, 9, 20], [-26, 9, 20], [-4, 0, 20], [4, 9, 20], [8, 9, 20], [8, -9, 20.0]])
+    found = smooth.unsafe(points, box, 3.0, 5.0)
+    np.testing.assert_array_equal(found, [False, True, True, True, True, True])
+    np.testing.assert_array_equal(smooth.unsafe(points[3:5], box, 3.0, 5.0), [False, False])
+    through = np.array([[-6.0, 0, 20], [6.0, 0, 20]])
+    np.testing.assert_array_equal(smooth.unsafe(through, box, 3.0, 50.0), [True, True])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
+    obstacles = random_town(seed)
+    scenario = straight_scenario(obstacles, 60.0)
+    raw = search.search_flight(scenario, lattice.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
+    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    assert facts["smooth"]
+    assert not smooth.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
+    assert (points[:, 2] >= 20.0).all()
+    seen, seen_raw = (kernels.visibility(obstacles, flight, scenario.targets_m).mean() for flight in (points, raw))
+    assert seen >= seen_raw - 0.01
+    assert facts["raw_visibility"] == pytest.approx(seen_raw, abs=1e-4)
+    assert flight_metrics.jerk_rms(points) <= max(0.3 * flight_metrics.jerk_rms(raw), 0.05)
+
+
+def test_a_raw_flight_that_cannot_be_smoothed_is_flown_as_it_is(monkeypatch):
+    scenario, obstacles = scenario_of("tower_midway")
+    raw = search.search_flight(scenario, lattice.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
+    monkeypatch.setattr(smooth, "unsafe", lambda points, *rest: np.ones(len(points), dtype=bool))
+    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    np.testing.assert_array_equal(points, raw)
+    assert not facts["smooth"]
+    assert facts["rounds"] == smooth.ROUNDS_MAX
+
+
+# --- whole flights ----------------------------------------------------------------------------------------------------
+
+
+def fly(planner, scenario, obstacles):
+    return load_planner(planner)(scenario, obstacles, CFG, rng_for(0, "plan", scenario.path_id))
+
+
+def test_where_the_wished_places_see_all_nothing_is_searched():
+    scenario, obstacles = scenario_of("empty")
+    assert fly("foresight", scenario, obstacles).solver["start"] == "wished"
+    assert fly("foresight", *scenario_of("tower_behind")).solver["start"] == "search"
+
+
+def test_it_climbs_over_what_blocks_every_ring():
+    ring = [((15 * np.cos(t), 15 * np.sin(t), 17), (9, 9, 17)) for t in np.arange(0, 2 * np.pi, np.pi / 4)]
+    wall = [((60 * np.cos(t), 60 * np.sin(t), 17), (30, 30, 17)) for t in np.arange(0, 2 * np.pi, np.pi / 4)]
+    obstacles = kernels.obstacle_index(town_of(*ring, *wall))
+    scenario = make_scenario(walk_along("w", [(-2, 0), (2, 0)]), obstacles, CFG)
+    made = fly("foresight", scenario, obstacles)
+    assert made.solver["start"] == "climbing search"
+    assert made.positions_m[:, 2].min() >= 34.0 + 3.0
+
+
+def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
+    """Canopies along the right of the second half of a walk whose wished place, right of the walker, they would hide it from."""
+    canopies = [((x, -6, 6), (4.5, 2.5, 5.5)) for x in range(40, 101, 8)]
+    obstacles = kernels.obstacle_index(town_of(*canopies))
+    scenario = make_scenario(walk_along("w", [(0, 0), (90, 0)]), obstacles, CFG)
+    right = replace(scenario.wish, bearing_rad=np.full_like(scenario.wish.bearing_rad, 1.5 * np.pi))
+    scenario = replace(scenario, wish=right)
+    wished = right.places_m(scenario.targets_m, scenario.ground_m)
+    assert kernels.visibility(obstacles, wished, scenario.targets_m).mean() < 0.6
+    flown = fly("foresight", scenario, obstacles).positions_m
+    assert kernels.visibility(obstacles, flown, scenario.targets_m).mean() > 0.99
+
+
+@pytest.mark.parametrize("bearing_rad", [0.0, np.pi / 2, np.pi])
+def test_a_wished_bearing_counts_for_more_than_a_short_way(bearing_rad):
+    scenario, obstacles = scenario_of("empty")
+    wish = replace(scenario.wish, bearing_rad=np.full_like(scenario.wish.bearing_rad, bearing_rad), any_bearing=False)
+    points = fly("foresight", replace(scenario, wish=wish), obstacles).positions_m
+    away = points - scenario.targets_m
+    off = np.arctan2(away[:, 1], away[:, 0]) - (wish.heading_rad + bearing_rad)
+    assert np.abs(np.angle(np.exp(1j * off))).mean() < np.radians(8)
+    assert np.abs(np.linalg.norm(away, axis=1) - wish.distance_m).mean() < 3.0
+
+
+def test_every_world_is_seen_at_least_as_well_as_from_behind():
+    for world in WORLDS:
+        scenario, obstacles = scenario_of(world)
+        wished = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)
+        made = foresight.plan(scenario, obstacles, CFG, rng_for(0, "plan", world))
+        seen, plain = (kernels.visibility(obstacles, p, scenario.targets_m).mean() for p in (made.positions_m, wished))
+        assert seen >= min(plain, 0.99) - 0.01, world
