@@ -140,7 +140,7 @@ def test_pictures_hold_both_colors(made):
 def test_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
     compare.run(CFG, *inputs, tmp_path / "two", workers=2)
     products = [entry["path"] for entry in json.loads((made / "manifest.json").read_text())["outputs"]]
-    assert len(products) == 6
+    assert len(products) == 4 + len(PLANNERS)
     for name in products:
         assert (tmp_path / "two" / name).read_bytes() == (made / name).read_bytes(), name
 
@@ -162,7 +162,7 @@ def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkey
     monkeypatch.setattr(compare, "plan_flight", lambda walk, *rest: planned.append(walk.path_id) or real(walk, *rest))
     compare.run(CFG, *inputs, tmp_path)
     assert "a" not in planned
-    assert planned.count("b") == 2  # the failed walk is tried again too
+    assert planned.count("b") == len(PLANNERS)  # the failed walk is tried again too
     for entry in json.loads((made / "manifest.json").read_text())["outputs"]:
         assert (tmp_path / entry["path"]).read_bytes() == (made / entry["path"]).read_bytes(), entry["path"]
 
@@ -199,12 +199,30 @@ def test_the_command_prints_the_tables(inputs, made):
 
 
 def test_rows_for_the_terminal(made):
-    figures, axes, wins = compare.text_tables(made / "compare.json")
+    figures, axes, *against, _, wins = compare.text_tables(made / "compare.json")
     assert len(figures.rows) == len(compare.FIGURES) + 1
-    assert figures.columns == ["figure", "TA* + Smooth", "MuCO", "difference", "%"]
+    assert figures.columns[:4] == ["figure", "foresight", "TA* + Smooth", "MuCO"]
+    assert figures.columns[4:] == ["less TA* + Smooth", "%", "less MuCO", "%"]
     assert ["both collision free", "2 of 2", "1.000"] in wins.rows
-    assert wins.title == "TA* + Smooth against MuCO, walk by walk"
+    assert wins.title == "foresight against MuCO, walk by walk"
+    assert [table.columns for table in against] == [["axis", "difference", "from", "to"]] * 2
     assert [row[0] for row in axes.rows] == ["visibility", "path efficiency", "smoothness", "safety", "mean"]
+
+
+def test_intervals_hold_the_difference_and_narrow_with_alike_walks():
+    rng, base = np.random.default_rng(0), {"length_m": 100.0, "jerk_rms_mps3": 1.0, "clearance_min_m": 3.0}
+    wild = [figures(five_ray_mean=v, **base) for v in rng.uniform(0.5, 1.0, 40)]
+    mild = [figures(five_ray_mean=row["five_ray_mean"] - 0.1, **base) for row in wild]
+    steady = [figures(five_ray_mean=0.7, **base) for _ in wild]
+    found = compare.axis_differences({"wild": wild, "mild": mild, "steady": steady}, np.random.default_rng(0))
+    assert found["mild"]["visibility"] == pytest.approx({"difference": 0.1, "low": 0.1, "high": 0.1}, abs=2e-4)
+    apart = found["steady"]["visibility"]
+    expected = np.mean([row["five_ray_mean"] for row in wild]) - 0.7
+    assert apart["difference"] == pytest.approx(expected, abs=2e-4)
+    assert apart["low"] < apart["difference"] < apart["high"]
+    error = np.std([row["five_ray_mean"] for row in wild]) / np.sqrt(40)
+    assert apart["high"] - apart["low"] == pytest.approx(2 * 1.96 * error, rel=0.15)
+    assert found["steady"]["mean"]["difference"] == pytest.approx(expected / 4, abs=2e-4)
 
 
 def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):

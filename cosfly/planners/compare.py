@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_validator
 
+from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
 from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.stage import check_ids, plan_flight, warm_up
@@ -28,7 +29,7 @@ from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
 from cosfly.store import write_bytes, write_json
 
-SCHEMA, VERSION = "cosfly.plan_compare", "2.0"
+SCHEMA, VERSION = "cosfly.plan_compare", "2.1"
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
 # Figures of one flight, in the order of the tables: name, title, digits.
@@ -46,6 +47,7 @@ FIGURES = (
     ("clearance_min_m", "min signed clearance (m)", 2),
 )
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
+NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of walks, for the intervals of axis differences
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -86,6 +88,32 @@ def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float
     return scores
 
 
+def axis_differences(
+    figures: dict[str, list[dict[str, float]]], rng: np.random.Generator
+) -> dict[str, dict[str, dict]]:
+    """Give the first planner's axis scores less each other's, with the 95 % interval over walks drawn with replacement (Efron 1979).
+
+    Args:
+        figures: planner -> figures of the same walks in the same order.
+    """
+    first, *others = figures
+    tables = {planner: np.array([list(row.values()) for row in rows]) for planner, rows in figures.items()}
+    names, num = [name for name, _, _ in FIGURES], len(tables[first])
+    draws = [np.arange(num), *rng.integers(num, size=(NUM_RESAMPLES, num))]
+    scores = [
+        axis_scores({k: dict(zip(names, table[draw].mean(axis=0), strict=True)) for k, table in tables.items()})
+        for draw in draws
+    ]
+    differences: dict[str, dict[str, dict]] = {other: {} for other in others}
+    for other in others:
+        for axis in (*AXES, "mean"):
+            found, *drawn = (score[first][axis] - score[other][axis] for score in scores)
+            low, high = np.percentile(drawn, INTERVAL_PERCENT)
+            row = {"difference": found, "low": low, "high": high}
+            differences[other][axis] = {name: round(float(value), 4) for name, value in row.items()}
+    return differences
+
+
 def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
     """Give difference and relative difference in percent for each figure; none where the second's is 0."""
     table: dict[str, dict[str, float | None]] = {}
@@ -110,13 +138,14 @@ def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> 
     return {name: {"count": sum(won), "of": num, "rate": round(sum(won) / num, 4)} for name, won in wins.items()}
 
 
-def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
+def summarize(flights: dict[str, list[DroneTrace]], rng: np.random.Generator) -> dict:
     """Compare flights of the same walks.
 
     Args:
-        flights: planner -> traces, the same walks in the same order, at least one.
+        flights: planner -> traces, the same walks in the same order, at least one. rng: draws walks for intervals.
     Returns:
-        The tables of `compare.json`. `deltas` and `win_rates` are by the other planner: the first's less its own, the first's wins.
+        The tables of `compare.json`. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first's less
+        its own, the first's wins.
     """
     first, *others = flights
     figures = {planner: [flight_figures(trace) for trace in traces] for planner, traces in flights.items()}
@@ -126,6 +155,7 @@ def summarize(flights: dict[str, list[DroneTrace]]) -> dict:
         "means": means,
         "deltas": {other: deltas(means[first], means[other]) for other in others},
         "axes": axis_scores(means),
+        "axis_differences": axis_differences(figures, rng),
         "win_rates": {other: win_rates(figures[first], figures[other]) for other in others},
         "scenarios": [
             {"id": path_id, **{planner: rows[i] for planner, rows in figures.items()}} for i, path_id in enumerate(ids)
@@ -220,7 +250,11 @@ def run(
     }
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
     named = {name: PLANNERS[name] for name in flights}
-    summary = {"planners": named, **summarize(flights), "left_out": _left_out(finished.records)}
+    summary = {
+        "planners": named,
+        **summarize(flights, rng_for(seed, "plan_compare", "intervals")),
+        "left_out": _left_out(finished.records),
+    }
     write_json(product, {"schema": SCHEMA, "schema_version": VERSION, **header, **summary})
     outputs = [product]
     for name, traces in flights.items():
@@ -288,6 +322,12 @@ def text_tables(product: Path) -> list[TextTable]:
         TextTable("Means over the walks that all fly", columns, figures),
         TextTable("Axis scores, higher is better", ["axis", *titles], axes),
     ]
+    for other, differences in record["axis_differences"].items():
+        rows = [
+            [name.replace("_", " "), *(f"{value:+.3f}" for value in row.values())] for name, row in differences.items()
+        ]
+        title = f"Axis scores, {title_of(first)} less {title_of(other)}, and 95 % of what other walks would give"
+        tables.append(TextTable(title, ["axis", "difference", "from", "to"], rows))
     for other, rates in record["win_rates"].items():
         rows = [
             [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
