@@ -31,14 +31,14 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
     """Give the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it keeps, m.
 
-    Where the wished places are free and see the whole walk, nothing is searched.
+    Where the wished places are free and see all that they are to see, nothing is searched.
 
     Raises:
         NoPathError: no places lead along this walk.
     """
     wished, step_m = scenario.wish.places_m(scenario.targets_m, scenario.ground_m), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    sees_all = bool((visibility(obstacles, wished, scenario.targets_m) == 1.0).all())
+    sees_all = bool((~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)).all())
     if sees_all and not unsafe(wished, obstacles, safety_m, SPEED_SHARE * step_m).any():
         return wished, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):

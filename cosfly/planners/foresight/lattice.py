@@ -22,9 +22,11 @@ STEP_OUT_SHARE, STEP_OUT_MAX_M = (
 )  # of the wished distance; farther apart, the drone could not change rings between keys
 STEP_UP_M = 7.0
 
-# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished distance.
-BEARING_COST, ANY_BEARING_COST = 0.15, 0.007  # per rad^2 off the wished bearing; where any will do
-NEAR_COST, FAR_COST, HIGH_COST = 0.1, 0.03, 0.8
+# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished distance. Where the
+# bearing and the altitude are what the flight is for, 64 degrees off are as dear as the hidden walker.
+BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the wished bearing; where any will do
+HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8
+NEAR_COST, FAR_COST = 0.1, 0.03
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     y = targets[frames, 1, None, None] + radii_m[:, :, None] * np.sin(angles)
     places_m = np.stack([x, y, np.broadcast_to(z[:, :, None], x.shape)], axis=-1)
     off = (radii_m - grounds_m) / distances_m
-    aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + HIGH_COST * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
-    turned = ANY_BEARING_COST if wish.any_bearing else BEARING_COST
+    turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if wish.any_bearing else (BEARING_COST, HIGH_COST)
+    aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()))
 

@@ -53,6 +53,7 @@ def search_flight(
     before, after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
     before[0], after[-1] = hidden[0], hidden[-1]
     own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
+    own[~scenario.wish.keeps_sight[frames]] = 0.0
     own += lattice.costs.reshape(own.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=0)
     chosen = _cheapest(

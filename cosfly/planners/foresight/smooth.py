@@ -15,7 +15,7 @@ from cosfly.kernels import BoxIndex, segments_hit, signed_distances, visibility
 from cosfly.planners.contract import PlanConfig, Scenario
 
 # Weights of the squared distance to the raw flight: where any bearing will do, where the wished one counts, at most for the sake of sight.
-PULL_ANY_BEARING, PULL, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 2.0, 300.0, 4.0
+PULL_ANY_BEARING, PULL, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 20.0, 300.0, 4.0
 # Weights of squared derivatives with respect to time: that of velocity draws the flight tight.
 VELOCITY_S2, ACCELERATION_S4, JERK_S6 = 8.0, 30.0, 100.0
 DIFFERENCES = ((VELOCITY_S2, (-1.0, 1.0)), (ACCELERATION_S4, (1.0, -2.0, 1.0)), (JERK_S6, (-1.0, 3.0, -3.0, 1.0)))
@@ -46,7 +46,7 @@ def smooth_flight(
         points = solveh_banded(system, pulls[:, None] * raw, lower=True)
         points[:, 2] = np.clip(points[:, 2], low, high)
         blocked = unsafe(points, obstacles, clearance_m, cfg.speed_max_mps * dt_s)
-        lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0)
+        lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * wish.keeps_sight
         lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
         lost[(lost < SIGHT_LOSS) | (pulls >= PULL_FOR_SIGHT_MAX)] = 0.0
         is_smooth = not blocked.any()
