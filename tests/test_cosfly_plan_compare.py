@@ -237,7 +237,7 @@ def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
     tables = compare.text_tables(out / "compare.json")
     assert tables[0].columns == ["figure", "MuCO", "again", "TA* + Smooth", "less again", "%", "less TA* + Smooth", "%"]
     assert {len(row) for row in tables[0].rows} == {8}
-    assert [table.title for table in tables[2:]] == [
+    assert [table.title for table in tables[4:]] == [
         "MuCO against again, walk by walk", "MuCO against TA* + Smooth, walk by walk"
     ]  # fmt: skip
     with pytest.raises(ResumeError):

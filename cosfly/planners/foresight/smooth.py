@@ -14,8 +14,10 @@ from scipy.ndimage import gaussian_filter1d
 from cosfly.kernels import BoxIndex, segments_hit, signed_distances, visibility
 from cosfly.planners.contract import PlanConfig, Scenario
 
-# Weights of the squared distance to the raw flight: where any bearing will do, where the wished one counts, at most for the sake of sight.
-PULL_ANY_BEARING, PULL, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 20.0, 300.0, 4.0
+# Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there at wished places,
+# whose halts are part of what is wished; at most for the sake of sight.
+PULL_ANY_BEARING, PULL, PULL_AS_WISHED, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 20.0, 1000.0, 300.0, 4.0
+AS_WISHED_M = 0.5  # from the wished place
 # Weights of squared derivatives with respect to time: that of velocity draws the flight tight.
 VELOCITY_S2, ACCELERATION_S4, JERK_S6 = 8.0, 30.0, 100.0
 DIFFERENCES = ((VELOCITY_S2, (-1.0, 1.0)), (ACCELERATION_S4, (1.0, -2.0, 1.0)), (JERK_S6, (-1.0, 3.0, -3.0, 1.0)))
@@ -39,7 +41,7 @@ def smooth_flight(
     wish, dt_s = scenario.wish, scenario.dt_s
     low, high = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
     seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * wish.distance_m
-    band, pulls = smoothness_band(len(raw), dt_s), np.full(len(raw), PULL_ANY_BEARING if wish.any_bearing else PULL)
+    band, pulls = smoothness_band(len(raw), dt_s), first_pulls(raw, scenario)
     for tried in range(1, ROUNDS_MAX + 1):
         system = band.copy()
         system[0] += pulls
@@ -55,6 +57,14 @@ def smooth_flight(
         pulls = pulls * PULL_RISE ** _spread(np.maximum(lost, blocked), SPREAD_S / dt_s)
     facts = {"raw_visibility": round(float(seen_raw.mean()), 4), "rounds": tried, "smooth": is_smooth}
     return (points if is_smooth else raw), facts
+
+
+def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
+    """Give the pull of each waypoint of a raw flight (n, 3) before anything is lost, (n,)."""
+    if scenario.wish.any_bearing:
+        return np.full(len(raw), PULL_ANY_BEARING)
+    off_m = np.linalg.norm(raw - scenario.wish.places_m(scenario.targets_m, scenario.ground_m), axis=1)
+    return np.where(off_m <= AS_WISHED_M, PULL_AS_WISHED, PULL)
 
 
 def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
