@@ -133,14 +133,8 @@ class WorkerPool:
         try:
             while self._waiting or self._busy():
                 self._hand_out()
-                try:
-                    worker, message = self._messages.get(
-                        timeout=max(0.0, min(next_check_s, next_probe_s) - time.monotonic())
-                    )
-                    if self._workers.get(worker.place) is worker:  # and not one that was given up
-                        yield from self._hear(worker, message)
-                except queue.Empty:
-                    pass
+                for worker, message in self._told(min(next_check_s, next_probe_s)):
+                    yield from self._hear(worker, message)
                 if (now_s := time.monotonic()) >= next_probe_s:
                     next_probe_s = now_s + self.watch.probe_s
                     self.events.probe({w.place: w.process.pid for w in self._workers.values()})
@@ -194,6 +188,14 @@ class WorkerPool:
         return worker
 
     # --- hearing what comes of it -----------------------------------------------------------------------------------------
+
+    def _told(self, until_s: float) -> list[tuple[_Worker, Message | None]]:
+        """Wait for a message, at most until then; those of workers that were given up count no more."""
+        try:
+            worker, message = self._messages.get(timeout=max(0.0, until_s - time.monotonic()))
+        except queue.Empty:
+            return []
+        return [(worker, message)] if self._workers.get(worker.place) is worker else []
 
     def _hear(self, worker: _Worker, message: Message | None) -> Iterator[ItemRecord]:
         if message is None:

@@ -11,7 +11,7 @@ from cosfly.bench.measure import row_of, run
 from cosfly.bench.picture import COLORS, draw_events
 from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
-from cosfly.runner import Item, Watch, run_items
+from cosfly.runner import Item, run_items
 from cosfly.settings import RunConfig
 from cosfly.stage_events import Event, read_events
 from cosfly.stage_folder import Manifest, Tally
@@ -72,9 +72,8 @@ def test_what_cannot_be_measured(tmp_path):
 
 def test_planted_faults_hit_workers_and_are_noticed(tmp_path):
     items = [Item(f"i{k}", ("slow", b"")) for k in range(2)]
-    watch = Watch(heartbeat_s=0.2, check_s=0.5)
     with planted(Faults("kill", 1, 1.0, seed=0), tmp_path / "s") as moments_s:
-        finished = run_items(stage_in(tmp_path), items, make_worker, (tmp_path / "s",), workers=2, watch=watch)
+        finished = run_items(stage_in(tmp_path), items, make_worker, (tmp_path / "s",), workers=2)
     assert finished.tally.kept == 2
     assert len(moments_s) == 1
     assert [e.event for e in read_events(tmp_path / "s") if e.event in WORDS] == ["worker_died"]

@@ -19,7 +19,7 @@ from cosfly.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, read_event
 from cosfly.stage_folder import Failed
 from cosfly.worker_pool import WORDS, limit_s
 
-QUICK = Watch(item_limit_s=1.5, heartbeat_s=0.1, check_s=0.4, probe_s=0.3)  # stalled after 1.2 s
+QUICK = Watch(item_limit_s=2.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)  # stands still after 2 s
 
 
 def items_of(*kinds: str) -> list[Item]:
