@@ -158,6 +158,12 @@ def _has_record(folder: Path, name: str, schema: str) -> bool:
     return isinstance(value, dict) and value.get("schema") == schema
 
 
+def _record_of(path: Path) -> StageRecord | None:
+    """Read what an input was made of; None where nobody says."""
+    folder = _stage_folder(path)
+    return read_stage_record(folder) if folder is not None and _has_record(folder, *RECORDS[1]) else None
+
+
 def _check_finished(path: Path) -> None:
     """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
     folder = _stage_folder(path)
@@ -212,12 +218,12 @@ def _not_as_recorded(where: Path, wrong: list[str]) -> VerifyError:
 
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
     """See that what an input was made of, where it is given too, is what is given."""
-    folder = _stage_folder(path)
-    if folder is None or not _has_record(folder, "stage.json", STAGE_SCHEMA):
+    begun = _record_of(path)
+    if begun is None:
         return
     front = name.rpartition(".")[0]
     peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == front}
-    for made_of, record in read_stage_record(folder).inputs.items():
+    for made_of, record in begun.inputs.items():
         peer = peers.get(_role(made_of), name)
         if peer != name and record.sha256 not in _lineage(inputs[peer], found[peer].sha256):
             raise VerifyError(
@@ -241,19 +247,15 @@ def warn_unbound(paths: Iterable[Path]) -> None:
 
 def was_made_of(product: Path, name: str) -> str | None:
     """Give the fingerprint that an input of a product's stage had; None where there is no record of it."""
-    folder = _stage_folder(product)
-    if folder is None or not _has_record(folder, "stage.json", STAGE_SCHEMA):
-        return None
-    found = read_stage_record(folder).inputs.get(name)
+    begun = _record_of(product)
+    found = begun.inputs.get(name) if begun is not None else None
     return None if found is None else found.sha256
 
 
 def _lineage(path: Path, digest: str) -> set[str]:
     """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
-    record = read_stage_record(path) if _has_record(path, "stage.json", STAGE_SCHEMA) else None
-    return {digest} | (
-        {record.inputs[CONVERTED].sha256} if record is not None and record.stage == CONVERSION else set()
-    )
+    begun = _record_of(path)
+    return {digest} if begun is None or begun.stage != CONVERSION else {digest, begun.inputs[CONVERTED].sha256}
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
