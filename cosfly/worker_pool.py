@@ -156,18 +156,18 @@ class WorkerPool:
         """Give every free worker an item, and start those that are missing."""
         for place in range(self.num_workers):
             worker = self._workers.get(place)
-            if (worker is None or worker.attempt is None) and (attempt := self._next_attempt()) is not None:
+            if (worker is None or worker.attempt is None) and (attempt := self._next_attempt(place)) is not None:
                 worker = self._workers.get(place) or self._start(place)
                 worker.give(attempt)
 
-    def _next_attempt(self) -> _Attempt | None:
-        """Take what is to be done next. A last attempt is made alone: there may not be the memory for two."""
+    def _next_attempt(self, place: int) -> _Attempt | None:
+        """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for two."""
         for k, attempt in enumerate(self._waiting):
             if attempt.number < self.watch.retries or attempt.number == 0:
                 del self._waiting[k]
                 return attempt
         if self._waiting and not self._busy():
-            for worker in list(self._workers.values()):
+            for worker in [worker for worker in self._workers.values() if worker.place != place]:
                 self._stop(worker, PATIENCE_S)
             return self._waiting.popleft()
         return None

@@ -44,11 +44,13 @@ def _tables(bench: Bench) -> list[Table]:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    scaling = Table(title=f"{bench.stage} on {bench.cores} cores", title_justify="left", box=SIMPLE_HEAD)
+    scaling = Table(
+        title=f"{bench.stage} on {bench.cores} cores", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     unit = "frames" if bench.counts_frames else "items"
     for name in ("workers", "wall s", "attempted", "successful", f"{unit}/s", "speed-up", "cores", "MiB"):
         scaling.add_column(name, justify="right")
-    faults = Table(title="faults", title_justify="left", box=SIMPLE_HEAD)
+    faults = Table(title="faults", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in (
         "workers",
         "fault",
