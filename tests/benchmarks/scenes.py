@@ -24,9 +24,9 @@ NUM_WALKS, SEED = 20, 0
 CITY_GAP_M = 20.0  # between the tiles of map (c)
 
 
-def town() -> BoxMap:
-    """Map (a): the synthetic town with the paper's box census, raw."""
-    return load_map(build(MapsConfig, {"synthetic": {"preset": "town10", "name": "Town"}}, "benchmark"), seed=SEED)
+def town(seed: int = SEED) -> BoxMap:
+    """Map (a): the synthetic town with the paper's box census, raw; other seeds give other towns."""
+    return load_map(build(MapsConfig, {"synthetic": {"preset": "town10", "name": "Town"}}, "benchmark"), seed=seed)
 
 
 def city() -> BoxMap | None:
@@ -36,6 +36,15 @@ def city() -> BoxMap | None:
         print(f"(map (b) is left out: {world} is not here)")
         return None
     return load_map(build(MapsConfig, {"source": "simworld", "simworld": {"world": str(world)}}, "benchmark"))
+
+
+def quarter() -> BoxMap | None:
+    """Delft's CityJSON quarter, raw; None where the shared data are absent."""
+    path = SHARED_DATA / "delft-bgt-lod1" / "delft.json.gz"
+    if not path.is_file():
+        print(f"(Delft is left out: {path} is not here)")
+        return None
+    return load_map(build(MapsConfig, {"source": "cityjson", "cityjson": {"path": str(path)}}, "benchmark"))
 
 
 def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
@@ -65,10 +74,10 @@ def simplified(raw: BoxMap) -> BoxMap:
 
 
 def walks_on(box_map: BoxMap, **settings: Any) -> list[Walk]:
-    """20 walks of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
+    """20 walks (`num_paths`) of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
     cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
     ground = walkable_ground(box_map, cfg)
-    names = [f"path_{k:05d}" for k in range(NUM_WALKS)]
+    names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
     return [make_walk(name, ground, cfg, rng_for(SEED, "pedestrians", name)).walk for name in names]
 
 
