@@ -30,7 +30,7 @@ from cosfly.provenance import (
     checked_inputs,
     read_stage_record,
 )
-from cosfly.reading.documents import model_lines, read_model
+from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
 from cosfly.reading.files import sha256_file
 from cosfly.store import dump_json, inside, refuse_links, remove_partials, sha256_bytes, write_bytes, write_model
 
@@ -78,6 +78,18 @@ class Failed(_Record):
 
 
 ItemRecord = Kept | Dropped | Failed
+
+
+def result_of(record: Kept | Dropped, model: type[Model]) -> Model:
+    """Give the result of an item, which may have been done by an earlier run, as the stage's own model.
+
+    Raises:
+        InputError: the journal holds something else; names the field.
+    """
+    with validation_errors(f"items.jsonl: {record.id}: result"):
+        return model.model_validate(record.result)
+
+
 _ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discriminator="status")])
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.client import ChatClient, EndpointConfig
@@ -23,7 +23,7 @@ from cosfly.products.captions import answer_schema, parse_answer
 from cosfly.products.playback import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
+from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
 from cosfly.store import dump_json, sha256_bytes, write_bytes
 from distill.checkpoint import read_adapter_facts
 from distill.encoding import encode, load_pictures, messages_of, most_pixels, prompt_batch
@@ -133,6 +133,12 @@ def make_worker(cfg: InferConfig, data: Path, model: Path, adapter: Path | None,
     return work
 
 
+class _Predicted(BaseModel):
+    """What the journal holds of a batch."""
+
+    predictions: list[Prediction]
+
+
 def _infer(
     cfg: InferConfig, stage: StageFolder, samples: list[Sample], data: Path, model: Path, adapter: Path | None
 ) -> tuple[list[Prediction], Tally]:
@@ -150,7 +156,7 @@ def _infer(
             predictions += [failed_prediction(sample, cfg.split, record.code) for sample in batch]
         else:
             tally.kept += len(batch)
-            predictions += [Prediction.model_validate(prediction) for prediction in record.result["predictions"]]
+            predictions += result_of(record, _Predicted).predictions
     return predictions, tally
 
 

@@ -15,7 +15,7 @@ from typing import IO, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 import cosfly
 from cosfly.config import Config
@@ -27,7 +27,7 @@ from cosfly.provenance import digest_of, folder_digests
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import num_rows, row_groups
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_items
-from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.stage_folder import Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes, write_checksums
 from release import columns
 from release.card import compute_numbers, render_card
@@ -86,7 +86,17 @@ def part_name(item_id: str) -> str:
     return item_id.replace("/", "__") + ".parquet"
 
 
-def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> dict[str, int]:
+class Packaged(BaseModel):
+    """What was packaged of a flight: counts of frames and captions, and the size of its part."""
+
+    frames: int
+    frames_available: int
+    captions: int
+    captions_not_selected: int
+    bytes: int
+
+
+def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> Packaged:
     """Write one flight's selected frames as parquet, in row groups; give its counts.
 
     Raises:
@@ -107,13 +117,13 @@ def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> dict[str, int]
         for batch in _batches(rows, cfg):
             writer.write_table(pa.Table.from_pylist(batch, schema=schema), row_group_size=len(batch))
     num_captions = sum(i in captions for i in selected)
-    return {
-        "frames": len(selected),
-        "frames_available": len(flight),
-        "captions": num_captions,
-        "captions_not_selected": len(captions) - num_captions,
-        "bytes": path.stat().st_size,
-    }
+    return Packaged(
+        frames=len(selected),
+        frames_available=len(flight),
+        captions=num_captions,
+        captions_not_selected=len(captions) - num_captions,
+        bytes=path.stat().st_size,
+    )
 
 
 def _digests(chosen: Chosen) -> dict[str, str]:
@@ -229,7 +239,7 @@ def make_worker(cfg: ReleaseConfig, parts: Path) -> Work:
     """Worker factory: give the function that packages one flight."""
 
     def work(item: Item) -> Outcome:
-        return Outcome(write_part(parts / part_name(item.item_id), item.payload, cfg))
+        return Outcome(write_part(parts / part_name(item.item_id), item.payload, cfg).model_dump())
 
     return work
 
@@ -262,7 +272,7 @@ def run(
     licence = choose_licence(cfg.licence, maps)  # before the work, not after it
     items = [Item(chosen.name, chosen) for chosen in material.chosen]
     finished = run_items(stage, items, make_worker, (cfg, parts), workers=workers, watch=watch, label="release")
-    results = {record.id: record.result for record in finished.kept}
+    results = {record.id: result_of(record, Packaged) for record in finished.kept}
     if not results:
         raise stage.nothing_kept(finished.tally)
     _check_parts(parts, results)
@@ -278,22 +288,22 @@ def run(
     return dataset
 
 
-def _check_parts(parts: Path, results: dict[str, dict]) -> None:
+def _check_parts(parts: Path, results: dict[str, Packaged]) -> None:
     for item_id, result in results.items():
         path = parts / part_name(item_id)
-        if not path.is_file() or path.stat().st_size != result["bytes"]:
-            expected, fix = f"{result['bytes']} bytes", f"remove {parts.parent} and run again"
+        if not path.is_file() or path.stat().st_size != result.bytes:
+            expected, fix = f"{result.bytes} bytes", f"remove {parts.parent} and run again"
             what = "a part that was finished before is missing or has another size"
             raise VerifyError(what, where=path, expected=expected, fix=fix)
 
 
 def account(material: Material, finished: Finished) -> History:
     """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
-    results = [record.result for record in finished.kept]
+    results = [result_of(record, Packaged) for record in finished.kept]
     gone = material.left_out | {f"failed: {code}": count for code, count in finished.tally.failed.items()}
     accepted = sum(len(frames) for captions in material.captions for frames in captions.values())
-    released = sum(result["captions"] for result in results)
-    not_selected = sum(result["captions_not_selected"] for result in results)
+    released = sum(result.captions for result in results)
+    not_selected = sum(result.captions_not_selected for result in results)
     history = History(
         trajectories=material.trajectories,
         flights=FlightHistory(inspected=material.inspected, released=len(results), left_out=gone),
@@ -313,7 +323,7 @@ def account(material: Material, finished: Finished) -> History:
 
 def make_record(
     shards: list[Path],
-    results: dict[str, dict],
+    results: dict[str, Packaged],
     history: History,
     licence: str,
     maps: list[ReleasedMap],
@@ -341,7 +351,7 @@ def make_record(
         numbers=compute_numbers(shards, cfg.num_frames),
         history=history,
         flights=[
-            ReleasedFlight(flight=item_id, frames=result["frames"], frames_available=result["frames_available"])
+            ReleasedFlight(flight=item_id, frames=result.frames, frames_available=result.frames_available)
             for item_id, result in results.items()
         ],
         shards=listed,

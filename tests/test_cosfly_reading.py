@@ -18,6 +18,7 @@ from shapely.geometry import Polygon
 from caption.teachers.foreign import read_foreign
 from cosfly.config import Config, apply_overrides, build, read_yaml
 from cosfly.errors import ConfigError, CosflyError, InputError
+from cosfly.journal import Journal
 from cosfly.maps import cityjson, simworld
 from cosfly.maps.footprints import check_outline, num_crossings
 from cosfly.products.boxes import read_boxes
@@ -32,7 +33,7 @@ from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths
 from cosfly.reading import arrays, documents, files, tables
 from cosfly.reading.limits import Limits, use_limits
-from cosfly.stage_folder import read_failures, read_manifest
+from cosfly.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
 from cosfly.store import CHECKSUMS, inside, read_checksums
 from distill.schema import read_split
 from release.record import read_record
@@ -43,6 +44,10 @@ def limited():
     """Set the limits of this process; afterwards they are as before."""
     yield lambda **changes: use_limits(Limits(**changes))
     use_limits(Limits())
+
+
+class _Dated(Config):
+    name: str = ""
 
 
 # --- every reader, every hostile file ---------------------------------------------------------------------------------
@@ -173,6 +178,37 @@ def test_the_place_of_a_number_is_named(tmp_path):
     (tmp_path / "x.json").write_text('{"a": [0, {"b": 1e999}]}')
     with pytest.raises(InputError, match=r"x\.json: a\[1\]\.b: .*got 1e999"):
         documents.read_json(tmp_path / "x.json")
+
+
+# --- records of stages ------------------------------------------------------------------------------------------------
+
+
+def _with_line(out: Path, record) -> StageFolder:
+    """A stage folder whose journal holds a line with the right checksum: whoever changes a file can change that too."""
+    stage = StageFolder.open(out, "demo", config=_Dated(), inputs={}, seed=0)
+    with Journal(stage.path / "items.jsonl") as journal:
+        journal.append(record)
+    return stage
+
+
+@pytest.mark.parametrize(
+    "record", [{"id": "a"}, {"id": 3, "status": "kept"}, {"id": "a", "status": "kept", "result": 7}], ids=str
+)
+def test_a_forged_line_of_a_journal_is_an_error(tmp_path, record):
+    stage = _with_line(tmp_path / "out", record)
+    with pytest.raises(InputError, match=r"items\.jsonl"):
+        list(stage.items())
+    with pytest.raises(InputError, match=r"items\.jsonl"):
+        StageFolder.open(tmp_path / "out", "demo", config=_Dated(name="other"), inputs={}, seed=0)
+
+
+def test_a_line_of_a_journal_that_is_no_object_is_damage(tmp_path):
+    assert list(_with_line(tmp_path / "out", [1]).items()) == []
+
+
+def test_a_result_of_another_shape_is_named():
+    with pytest.raises(InputError, match=r"items\.jsonl: a: result: name: .*got 7"):
+        result_of(Kept(id="a", result={"name": 7}), _Dated)
 
 
 # --- limits -----------------------------------------------------------------------------------------------------------
@@ -393,10 +429,6 @@ def test_hostile_settings_are_one_clear_line(tmp_path, case):
     if isinstance(text, str) and "\0" not in text:
         with pytest.raises(ConfigError, match="--set a"):
             apply_overrides({}, [f"a={text}"])
-
-
-class _Dated(Config):
-    name: str = ""
 
 
 def test_a_date_is_the_text_that_it_looks_like():

@@ -25,9 +25,8 @@ from cosfly.products.inspection import (
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.provenance import recorded_digests
-from cosfly.reading.documents import validation_errors
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder
+from cosfly.stage_folder import Failed, Resume, StageFolder, result_of
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
@@ -94,8 +93,7 @@ def assemble(
         if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, planned or [], data))
         else:
-            with validation_errors(f"items.jsonl: {outcome.id}"):  # it may be of an earlier run
-                inspected = Inspected.model_validate(outcome.result)
+            inspected = result_of(outcome, Inspected)
             flights.append(inspected.record)
             views[outcome.id] = inspected.view
     flights = _with_twins_trace(flights)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from cosfly.chance import draw_by_share, rng_for
 from cosfly.errors import NoPathError
@@ -38,7 +39,7 @@ from cosfly.products.boxes import read_boxes
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, write_paths
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
+from cosfly.stage_folder import Resume, StageFolder, result_of
 from cosfly.store import write_bytes, write_json
 
 STAGE = "pedestrians"
@@ -119,6 +120,14 @@ def _draw_route(
         expected=f"a cell {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m off in the same walkable area",
         fix="lower min_distance_m, raise max_distance_m, max_detour or num_retries, or widen the region of interest",
     )
+
+
+class _Made(BaseModel):
+    """What the journal holds of a walk."""
+
+    path: dict[str, Any]
+    retries: dict[str, int]
+    seconds: dict[str, float]
 
 
 def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Work:
@@ -210,13 +219,13 @@ def run(
     finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, watch=watch, label="walks")
     if not finished.kept:
         raise stage.nothing_kept(finished.tally)
-    results = [record.result for record in finished.kept]
-    paths = [Walk.from_json(result["path"], f"{out}: items.jsonl") for result in results]
+    results = [result_of(record, _Made) for record in finished.kept]
+    paths = [Walk.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
-        for step, seconds in result["seconds"].items():
-            clock.add(step, seconds)
+        for step, taken_s in result.seconds.items():
+            clock.add(step, taken_s)
     with clock("report"):
-        retries = [result["retries"] for result in results]
+        retries = [result.retries for result in results]
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
         write_json(out / "pedestrians_report.json", summary)

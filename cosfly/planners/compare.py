@@ -13,9 +13,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
@@ -26,7 +27,7 @@ from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
 from cosfly.reading.documents import read_json
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest
+from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest, result_of
 from cosfly.store import write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "2.1"
@@ -245,7 +246,10 @@ def run(
     if not shared:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
     flights = {
-        name: [DroneTrace.from_json(r.result["flights"][name], f"{out}/items.jsonl: {r.id}: {name}") for r in shared]
+        name: [
+            DroneTrace.from_json(result_of(r, _Compared).flights.get(name) or {}, f"{out}/items.jsonl: {r.id}: {name}")
+            for r in shared
+        ]
         for name in cfg.planners
     }
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
@@ -274,6 +278,14 @@ def run(
     return product
 
 
+class _Compared(BaseModel):
+    """What the journal holds of a walk, by planner."""
+
+    flights: dict[str, dict[str, Any]]
+    errors: dict[str, str]
+    times_ms: dict[str, float]
+
+
 def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
     """Walks that are not compared, with the reason of the planner that failed; of a walk that none flies, the first one's."""
     rows = []
@@ -281,7 +293,9 @@ def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
         if isinstance(record, Failed):
             rows.append({"id": record.id, "planner": "all", "message": record.message})
         elif isinstance(record, Dropped):
-            rows += [{"id": record.id, "planner": k, "message": v} for k, v in record.result["errors"].items()]
+            rows += [
+                {"id": record.id, "planner": k, "message": v} for k, v in result_of(record, _Compared).errors.items()
+            ]
     return rows
 
 
@@ -289,7 +303,7 @@ def _timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str,
     """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
     for name in planners:
-        times_ms = np.array([record.result["times_ms"][name] for record in shared])
+        times_ms = np.array([result_of(record, _Compared).times_ms.get(name, 0.0) for record in shared])
         table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
     return table
 

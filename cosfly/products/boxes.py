@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -113,7 +114,7 @@ class BoxMap:
     def name(self) -> str:
         return self.header.name
 
-    @property
+    @cached_property
     def ground(self) -> Ground:
         """The height of the ground, everywhere."""
         return self.header.ground.ground() if self.header.ground else Ground.flat(self.header.ground_z_m)

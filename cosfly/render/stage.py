@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 from cosfly.chance import rng_for
 from cosfly.config import Config, MayDiffer
@@ -30,8 +30,8 @@ from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Kept, Resume, StageFolder, Tally
-from cosfly.store import CHECKSUMS, atomic_folder, dump_json, sha256_bytes, write_json
+from cosfly.stage_folder import Kept, Resume, StageFolder, Tally, result_of
+from cosfly.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
 
 log = logging.getLogger(__name__)
 
@@ -208,19 +208,26 @@ def run(
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)
-    results = [record.result for record in finished.kept]
-    outputs = [out / result["folder"] / name for result in results for name in ("trajectory.json", CHECKSUMS)]
+    made = [result_of(record, _Rendered) for record in finished.kept]
+    outputs = [inside(out, one.folder) / name for one in made for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
         [*outputs, ids_file, map_file],
         finished.tally,
         town=town,
-        flights=results,
-        num_frames=sum(result["num_frames"] for result in results),
+        flights=[record.result for record in finished.kept],
+        num_frames=sum(one.num_frames for one in made),
         num_traces=len(all_traces),
         num_traces_not_rendered=len(all_traces) - len(passed),
         num_boxes_sharing_an_id=num_shared,
     )
     return out
+
+
+class _Rendered(BaseModel):
+    """Of what the journal holds of a flight, what is read again."""
+
+    folder: str
+    num_frames: int
 
 
 def _names(stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, seed: int) -> tuple[str, int]:
@@ -229,7 +236,7 @@ def _names(stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, s
     for record in stage.items():
         number = numbers.get(record.id.rpartition("/")[0])
         if isinstance(record, Kept) and number is not None:
-            place = place_of(Path(record.result["folder"]))
+            place = place_of(Path(result_of(record, _Rendered).folder))
             return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
     town = town_folder(cfg.town or map_name)
     what = dump_json([town, seed, fingerprint(traces), cfg.recorded()])
