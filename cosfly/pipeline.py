@@ -24,10 +24,11 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package
+from cosfly.errors import InputError
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
-from cosfly.reading.documents import read_json
+from cosfly.reading.documents import read_object
 from cosfly.reading.limits import use_limits
 from cosfly.settings import RunConfig, manner_of_work
 from cosfly.stage_folder import Manifest, Resume, read_manifest
@@ -167,7 +168,15 @@ def _save_run(cfg: RunConfig, out: Path) -> None:
 def _save_summary(results: list[StageResult], out: Path) -> None:
     """Write `summary.json`: counts, seconds and peak memory. A resumed run adds to the peak of the one before."""
     path = out / "summary.json"
-    before = read_json(path).get("peak_memory_mb", 0) if path.exists() else 0
+    before = read_object(path, what="summary").get("peak_memory_mb", 0) if path.exists() else 0
+    if not isinstance(before, int | float):
+        raise InputError(
+            "not a summary",
+            where=f"{path}: peak_memory_mb",
+            got=repr(before)[:80],
+            expected="a number",
+            fix="remove it",
+        )
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
     rows = [

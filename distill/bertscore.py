@@ -16,7 +16,7 @@ from pydantic import Field
 from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
-from cosfly.reading.documents import read_json
+from cosfly.reading.documents import read_json, read_object
 from distill.student import Device, pick_device, quiet_transformers, require
 
 Scorer = Callable[[Sequence[str], Sequence[str]], np.ndarray]  # candidates, references -> (n, 3) precision, recall, F1
@@ -90,7 +90,7 @@ def bert_scorer(cfg: BertScoreConfig, folder: Path, references: Sequence[str]) -
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
     # Without this limit in the tokenizer's files the library overflows; two places go to the sentence marks.
-    positions = int(read_json(folder / "config.json").get("max_position_embeddings", 514))
+    positions = read_object(folder / "config.json", what="BERTScore model").get("max_position_embeddings", 514)
     limit = min(int(min(scorer._tokenizer.model_max_length, 10**9)), positions - 2)
     scorer._tokenizer.model_max_length = limit
     if cfg.idf:

@@ -11,8 +11,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_json, read_json
+from cosfly.reading.documents import parse_json, read_json, read_object, validation_errors
 from cosfly.reading.files import read_lines, sha256_file
 from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json
 from distill.student import Student, weight_files
@@ -55,7 +57,7 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any) -> int:
 
     set_peft_model_state_dict(student.model, load_file(folder / "adapter" / "adapter_model.safetensors"))
     optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True, map_location=student.device))
-    return int(read_json(folder / "state.json")["step"])
+    return int(read_object(folder / "state.json", what="checkpoint")["step"])  # its checksums were compared
 
 
 def drop_old_checkpoints(folder: Path, keep: int) -> None:
@@ -104,21 +106,30 @@ def base_digests(model: Path) -> dict[str, str]:
     return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix == ".safetensors"}
 
 
-def read_adapter_facts(adapter: Path, model: Path) -> dict[str, Any]:
+class AdapterFacts(BaseModel):
+    """Of what stands beside an adapter, what those who load it need."""
+
+    base_sha256: dict[str, str]
+    max_pixels: int
+
+
+def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
     """Read what stands beside an adapter, and check that it belongs to the model.
 
     Raises:
-        InputError: it was trained on other weights.
+        InputError: it was trained on other weights, or is malformed.
     """
     path = adapter / ADAPTER_FACTS
-    facts = read_json(path, what="adapter")
+    value = read_json(path, what="adapter")
+    with validation_errors(path):
+        facts = AdapterFacts.model_validate(value)
     found = base_digests(model)
-    if facts.get("base_sha256") != found:
+    if facts.base_sha256 != found:
         raise InputError(
             "the adapter was trained on another model",
             where=path,
             got=json.dumps(found)[:120],
-            expected=json.dumps(facts.get("base_sha256"))[:120],
+            expected=json.dumps(facts.base_sha256)[:120],
             fix="give the model folder that it was trained on",
         )
     return facts

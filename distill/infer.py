@@ -142,11 +142,11 @@ class _Predicted(BaseModel):
 def _infer(
     cfg: InferConfig, stage: StageFolder, samples: list[Sample], data: Path, model: Path, adapter: Path | None
 ) -> tuple[list[Prediction], Tally]:
-    facts = read_adapter_facts(adapter, model) if adapter else {}
+    trained = read_adapter_facts(adapter, model).max_pixels if adapter else most_pixels(samples)
     # Whole batches are the unit of resumption: rounding may depend on what else is in a batch.
     batches = [samples[start : start + cfg.batch_size] for start in range(0, len(samples), cfg.batch_size)]
     items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
-    max_pixels = cfg.max_pixels or int(facts.get("max_pixels", most_pixels(samples)))
+    max_pixels = cfg.max_pixels or trained
     finished = run_items(stage, items, make_worker, (cfg, data, model, adapter, max_pixels), label=STAGE)
     tally = Tally(input=len(samples))
     predictions: list[Prediction] = []

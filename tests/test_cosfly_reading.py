@@ -24,7 +24,7 @@ from cosfly.maps.footprints import check_outline, num_crossings
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import read_captions
 from cosfly.products.frames import depth_bytes, read_depth, read_instance, read_meta, read_rgb, rgb_bytes
-from cosfly.products.inspection import read_inspection
+from cosfly.products.inspection import Inspection, read_inspection, write_inspection
 from cosfly.products.playback import read_flight
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
@@ -204,6 +204,31 @@ def test_a_forged_line_of_a_journal_is_an_error(tmp_path, record):
 
 def test_a_line_of_a_journal_that_is_no_object_is_damage(tmp_path):
     assert list(_with_line(tmp_path / "out", [1]).items()) == []
+
+
+def test_an_inspection_that_tells_of_a_flight_twice(tmp_path):
+    flight = {
+        "town": "Town01",
+        "trajectory": "t",
+        "variant": "ORI",
+        "folder": "Town01/t/ORI",
+        "trace_id": None,
+        "result": "rejected",
+        "issues": [],
+        "metrics": {},
+    }
+    counts = {"planned": 1, "dropped": {}, "not_rendered": 0, "rendered": 1, "accepted": 1, "review": 0, "rejected": 0}
+    flights = {"inspected": 1, "accepted": 1, "review": 0, "rejected": 0, "without_trace": 0, "reasons": {}}
+    funnel = {"trajectories": counts, "flights": flights}
+    once = Inspection(settings={}, funnel=funnel, flights=[flight])
+    write_inspection(tmp_path / "inspect.json", once)
+    assert read_inspection(tmp_path / "inspect.json") == once
+    write_inspection(
+        tmp_path / "inspect.json",
+        Inspection(settings={}, funnel=funnel, flights=[flight, flight | {"result": "accepted"}]),
+    )
+    with pytest.raises(InputError, match=r"flights: a flight has two records; got Town01/t/ORI"):
+        read_inspection(tmp_path / "inspect.json")
 
 
 def test_a_result_of_another_shape_is_named():

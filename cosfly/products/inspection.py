@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from cosfly.errors import InputError
 from cosfly.issues import Issue
 from cosfly.products.playback import ORIGINAL
 from cosfly.reading.documents import read_model
@@ -104,4 +106,10 @@ def read_inspection(path: Path) -> Inspection:
     Raises:
         InputError: names the file and the field.
     """
-    return read_model(path, Inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION, what="inspection")
+    inspection = read_model(path, Inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION, what="inspection")
+    counts = Counter(flight.folder for flight in inspection.flights)
+    if twice := [folder for folder, count in counts.items() if count > 1]:
+        raise InputError(
+            "a flight has two records", where=f"{path}: flights", got=twice[0], expected="one for each folder"
+        )
+    return inspection
