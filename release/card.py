@@ -14,10 +14,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from cosfly.coverage_page import ranges, shares
 from cosfly.escaping import for_markdown, for_terminal, markdown_code
 from cosfly.products.captions import FIELDS
+from cosfly.products.coverage import NAMED, Coverage, axis_values
 from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
 from cosfly.reading.tables import open_table, rows_of
@@ -66,72 +69,109 @@ def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
     Returns:
         sums are exact (fsum), so that the same rows give the same digits everywhere.
     """
-    counts = {name: Counter[str]() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
-    totals, characters = Counter[str](), Counter[str]()
-    flights: dict[tuple[str, ...], list[tuple[float, float, float, float]]] = {}
-    samples: dict[str, list[float]] = {name: [] for name in ("height_m", "distance_m", "visibility", *CAPTION_SHARES)}
-    fovs: dict[tuple[str, ...], str] = {}  # a trajectory keeps its field of view
-    example: dict[str, str] = {}
+    counted = _Rows()
     for row in read_rows(shards):
-        totals.update(name for name in FLAGS if row[name])
-        fov = fovs[row["run"], row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
+        counted.add(row)
+    return counted.numbers(shards, num_frames)
+
+
+class _Rows:
+    """Counts and values of rows that were read one after the other."""
+
+    def __init__(self) -> None:
+        self.counts = {name: Counter[str]() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
+        self.totals, self.characters = Counter[str](), Counter[str]()
+        self.flights: dict[tuple[str, ...], list[tuple[float, float, float, float]]] = {}
+        self.samples: dict[str, list[float]] = {
+            name: [] for name in ("height_m", "distance_m", "visibility", *CAPTION_SHARES)
+        }
+        self.fovs: dict[tuple[str, ...], str] = {}  # a trajectory keeps its field of view
+        self.example: dict[str, str] = {}
+        self.seen: list[
+            tuple[float, ...]
+        ] = []  # for the coverage: person to drone (x, y, z), heading, height in px, visibility
+        self.named: dict[str, list[str]] = {name: [] for name in NAMED}
+
+    def add(self, row: dict[str, Any]) -> None:
+        self.totals.update(name for name in FLAGS if row[name])
+        fov = self.fovs[row["run"], row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
         size = f"{row['width_px']} x {row['height_px']}"
         for name, value in {"town": row["town"], "track": row["track"], "fov_deg": fov, "image_px": size}.items():
-            counts[name][value] += 1
-        pose, target = row["pose"], row["target"]
-        flight = flights.setdefault((row["track"], *(row[name] for name in PLACE)), [])
+            self.counts[name][value] += 1
+        pose, target, box = row["pose"], row["target"], row["target_mask_bbox"]
+        flight = self.flights.setdefault((row["track"], *(row[name] for name in PLACE)), [])
         flight.append((row["time_s"], pose["x_m"], pose["y_m"], pose["z_m"]))
+        offset = [math.nan] * 3 if target is None else [pose[axis] - target[axis] for axis in POINT]
         if target is not None:
-            offset = [pose[axis] - target[axis] for axis in POINT]
-            samples["height_m"].append(offset[2])
-            samples["distance_m"].append(math.hypot(*offset))
+            self.samples["height_m"].append(offset[2])
+            self.samples["distance_m"].append(math.hypot(*offset))
         for name in ("visibility", *CAPTION_SHARES):
             if row[name] is not None:
-                samples[name].append(row[name])
+                self.samples[name].append(row[name])
+        height_px = None if box is None else box["ymax_px"] - box["ymin_px"]
+        known = (row["target_heading_deg"], height_px, row["visibility"])
+        self.seen.append((*offset, *(math.nan if value is None else value for value in known)))
+        for kind, column in zip(NAMED, ("style", "pace", "label"), strict=True):
+            self.named[kind] += [row[column]] if row[column] is not None else []
         if row["has_caption"]:
-            for name in CAPTION_FACTS:
-                counts[name]["none" if row[name] is None else row[name]] += 1
-            totals["with_label"] += row["label"] is not None
-            totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
-            example = example or {"sample_id": row["sample_id"], **{name: row[name] for name in CAPTION_FIELDS}}
-            characters.update({name: len(row[name] or "") for name in CAPTION_FIELDS})
-    num_rows, num_captions = sum(counts["town"].values()), totals["has_caption"]
-    captions: dict[str, Any] = {name: _sorted(counts[name]) for name in CAPTION_FACTS}
-    return Numbers(
-        frames=num_rows,
-        flights=len(flights),
-        trajectories=len(fovs),
-        frames_by=FramesBy(**{name: _sorted(counts[name]) for name in FramesBy.model_fields}),
-        trajectories_by_fov_deg=_sorted(Counter(fovs.values())),
-        flights_by_track=_sorted(Counter(track for track, *_ in flights)),
-        frames_per_flight=_spread([float(len(points)) for points in flights.values()]),
-        flights_shorter_than_num_frames=sum(len(points) < num_frames for points in flights.values()),
-        flight_duration_s=_spread([points[-1][0] - points[0][0] for points in flights.values()]),
-        flight_length_m=_spread([_length(points) for points in flights.values()]),
-        height_over_target_m=_spread(samples["height_m"]),
-        distance_to_target_m=_spread(samples["distance_m"]),
-        visibility=_spread(samples["visibility"]),
-        frames_perturbed=totals["is_perturbed"],
-        frames_target_in_view=totals["target_in_view"],
-        frames_target_visible=totals["target_visible"],
-        captions=CaptionNumbers(
+            self._add_caption(row)
+
+    def _add_caption(self, row: dict[str, Any]) -> None:
+        for name in CAPTION_FACTS:
+            self.counts[name]["none" if row[name] is None else row[name]] += 1
+        self.totals["with_label"] += row["label"] is not None
+        self.totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
+        texts = {name: row[name] for name in CAPTION_FIELDS}
+        self.example = self.example or {"sample_id": row["sample_id"], **texts}
+        self.characters.update({name: len(text or "") for name, text in texts.items()})
+
+    def numbers(self, shards: list[Path], num_frames: int) -> Numbers:
+        flights, samples, totals = self.flights.values(), self.samples, self.totals
+        return Numbers(
+            frames=len(self.seen),
+            flights=len(flights),
+            trajectories=len(self.fovs),
+            frames_by=FramesBy(**{name: _sorted(self.counts[name]) for name in FramesBy.model_fields}),
+            trajectories_by_fov_deg=_sorted(Counter(self.fovs.values())),
+            flights_by_track=_sorted(Counter(track for track, *_ in self.flights)),
+            frames_per_flight=_spread([float(len(points)) for points in flights]),
+            flights_shorter_than_num_frames=sum(len(points) < num_frames for points in flights),
+            flight_duration_s=_spread([points[-1][0] - points[0][0] for points in flights]),
+            flight_length_m=_spread([_length(points) for points in flights]),
+            height_over_target_m=_spread(samples["height_m"]),
+            distance_to_target_m=_spread(samples["distance_m"]),
+            visibility=_spread(samples["visibility"]),
+            frames_perturbed=totals["is_perturbed"],
+            frames_target_in_view=totals["target_in_view"],
+            frames_target_visible=totals["target_visible"],
+            coverage=self._coverage(),
+            captions=self._captions(),
+            files=FileNumbers(
+                shards=len(shards),
+                bytes=sum(shard.stat().st_size for shard in shards),
+                bytes_by_modality=stored_bytes(shards),
+            ),
+        )
+
+    def _coverage(self) -> Coverage:
+        seen = np.array(self.seen, dtype=np.float64).reshape(-1, 6)
+        return Coverage.of(axis_values(seen[:, :3], *seen[:, 3:].T), *(self.named[kind] for kind in NAMED))
+
+    def _captions(self) -> CaptionNumbers:
+        num_captions, characters = self.totals["has_caption"], self.characters
+        facts: dict[str, Any] = {name: _sorted(self.counts[name]) for name in CAPTION_FACTS}
+        return CaptionNumbers(
             frames_with=num_captions,
-            frames_without=num_rows - num_captions,
-            with_label=totals["with_label"],
-            decision_equals_label=totals["decision_equals_label"],
-            **captions,
-            mean_proved={name: _spread(samples[name]).mean for name in CAPTION_SHARES},
+            frames_without=len(self.seen) - num_captions,
+            with_label=self.totals["with_label"],
+            decision_equals_label=self.totals["decision_equals_label"],
+            **facts,
+            mean_proved={name: _spread(self.samples[name]).mean for name in CAPTION_SHARES},
             mean_characters={
                 name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS
             },
-            example=example,
-        ),
-        files=FileNumbers(
-            shards=len(shards),
-            bytes=sum(shard.stat().st_size for shard in shards),
-            bytes_by_modality=stored_bytes(shards),
-        ),
-    )
+            example=self.example,
+        )
 
 
 def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
@@ -208,6 +248,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
             ("decision", "frames", "share"),
             [(_Code(name), f"{n:,}", _share(n, captions.frames_with)) for name, n in captions.decision.items()],
         ),
+        "coverage_table": _covered(numbers.coverage),
         "provenance_table": _provenance(captions),
         "characters_table": _characters(captions.mean_characters),
         "files_table": _table(
@@ -294,6 +335,14 @@ def _spreads(numbers: Numbers) -> str:
         values = (spread.mean, spread.std, spread.min, spread.max)
         rows.append((title, *("-" if value is None else f"{value:,.3f}" for value in values), f"{spread.count:,}"))
     return _table(("", "mean", "std", "min", "max", "values"), rows)
+
+
+def _covered(coverage: Coverage) -> str:
+    tables = [_table(("5 % to 95 % of the frames", "here", "plain run"), ranges(coverage))]
+    for kind in NAMED:
+        rows = [(_Code(name), f"{n:,}", share, plain) for name, n, share, plain in shares(coverage, kind)]
+        tables += [_table((kind, "frames", "share", "plain run"), rows)] if rows else []
+    return "\n\n".join(tables)
 
 
 def _characters(mean: dict[str, float | None]) -> str:

@@ -52,7 +52,7 @@ CONTRACT: dict[str, Any] = {
     "projection": "u = fx * x / z + cx, v = fy * y / z + cy for a point (x, y, z) in camera axes",
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
-    "target": "hip of the tracked person",
+    "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
     "offsets": "the perturbation of the frame, already contained in pose and target; where a position was shifted the camera "
     "was aimed anew, and the rotation offset is its turn away from that aim",
     "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of the view): none, applied, "
@@ -126,6 +126,8 @@ SCALARS = (  # everything but pictures and depth
     Column("trajectory", "string", lambda f, i, _: f.trajectory),
     Column("variant", "string", lambda f, i, _: f.variant),
     Column("track", "string", lambda f, i, _: "clean" if f.is_original else "perturbed"),
+    Column("style", "string", lambda f, i, _: f.styles[i]),
+    Column("pace", "string", lambda f, i, _: f.pace),
     Column("frame_index", "int32", lambda f, i, _: i),
     Column("time_s", "float64", lambda f, i, _: f.time_s[i]),
     Column("width_px", "int32", lambda f, i, _: f.camera.width_px),
@@ -134,6 +136,7 @@ SCALARS = (  # everything but pictures and depth
     Column("intrinsics", ("fx", "fy", "cx", "cy"), lambda f, i, _: f.camera.intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
     Column("pose", POSE, lambda f, i, _: np.concatenate([f.positions_m[i], f.rotations_deg[i]])),
     Column("target", POINT, lambda f, i, _: f.targets_m[i]),
+    Column("target_heading_deg", "float64", lambda f, i, _: f.target_headings_deg[i]),
     Column("target_uv", ("u_px", "v_px"), lambda f, i, _: f.target_uv[i]),
     Column("target_bbox", BOX, lambda f, i, _: f.target_bbox[i]),
     Column(

@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosfly.products.coverage import Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
@@ -116,6 +117,7 @@ class Numbers(Strict):
     frames_perturbed: int
     frames_target_in_view: int
     frames_target_visible: int
+    coverage: Coverage
     captions: CaptionNumbers
     files: FileNumbers
 

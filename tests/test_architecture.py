@@ -14,16 +14,16 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
-SHARED = ("kernels", "grid", "flight_metrics", "topview", "frame_views")  # what several stages use; knows products
-ASSEMBLY = (
-    "cli",
-    "pipeline",
-    "settings",
-    "doctor",
-    "gallery",
-    "bench",
-    "__main__",
-)  # what may know all stages and siblings
+SHARED = (
+    "kernels",
+    "grid",
+    "flight_metrics",
+    "topview",
+    "frame_views",
+    "coverage_page",
+)  # what several stages use; knows products
+# What may know all stages and siblings.
+ASSEMBLY = ("cli", "pipeline", "settings", "doctor", "gallery", "bench", "__main__")
 HEAVY = {
     "torch",
     "transformers",

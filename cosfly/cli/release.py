@@ -64,3 +64,14 @@ def release_verify(
     typer.echo(str(report))
     if not report.is_ok:
         raise typer.Exit(1)
+
+
+@app.command("stats")
+def release_stats(
+    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    out: Annotated[Path, typer.Option(help="Folder for stats.html and stats.json.")],
+) -> None:
+    """Draw what a release covers (heights, distances, azimuths, sizes, styles, paces, labels) beside the plain run that ships."""
+    from release import stats
+
+    typer.echo(stats.run(folder, out))

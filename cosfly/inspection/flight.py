@@ -38,6 +38,7 @@ from cosfly.inspection.frames import (
 )
 from cosfly.inspection.report import FlightView, draw_flight
 from cosfly.issues import Report
+from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.inspection import FlightInspection
 from cosfly.products.inspection import Result as FlightResult
 from cosfly.products.playback import Flight, read_flight, read_twin
@@ -106,6 +107,7 @@ class Inspected(BaseModel):
 
     record: FlightInspection
     view: FlightView
+    coverage: Coverage
 
 
 def inspect_flight(
@@ -157,7 +159,8 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    return Inspected(record=record, view=draw_flight(flight, _heights_m(flight), cfg.thumbnail_px))
+    view = draw_flight(flight, _heights_m(flight), cfg.thumbnail_px)
+    return Inspected(record=record, view=view, coverage=coverage_of(flight))
 
 
 def _digest(folder: Path) -> str | None:

@@ -8,6 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
+from cosfly.coverage_page import STYLE as COVERAGE_STYLE
+from cosfly.coverage_page import coverage_html
 from cosfly.escaping import for_html, html_page
 from cosfly.frame_views import thumbnail
 from cosfly.issues import Issue
@@ -74,7 +76,7 @@ def report_html(inspection: Inspection, views: dict[str, FlightView]) -> str:
 <p class="lead">{for_html(summary)} A rejected flight breaks a rule; one in review is for a person to decide.</p>
 <h2>Funnel</h2>
 <div class="funnel">{_funnel(inspection)}</div>
-<h2>Flights</h2>
+{_covered(inspection)}<h2>Flights</h2>
 <p class="lead">a, j: RMS acceleration and jerk of the plan; S: smoothness score; clear: least distance of the
 drawn poses to an obstacle; five-ray: their mean visibility on the map; rendered: mean visibility of the target in the frames; visible: frames that show it; IoU: projected box against mask.</p>
 <div class="scroll"><table><thead><tr><th>flight</th><th>first, middle, last frame</th>{heads}<th>height over person, visibility</th></tr></thead><tbody>
@@ -82,7 +84,16 @@ drawn poses to an obstacle; five-ray: their mean visibility on the map; rendered
 </tbody></table></div>
 <h2>Settings</h2>
 <p class="lead">{for_html(", ".join(f"{name} {value}" for name, value in inspection.settings.items()))}</p>"""
-    return html_page("cosfly: inspection", STYLE, body)
+    return html_page("cosfly: inspection", STYLE + COVERAGE_STYLE, body)
+
+
+def _covered(inspection: Inspection) -> str:
+    if inspection.coverage is None or not inspection.coverage.frames:
+        return ""
+    lead = (
+        f"{inspection.coverage.frames:,} frames of accepted flights; the line is the plain run that ships (quickstart)."
+    )
+    return f'<h2>What is covered</h2>\n<p class="lead">{lead}</p>\n{coverage_html(inspection.coverage)}\n'
 
 
 def _funnel(inspection: Inspection) -> str:

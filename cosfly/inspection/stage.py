@@ -14,6 +14,7 @@ from cosfly.inspection.flight import InspectConfig, Inspected, inspect_flight, t
 from cosfly.inspection.report import FlightView, write_report
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
+from cosfly.products.coverage import Coverage
 from cosfly.products.inspection import (
     FlightFunnel,
     FlightInspection,
@@ -89,6 +90,7 @@ def assemble(
     """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
     flights: list[FlightInspection] = []
     views: dict[str, FlightView] = {}
+    covered: list[Coverage] = []
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, planned or [], data))
@@ -96,10 +98,13 @@ def assemble(
             inspected = result_of(outcome, Inspected)
             flights.append(inspected.record)
             views[outcome.id] = inspected.view
+            if inspected.record.result == "accepted":
+                covered.append(inspected.coverage)
     flights = _with_twins_trace(flights)
     funnel = Funnel(trajectories=_trajectory_funnel(flights, planned), flights=_flight_funnel(flights))
     funnel.trajectories.check()
-    return Inspection(settings=cfg.model_dump(mode="json"), funnel=funnel, flights=flights), views
+    settings, coverage = cfg.model_dump(mode="json"), Coverage.total(covered)
+    return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=flights), views
 
 
 def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> FlightInspection:

@@ -29,7 +29,8 @@ from cosfly.flight_metrics import (
     SAFETY_DISTANCE_M,
 )
 from cosfly.geometry import DT_S
-from cosfly.planners.styles.table import FOLLOW, NAMES
+from cosfly.planners.styles.table import NAMES
+from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex

@@ -18,8 +18,8 @@ from cosfly.errors import InputError, NoPathError
 from cosfly.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
 from cosfly.geometry import DT_S, step_s
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
-from cosfly.planners.styles.table import FOLLOW
 from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.segments import FOLLOW
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.runner import Item, Outcome, Watch, Work, run_items

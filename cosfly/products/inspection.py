@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.issues import Issue
+from cosfly.products.coverage import Coverage
 from cosfly.products.playback import ORIGINAL
 from cosfly.reading.documents import read_model
 from cosfly.store import write_model
@@ -92,6 +93,7 @@ class Inspection(_Strict):
 
     settings: dict[str, Any]
     funnel: Funnel
+    coverage: Coverage | None = None  # of the accepted flights; None in inspections of before
     flights: list[FlightInspection]
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
 from cosfly.products.places import tree_of_flight
-from cosfly.products.segments import Mission, Segment, flown_as_json, mirrored
+from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
     BBOX,
     SCHEMA,
@@ -34,6 +35,7 @@ from cosfly.products.trajectory import (
     offsets_of,
     vectors_of,
 )
+from cosfly.products.walks import pace_of
 from cosfly.reading.documents import read_json
 from cosfly.store import write_json
 
@@ -41,6 +43,10 @@ ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
 TWIN_TOLERANCE_S = 1e-3
+HEADING_FRAMES, STANDS_M = (
+    2,
+    0.1,
+)  # whither a person walks: the way from so many frames before to so many after; less is standing
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,29 @@ class Flight:
     def flight_id(self) -> str:
         """`trajectory_1776047127_ORI`, the stem of its sample ids."""
         return self.given_id or f"{self.trajectory}_{self.variant}"
+
+    @cached_property
+    def styles(self) -> list[str]:
+        """The style that each frame was flown in."""
+        styles = [FOLLOW] * len(self)
+        for part in self.segments:
+            styles[part.begin : part.end] = [part.style] * (part.end - part.begin)
+        return styles
+
+    @cached_property
+    def target_headings_deg(self) -> np.ndarray:
+        """Whither the person walks at each frame, (n,) counter-clockwise from east; NaN before the first step and where nobody is."""
+        frames = np.arange(len(self))
+        ahead, behind = np.minimum(frames + HEADING_FRAMES, len(self) - 1), np.maximum(frames - HEADING_FRAMES, 0)
+        steps = self.targets_m[ahead, :2] - self.targets_m[behind, :2]
+        moves = np.linalg.norm(np.nan_to_num(steps), axis=1) >= STANDS_M
+        last = np.maximum.accumulate(np.where(moves, frames, -1))  # who stands keeps the direction of before
+        return np.where(last >= 0, np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))[last], np.nan)
+
+    @property
+    def pace(self) -> str:
+        """The pace of the walk that it follows."""
+        return pace_of(self.source, str(self.folder))
 
     @property
     def keeps_sight(self) -> np.ndarray:

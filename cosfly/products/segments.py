@@ -11,6 +11,7 @@ from typing import Any
 from cosfly.errors import InputError
 from cosfly.products.columns import LARGEST
 
+FOLLOW = "follow"  # the style where nothing else is said
 MISSION_KINDS = ("geofence", "battery", "time_over")
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.table import ALTITUDE_LEAST_M, FOLLOW, TABLE, Range, Style
+from cosfly.planners.styles.table import ALTITUDE_LEAST_M, TABLE, Range, Style
+from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex

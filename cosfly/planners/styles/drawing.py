@@ -11,8 +11,8 @@ from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles.courses import wish_of
 from cosfly.planners.styles.mission import wish_of_mission
 from cosfly.planners.styles.reacquire import finds_again, wish_of_reacquire
-from cosfly.planners.styles.table import FOLLOW, REACQUIRE, RETURN_HOME, WHOLE
-from cosfly.products.segments import Mission, Segment
+from cosfly.planners.styles.table import REACQUIRE, RETURN_HOME, WHOLE
+from cosfly.products.segments import FOLLOW, Mission, Segment
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-FOLLOW, REACQUIRE, RETURN_HOME = "follow", "reacquire", "return_home"
+from cosfly.products.segments import FOLLOW
+
+REACQUIRE, RETURN_HOME = "reacquire", "return_home"
 ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, which keeps that of the settings
 
 Range = tuple[float, float]  # a value is drawn evenly from it for each part of a flight

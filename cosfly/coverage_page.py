@@ -1,0 +1,95 @@
+"""What a run covers, for people: histograms and tables as HTML, and as Markdown, beside the plain run that ships. Used by inspection and release."""
+
+from __future__ import annotations
+
+from cosfly.escaping import for_html
+from cosfly.products.coverage import AXES, NAMED, Axis, Coverage, default_coverage
+
+WIDTH_PX, HEIGHT_PX = 300.0, 110.0
+INK, BESIDE = "#2b6cb0", "#c05621"
+STYLE = """
+.coverage { display: grid; grid-template-columns: repeat(auto-fit, minmax(330px, 1fr)); gap: 12px; }
+.coverage .panel { background: #fff; border: 1px solid #e2e8f0; border-radius: 8px; padding: 12px 16px; }
+.coverage h3 { font-size: 14px; margin: 0 0 6px; } .coverage small { color: #718096; } .coverage table { width: 100%; }
+.coverage td, .coverage th { padding: 3px 8px 3px 0; border-bottom: 1px solid #e2e8f0; position: static; background: none; }
+"""
+
+
+def coverage_html(coverage: Coverage) -> str:
+    """Give a grid of histograms, one an axis, and of tables, one for each kind of name; blue bars, and the plain run as a red line."""
+    plain = default_coverage()
+    panels = [
+        f"<h3>{axis.title}{', ' * bool(axis.unit)}{axis.unit}</h3>{_histogram(axis, coverage.bins.get(name, []), plain.bins[name])}"
+        f"<small>5 % to 95 % of the frames: {_range(coverage, name)}; plain run: {_range(plain, name)}</small>"
+        for name, axis in AXES.items()
+    ]
+    for kind in NAMED:
+        rows = "".join(
+            f'<tr><td>{for_html(name.replace("_", " "))}</td><td class="n">{count:,}</td><td class="n">{share}</td>'
+            f'<td class="n">{beside}</td></tr>'
+            for name, count, share, beside in shares(coverage, kind)
+        )
+        if rows:
+            head = (
+                f'<tr><th>{kind}</th><th class="n">frames</th><th class="n">share</th><th class="n">plain run</th></tr>'
+            )
+            panels.append(f"<table>{head}{rows}</table>")
+    return '<div class="coverage">' + "".join(f'<div class="panel">{panel}</div>' for panel in panels) + "</div>"
+
+
+def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
+    """Give a row for each axis: title, 5 % to 95 % of the frames, the same of the plain run."""
+    plain = default_coverage()
+    return [
+        (f"{axis.title}{', ' * bool(axis.unit)}{axis.unit}", _range(coverage, name), _range(plain, name))
+        for name, axis in AXES.items()
+    ]
+
+
+def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
+    """Give a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where none is known."""
+    counts, plain = getattr(coverage, kind), getattr(default_coverage(), kind)
+    if not counts:
+        return []
+    names = sorted({*counts, *plain}, key=lambda name: (-counts.get(name, 0), name))
+    return [(name, counts.get(name, 0), _share(counts, name), _share(plain, name)) for name in names]
+
+
+def _share(counts: dict[str, int], name: str) -> str:
+    total = sum(counts.values())
+    return f"{100.0 * counts.get(name, 0) / total:.1f} %" if total else "-"
+
+
+def _range(coverage: Coverage, name: str) -> str:
+    low, high = coverage.range_of(name)
+    digits = 2 if AXES[name].step < 1.0 else 0
+    return "-" if low is None or high is None else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def _histogram(axis: Axis, counts: list[int], beside: list[int]) -> str:
+    """Draw shares of frames by bin; the plain run's as a line of steps."""
+    heights = [[value / (sum(row) or 1) for value in row] for row in (counts, beside) if row]
+    top = max((max(row) for row in heights), default=0.0) or 1.0
+    filled = [k for row in (counts, beside) for k, value in enumerate(row) if value] or [0]
+    first, last = min(filled), max(filled)
+    step = WIDTH_PX / max(8, last - first + 1)
+    bars = "".join(
+        f'<rect x="{(k - first) * step:.1f}" y="{HEIGHT_PX * (1 - share / top):.1f}" width="{max(1.0, step - 1):.1f}" '
+        f'height="{HEIGHT_PX * share / top:.1f}" fill="{INK}"><title>{axis.low + k * axis.step:g} to '
+        f"{axis.low + (k + 1) * axis.step:g} {axis.unit}: {100 * share:.1f} %</title></rect>"
+        for k, share in enumerate(heights[0] if counts else [])
+        if first <= k <= last
+    )
+    line = " ".join(
+        f"{(k - first + side) * step:.1f},{HEIGHT_PX * (1 - share / top):.1f}"
+        for k, share in enumerate(heights[-1])
+        if first <= k <= last
+        for side in (0, 1)
+    )
+    ends = [axis.low + first * axis.step, axis.low + (last + 1) * axis.step]
+    return (
+        f'<svg viewBox="0 0 {WIDTH_PX:.0f} {HEIGHT_PX + 16:.0f}" width="100%" font-size="11" fill="#4a5568">{bars}'
+        f'<polyline points="{line}" fill="none" stroke="{BESIDE}" stroke-width="1.5"/>'
+        f'<text x="0" y="{HEIGHT_PX + 13:.0f}">{ends[0]:g}</text>'
+        f'<text x="{(last - first + 1) * step:.0f}" y="{HEIGHT_PX + 13:.0f}" text-anchor="end">{ends[1]:g}</text></svg>'
+    )

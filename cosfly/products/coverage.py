@@ -1,0 +1,140 @@
+"""How much of what could be flown was flown: heights, distances, directions, sizes, occlusion, styles and paces, frame by frame.
+
+A student cannot learn what it never sees. Counts of frames in fixed bins, so that flights, runs and releases add up; each shown beside those of
+the plain run that ships (`default_coverage.json`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.products.playback import Flight
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.reading.documents import read_json, validation_errors
+
+DEFAULT = Path(__file__).with_name("default_coverage.json")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Bins of one quantity: `num_bins` of `step` from `low`; what lies beyond counts in the outermost."""
+
+    title: str
+    unit: str
+    low: float
+    step: float
+    num_bins: int
+
+    def counts(self, values: np.ndarray) -> list[int]:
+        """Count the values, (n,), in each bin; NaN counts nowhere."""
+        known = np.asarray(values, dtype=np.float64)
+        known = known[~np.isnan(known)]
+        bins = np.clip(np.floor((known - self.low) / self.step), 0, self.num_bins - 1).astype(int)
+        return np.bincount(bins, minlength=self.num_bins).tolist()
+
+    def percentile(self, counts: list[int], share: float) -> float | None:
+        """Give the value that a share of the frames stay below, to a part of a bin; None without any."""
+        total = sum(counts)
+        if not total:
+            return None
+        ends = np.cumsum(counts) / total
+        k = int(np.searchsorted(ends, share))
+        before = ends[k - 1] if k else 0.0
+        return float(self.low + self.step * (k + (share - before) / max(ends[k] - before, 1e-12)))
+
+
+AXES = {
+    "height_m": Axis("height over the person's ground", "m", 0.0, 2.0, 50),
+    "distance_m": Axis("distance to the person", "m", 0.0, 2.0, 50),
+    "azimuth_deg": Axis("where the drone stands round the walker: 0 in front, 90 to the left", "deg", -180.0, 15.0, 24),
+    "target_height_px": Axis("height of the person in the picture", "px", 0.0, 4.0, 50),
+    "visibility": Axis("visible share of the person", "", 0.0, 0.05, 20),
+}
+
+NAMED = ("styles", "paces", "labels")
+
+
+class Coverage(BaseModel):
+    """Frames by bin of each axis, by style, by pace, and by label, which only captions tell."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    frames: int = 0
+    bins: dict[str, list[int]] = {}
+    styles: dict[str, int] = {}
+    paces: dict[str, int] = {}
+    labels: dict[str, int] = {}
+
+    @classmethod
+    def of(
+        cls, values: Mapping[str, np.ndarray], styles: Iterable[str], paces: Iterable[str], labels: Iterable[str] = ()
+    ) -> Coverage:
+        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have one."""
+        named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels)]
+        counted = {name: axis.counts(values[name]) for name, axis in AXES.items()}
+        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip(NAMED, named, strict=True)))
+
+    @classmethod
+    def total(cls, parts: Iterable[Coverage]) -> Coverage:
+        """Add up the frames of many."""
+        parts = list(parts)
+        bins = {name: np.sum([part.bins[name] for part in parts], axis=0).tolist() for name in AXES if parts}
+        named = {
+            name: dict(sorted(sum((Counter(getattr(part, name)) for part in parts), Counter()).items()))
+            for name in NAMED
+        }
+        return cls(frames=sum(part.frames for part in parts), bins=bins, **named)
+
+    def range_of(self, name: str) -> tuple[float | None, float | None]:
+        """Give the 5th and the 95th percentile of an axis."""
+        counts = self.bins.get(name, [])
+        return AXES[name].percentile(counts, 0.05), AXES[name].percentile(counts, 0.95)
+
+
+def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
+    """Give where the drone stands as seen from the walker: (n,) degrees from the heading, -180 to 180, left positive.
+
+    Args:
+        offsets_m: (n, 3) from person to drone. headings_deg: (n,), whither the person walks.
+    """
+    bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
+    return (bearing - headings_deg + 180.0) % 360.0 - 180.0
+
+
+def axis_values(
+    offsets_m: np.ndarray, headings_deg: np.ndarray, target_heights_px: np.ndarray, visibility: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Give the value of each axis at each frame, NaN where unknown.
+
+    Args:
+        offsets_m: (n, 3) from person to drone. headings_deg: (n,), whither the person walks. target_heights_px, visibility: (n,).
+    """
+    return {
+        "height_m": offsets_m[:, 2] + TARGET_HEIGHT_M,
+        "distance_m": np.linalg.norm(offsets_m, axis=1),
+        "azimuth_deg": azimuths_deg(offsets_m, headings_deg),
+        "target_height_px": target_heights_px,
+        "visibility": visibility,
+    }
+
+
+def coverage_of(flight: Flight) -> Coverage:
+    """Count the frames of a flight."""
+    box = flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox
+    offsets_m = flight.positions_m - flight.targets_m
+    values = axis_values(offsets_m, flight.target_headings_deg, box[:, 3] - box[:, 1], flight.visibility)
+    return Coverage.of(values, flight.styles, [flight.pace] * len(flight))
+
+
+@cache
+def default_coverage() -> Coverage:
+    """Give what the plain run that ships covers (`configs/quickstart.yaml`)."""
+    with validation_errors(DEFAULT):
+        return Coverage.model_validate(read_json(DEFAULT))
