@@ -16,11 +16,11 @@ STYLE = """
 
 
 def coverage_html(coverage: Coverage) -> str:
-    """Give a grid of histograms, one an axis, and of tables, one for each kind of name; blue bars, and the plain run as a red line."""
+    """Give a grid of histograms, one an axis, with where 5 % to 95 % of the frames lie, and of tables, one for each kind of name."""
     plain = default_coverage()
     panels = [
         f"<h3>{axis.title}{', ' * bool(axis.unit)}{axis.unit}</h3>{_histogram(axis, coverage.bins.get(name, []), plain.bins[name])}"
-        f"<small>5 % to 95 % of the frames: {_range(coverage, name)}; plain run: {_range(plain, name)}</small>"
+        f"<small>{_range(coverage, name)}; plain run: {_range(plain, name)}</small>"
         for name, axis in AXES.items()
     ]
     for kind in NAMED:
@@ -61,9 +61,23 @@ def _share(counts: dict[str, int], name: str) -> str:
 
 
 def _range(coverage: Coverage, name: str) -> str:
+    """Say where 5 % to 95 % of the frames lie; of a circle, how they are shared out."""
+    if name == "azimuth_deg":
+        return _sides(coverage.bins.get(name, []))
     low, high = coverage.range_of(name)
     digits = 2 if AXES[name].step < 1.0 else 0
     return "-" if low is None or high is None else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def _sides(counts: list[int]) -> str:
+    total = sum(counts)
+    if not total:
+        return "-"
+    axis = AXES["azimuth_deg"]
+    middles = [abs(axis.low + (k + 0.5) * axis.step) for k in range(axis.num_bins)]
+    behind = sum(count for count, middle in zip(counts, middles, strict=True) if middle > 135.0) / total
+    ahead = sum(count for count, middle in zip(counts, middles, strict=True) if middle < 45.0) / total
+    return f"{behind:.0%} behind, {1 - behind - ahead:.0%} beside, {ahead:.0%} in front"
 
 
 def _histogram(axis: Axis, counts: list[int], beside: list[int]) -> str:

@@ -33,6 +33,7 @@ def _body(record: ReleaseRecord) -> str:
     numbers = record.numbers
     lead = (
         f"{numbers.frames:,} frames of {numbers.flights:,} flights over {numbers.trajectories:,} trajectories; "
-        "the line, and the last column of the tables, are those of the plain run that ships (quickstart)."
+        "below a histogram, where 5 % to 95 % of the frames lie; the line, and the last column of the tables, are those of the plain run that "
+        "ships (quickstart)."
     )
     return f"<h1>{for_html(record.name)}</h1>\n<p>{for_html(lead)}</p>\n{coverage_html(numbers.coverage)}"

@@ -90,9 +90,7 @@ drawn poses to an obstacle; five-ray: their mean visibility on the map; rendered
 def _covered(inspection: Inspection) -> str:
     if inspection.coverage is None or not inspection.coverage.frames:
         return ""
-    lead = (
-        f"{inspection.coverage.frames:,} frames of accepted flights; the line is the plain run that ships (quickstart)."
-    )
+    lead = f"{inspection.coverage.frames:,} frames of accepted flights, and where 5 % to 95 % of them lie; the line is the plain run that ships (quickstart)."
     return f'<h2>What is covered</h2>\n<p class="lead">{lead}</p>\n{coverage_html(inspection.coverage)}\n'
 
 
