@@ -16,7 +16,7 @@ from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import make_scenario, plan_flight, run, style_rng
 from cosfly.planners.styles.courses import wish_of
 from cosfly.planners.styles.drawing import draw_intent
-from cosfly.planners.styles.reacquire import finds_again
+from cosfly.planners.styles.reacquire import finds_again, screens_of
 from cosfly.planners.styles.table import (
     ALTITUDE_LEAST_M,
     FOLLOW,
@@ -26,7 +26,8 @@ from cosfly.planners.styles.table import (
     RETURN_HOME,
     TABLE,
 )
-from cosfly.products.boxes import write_boxes
+from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
+from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import write_paths
@@ -121,7 +122,7 @@ def test_every_planner_flies_every_style_safely(planner, style):
 
 def test_the_default_is_the_papers_flight_and_draws_nothing():
     scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
-    intent = draw_intent(scenario, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
+    intent = draw_intent(scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
     assert intent.wish is scenario.wish
     assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 
@@ -177,6 +178,23 @@ def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it()
     assert aside[lost].max() > 3  # nobody tells it where the walker is
     assert aside[trace.visibility > 0].max() < 1e-3
     assert labels_of(trace)["search_to_reacquire_target"] >= 2
+
+
+def test_a_crown_hides_for_certain_only_within_its_ellipsoid():
+    box_map = make_box_map(
+        [(0, 0, 5), (20, 0, 5)],
+        [(3, 3, 3)] * 2,
+        [(0, 0, 0)] * 2,
+        [KINDS["Vegetation"], KINDS["Buildings"]],
+        header=MapHeader(name="w"),
+    )
+    screens = screens_of(box_map)
+    eyes, feet = (
+        np.array([[0, -20, 5.0], [2.5, -20, 5], [22.5, -20, 5]]),
+        np.array([[0, 20, 5.0], [2.5, 20, 5], [22.5, 20, 5]]),
+    )
+    assert kernels.visibility(screens, eyes, feet).tolist() == [0, 1, 0]
+    assert kernels.visibility(kernels.obstacle_index(box_map), eyes, feet).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

@@ -186,8 +186,10 @@ class CompareConfig(PlanConfig):
 def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk with each of the planners."""
     from cosfly.kernels import obstacle_index
+    from cosfly.planners.styles.reacquire import screens_of
 
-    obstacles = obstacle_index(read_boxes(simplified_map))
+    box_map = read_boxes(simplified_map)
+    obstacles, screens = obstacle_index(box_map), screens_of(box_map)
     settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
     for planner in settings.values():
         warm_up(planner)
@@ -199,7 +201,7 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
         for name, planner in settings.items():
             begin_s = time.perf_counter()
             try:
-                flights[name] = plan_flight(item.payload, obstacles, planner, seed).as_json()
+                flights[name] = plan_flight(item.payload, obstacles, planner, seed, screens).as_json()
             except NoPathError as error:
                 errors[name] = error
             times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)

@@ -79,7 +79,7 @@ class MucoConfig(Config):
     weight_above: float = Field(20.0, ge=0, description="weight of squared altitude above altitude_preferred_m")
     weight_oscillation: float = Field(8.0, ge=0, description="weight of the squared change of altitude per step")
     weight_bearing: float = Field(
-        20.0, ge=0, description="weight of squared azimuth deviation of styles other than follow, per rad^2"
+        40.0, ge=0, description="weight of squared azimuth deviation of styles other than follow, per rad^2"
     )
     weight_beneath: float = Field(
         2.0, ge=0, description="weight of squared altitude beneath the wished one of styles other than follow"

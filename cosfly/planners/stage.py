@@ -71,19 +71,24 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
-def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
+def plan_flight(
+    walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None
+) -> DroneTrace:
     """Plan, measure and check one flight in a style drawn for it; in that of the paper instead where it fails and the settings say so.
 
+    Args:
+        screens: the obstacles that hide a person for certain, for a search; None: all do.
     Raises:
         NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
     """
     from cosfly.planners.styles.drawing import Intent, draw_intent
 
     scenario = make_scenario(walk, obstacles, cfg)
-    intent = draw_intent(scenario, obstacles, cfg, style_rng(walk, seed))
+    screens = obstacles if screens is None else screens
+    intent = draw_intent(scenario, obstacles, screens, cfg, style_rng(walk, seed))
     has_other = bool(intent.segments) and cfg.styles_fallback == "follow"
     try:
-        trace = _fly(walk, scenario, intent, obstacles, cfg, seed)
+        trace = _fly(walk, scenario, intent, obstacles, screens, cfg, seed)
         reason = trace.drop_reason
     except NoPathError:
         if not has_other:
@@ -91,7 +96,7 @@ def plan_flight(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> 
         reason = "no_path"
     if reason is None or not has_other:
         return trace
-    follows = _fly(walk, scenario, Intent(scenario.wish), obstacles, cfg, seed)
+    follows = _fly(walk, scenario, Intent(scenario.wish), obstacles, screens, cfg, seed)
     return replace(follows, instead_of=f"{intent.styles}: {reason}")
 
 
@@ -101,7 +106,9 @@ def style_rng(walk: Walk, seed: int) -> np.random.Generator:
     return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}")
 
 
-def _fly(walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, cfg: PlanConfig, seed: int) -> DroneTrace:
+def _fly(
+    walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
+) -> DroneTrace:
     from cosfly.kernels import segments_hit, signed_distances, visibility
     from cosfly.planners.styles.camera import view_of
     from cosfly.planners.styles.drawing import why_not_held
@@ -118,7 +125,8 @@ def _fly(walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, cf
             got=f"a least clearance of {clearances.min():.2f} m", expected=f"{cfg.relaxed_safety_m:g} m and no segment in a box",
         )  # fmt: skip
     seen, judged = visibility(obstacles, positions, targets), intent.wish.keeps_sight
-    pitch, yaw = view_of(intent, positions, targets, seen, scenario.dt_s)
+    seen_past_screens = visibility(screens, positions, targets) if intent.searches else seen
+    pitch, yaw = view_of(intent, positions, targets, seen_past_screens, scenario.dt_s)
     rotations = np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1))
     counted = seen[judged] if judged.any() else seen
     metrics = flight_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
@@ -134,7 +142,7 @@ def _fly(walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, cf
         clearances_m=clearances,
         metrics=metrics,
         solver=made.solver,
-        drop_reason=reason or why_not_held(intent, scenario, positions, seen),
+        drop_reason=reason or why_not_held(intent, scenario, positions, seen_past_screens),
         segments=intent.segments,
         mission=intent.mission,
         pace=walk.pace,
@@ -162,12 +170,14 @@ def drop_reason(
 def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk."""
     from cosfly.kernels import obstacle_index
+    from cosfly.planners.styles.reacquire import screens_of
 
-    obstacles = obstacle_index(read_boxes(simplified_map))
+    box_map = read_boxes(simplified_map)
+    obstacles, screens = obstacle_index(box_map), screens_of(box_map)
     warm_up(cfg)
 
     def work(item: Item) -> Outcome:
-        trace = plan_flight(item.payload, obstacles, cfg, seed)
+        trace = plan_flight(item.payload, obstacles, cfg, seed, screens)
         return Outcome(trace.as_json(), trace.drop_reason)
 
     return work

@@ -44,11 +44,13 @@ class Intent:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
-def draw_intent(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Intent:
-    """Draw the style or styles of a flight."""
+def draw_intent(
+    scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
+) -> Intent:
+    """Draw the style or styles of a flight. screens: the obstacles that hide a person for certain."""
     name, num = _draw(cfg.styles, rng), len(scenario.targets_m)
     if name == REACQUIRE:
-        wish = wish_of_reacquire(scenario, obstacles, cfg, rng)
+        wish = wish_of_reacquire(scenario, obstacles, screens, cfg, rng)
         segment = Segment(name, 0, num, keeps_sight=False)
         if wish is None:
             return Intent(scenario.wish, (segment,), impossible=NO_HIDING_PLACE)
@@ -82,7 +84,7 @@ def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, se
     """Say why a flight is not what it was meant to be, None where it is.
 
     Args:
-        positions_m: (n, 3), as flown. seen: (n,) five-ray visibility.
+        positions_m: (n, 3), as flown. seen: (n,) five-ray visibility past the screens.
     """
     if intent.impossible is not None or not intent.segments:
         return intent.impossible

@@ -1,7 +1,7 @@
 """`reacquire`: the walker disappears behind a house or a tree, the drone searches and finds again.
 
-It begins low and away, where the map hides the walker for a while (a place is looked for, by chance), and goes on as it was while it
-waits; then it climbs and swings behind the walker's last way until it sees. Judged by what came of it, not by the mean of sight.
+It begins low and away, where the map hides the walker for a while (a place is looked for, by chance), and goes on as before for a
+moment; then it climbs and swings behind the walker's last way until it sees. Judged by what came of it, not by the mean of sight.
 """
 
 from __future__ import annotations
@@ -14,57 +14,78 @@ import numpy as np
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles.courses import without_jumps
 from cosfly.planners.styles.table import HIDING
+from cosfly.products.kinds import KINDS
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
+    from cosfly.products.boxes import BoxMap
 
-TRIES = 48
+TRIES = 64
 LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # longest time without sight
 BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least so long before it is lost, and at the end
 SEEN = 0.5  # mean visibility that counts as seen
-WAITS_S = 2.0  # before it searches
+WAITS_S = 4.0  # before it searches
+DEEP_LOSS_S = 5.0  # of a place that is looked for: the planner may move a little, and the walker stays hidden
 CLIMBS_M, SEARCHES_FROM_M = (12.0, 26.0), (8.0, 16.0)  # while it searches: height gained, distance in the plane
-FREE_SHARE = 0.9  # of the wished places that keep the safety distance; the planner finds ways round the rest
+CROWN_SHARE = 1 / np.sqrt(3.0)  # of the half extents: the box within the ellipsoid within the box
+LATE_SHARE = 0.5  # of the tries that fly along the walker's own way
+FREE_SHARE = 1.0  # of the wished places that keep the safety distance
+
+
+def screens_of(box_map: BoxMap) -> BoxIndex:
+    """Index what hides a person for certain: the obstacles, but of a crown's box only what its ellipsoid fills whatever the direction."""
+    from cosfly.kernels import obstacle_index
+
+    is_crown = box_map.is_any_of({KINDS["Vegetation"]})
+    half_extents = np.where(is_crown[:, None], CROWN_SHARE * box_map.half_extents, box_map.half_extents)
+    return obstacle_index(replace(box_map, half_extents=half_extents))
 
 
 def wish_of_reacquire(
-    scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
+    scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> Wish | None:
     """Look for a flight that loses the walker and finds again; None where the map hides nobody on this walk."""
     from cosfly.kernels import signed_distances, visibility
 
-    targets, ground = scenario.targets_m, scenario.ground_m
+    targets, ground, dt_s = scenario.targets_m, scenario.ground_m, scenario.dt_s
     for _ in range(TRIES):
-        apart_m, altitude_m = rng.uniform(*HIDING.ground_distance_m), rng.uniform(*HIDING.altitude_m)
-        bearing, climb_m, near_m = rng.uniform(-np.pi, np.pi), rng.uniform(*CLIMBS_M), rng.uniform(*SEARCHES_FROM_M)
-        waiting = _wish(scenario, cfg, len(targets), bearing, (apart_m, apart_m), (altitude_m, altitude_m))
-        lost = first_loss(visibility(obstacles, waiting.places_m(targets, ground), targets), scenario.dt_s)
+        course, climb_m, near_m = _watching(scenario, rng), rng.uniform(*CLIMBS_M), rng.uniform(*SEARCHES_FROM_M)
+        waiting = without_jumps(course, scenario, cfg)
+        lost = first_loss(visibility(screens, waiting.places_m(targets, ground), targets), dt_s, DEEP_LOSS_S)
         if lost is None:
             continue
-        begin = lost + round(WAITS_S / scenario.dt_s)
-        wish = _wish(scenario, cfg, begin, bearing, (apart_m, near_m), (altitude_m, altitude_m + climb_m))
+        searching = np.arange(len(course)) >= lost + round(WAITS_S / dt_s)
+        course[searching, 0] = scenario.wish.heading_rad[searching] + np.pi
+        course[searching, 1:] = near_m, course[lost, 2] + climb_m
+        wish = without_jumps(course, scenario, cfg)
         places = wish.places_m(targets, ground)
         gaps_m, _ = signed_distances(obstacles, places, cfg.safety_distance_m)
         is_free = gaps_m >= cfg.safety_distance_m
-        if is_free.mean() >= FREE_SHARE and finds_again(visibility(obstacles, places, targets), scenario.dt_s):
-            return wish
+        if is_free.mean() >= FREE_SHARE and finds_again(visibility(screens, places, targets), dt_s):
+            return replace(wish, keeps_sight=np.zeros(len(course), dtype=bool))
     return None
 
 
-def _wish(scenario: Scenario, cfg: PlanConfig, begin: int, bearing: float, aparts_m: tuple, altitudes_m: tuple) -> Wish:
-    """Stand at a bearing, and from frame `begin` on behind the walker, nearer and higher: (before, after)."""
-    after = np.arange(len(scenario.targets_m)) >= begin
-    azimuth = scenario.wish.heading_rad + np.where(after, np.pi if bearing >= 0 else -np.pi, bearing)
-    apart_m, altitude_m = np.where(after, aparts_m[1], aparts_m[0]), np.where(after, altitudes_m[1], altitudes_m[0])
-    wish = without_jumps(np.column_stack([azimuth, apart_m, altitude_m]), scenario, cfg)
-    return replace(wish, keeps_sight=np.zeros(len(after), dtype=bool))
+def _watching(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
+    """Draw a course, (n, 3), before the loss: at a bearing of the walker, or along the walker's own way and late, round its corners."""
+    targets, heading_rad = scenario.targets_m, scenario.wish.heading_rad
+    apart_m, altitude_m = rng.uniform(*HIDING.ground_distance_m), rng.uniform(*HIDING.altitude_m)
+    bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE
+    azimuth, aparts_m = heading_rad + bearing, np.full(len(targets), apart_m)
+    if is_late:
+        walked_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(targets[:, :2], axis=0).T))])
+        start = -apart_m * np.array([np.cos(heading_rad[0]), np.sin(heading_rad[0])])
+        away = np.stack([np.interp(walked_m - apart_m, walked_m, targets[:, k]) for k in (0, 1)], axis=1)
+        away += np.clip(1.0 - walked_m / apart_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
+        azimuth, aparts_m = np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1])
+    return np.column_stack([azimuth, aparts_m, np.full(len(targets), altitude_m)])
 
 
-def first_loss(seen: np.ndarray, dt_s: float) -> int | None:
-    """Give the first frame of a loss that follows a time of sight; None where there is none."""
+def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> int | None:
+    """Give the first frame of a loss of at least `least_s` that follows a time of sight; None where there is none."""
     before = round(BEFORE_S / dt_s)
     for begin, end in _hidden_runs(seen):
-        if begin >= before and (end - begin) * dt_s >= LOST_LEAST_S and seen[begin - before : begin].mean() >= SEEN:
+        if begin >= before and (end - begin) * dt_s >= least_s and seen[begin - before : begin].mean() >= SEEN:
             return begin
     return None
 
