@@ -17,6 +17,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -69,6 +70,7 @@ class Start:
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
     """Hold back Ctrl-C and its like; a worker that starts here inherits that, or they would hit it in the middle of an import."""
+    resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
     before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
     try:
         yield
