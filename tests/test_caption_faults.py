@@ -21,9 +21,13 @@ import pytest
 from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers, refusal
 from typer.testing import CliRunner
 
+from caption.run.flights import allot, named_flights
 from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.teachers.prompts import make_question
+from caption.teachers.teacher import AskingTeacher, first_budget
 from cosfly.chat import client, throttle
+from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Request, started
 from cosfly.chat.throttle import Throttle
@@ -232,23 +236,26 @@ def test_seven_windows_that_are_too_long_cost_seven(tree, tmp_path, caplog, whol
 
 
 def test_refusals_between_which_windows_are_answered_cost_one_trial_prompt(tree, tmp_path, whole):
-    """Those after an answer: which of them are refused in a row shows in the order in which the run asks."""
-    order: list[int] = []
-    refused = Picky(400, TOO_LONG, [])
+    """Asked one after the other, so that it is plain which answer came before which refusal; every third is refused."""
 
-    def respond(body):
-        if not is_mirror(body) and body["seed"] in whole.seeds and body["seed"] not in order:
-            order.append(body["seed"])
-            refused.seeds += order[-1:] if len(order) % 3 == 0 else []  # every third
-        return refused(body)
+    async def ask_in_turn(cfg: CaptionConfig) -> list[bool]:
+        windows = [window for flight in allot(named_flights(tree), cfg)[0] for window in flight.windows(cfg)]
+        refused = []
+        with AnswerBook(tmp_path / "answers") as book:
+            async with AskingTeacher(cfg, book, 0, first_budget(cfg, book.totals)) as teacher:
+                for number, window in enumerate(windows):
+                    server.respond = Picky(400, TOO_LONG, whole.seeds) if number % 3 == 2 else None
+                    try:
+                        await teacher.ask(make_question(window.observed, cfg.image, cfg.writing))
+                        refused.append(False)
+                    except NoAnswer:
+                        refused.append(True)
+        return refused
 
-    with hovering(respond) as server:
-        run(settings(server.url, endpoint={"concurrency": 1}), tree, tmp_path / "out")
-    assert report_of(tmp_path / "out")["windows"]["dropped"] == {"refused_too_long": 3}
-    trials = [
-        body for body in map(json.loads, server.bodies) if not is_mirror(body) and body["seed"] not in whole.seeds
-    ]
-    assert len(trials) == 1
+    with hovering() as server:
+        refused = asyncio.run(ask_in_turn(settings(server.url, endpoint={"concurrency": 1})))
+    assert refused == [number % 3 == 2 for number in range(NUM_WINDOWS)]
+    assert len(server.bodies) == NUM_WINDOWS + 1
 
 
 def test_a_filter_that_stops_a_trial_prompt_by_chance_ends_no_run(tree, tmp_path, whole):
