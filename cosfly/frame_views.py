@@ -16,7 +16,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.captions import Language
-from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, read_depth, read_instance, read_rgb
+from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 
 View = Literal["rgb", "depth", "segmentation"]
@@ -148,7 +148,17 @@ def read_view(
     if view == "depth":
         return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
     kinds, ids = read_instance(frame)
+    kinds = np.where(np.isin(ids, _ids_of_others(frame)) & (kinds == KINDS["Pedestrians"]), KINDS["Rider"], kinds)
     return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
+
+
+def _ids_of_others(frame: Path) -> list[int]:
+    """Ids of who moves beside the target, so that the target alone is red; none where the frame does not tell."""
+    try:
+        others = read_meta(frame).others
+    except InputError:  # somebody else's tree
+        return []
+    return [] if others is None else [other.instance_id for other in others.others]
 
 
 def depth_colors(depth_m: np.ndarray, range_m: float = DEPTH_RANGE_M) -> np.ndarray:

@@ -139,3 +139,20 @@ def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
 def step_s(time_s: np.ndarray) -> float:
     """Give the time step of even time stamps, (n,) s; DT_S where there is one."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else DT_S
+
+
+def headings_of(positions_m: np.ndarray, time_s: np.ndarray, slowest_mps: float = 0.05) -> np.ndarray:
+    """Which way somebody goes at each time, (n,) rad counter-clockwise from +x.
+
+    Args:
+        positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.
+    Returns:
+        By central differences. Who is slower than `slowest_mps` keeps the last direction, at the start the first one to come; who never moves faces east.
+    """
+    velocity = np.gradient(positions_m[:, :2], time_s, axis=0)
+    moves = np.linalg.norm(velocity, axis=1) > slowest_mps
+    if not moves.any():
+        return np.zeros(len(time_s))
+    last = np.maximum.accumulate(np.where(moves, np.arange(len(time_s)), -1))
+    last[last < 0] = np.argmax(moves)
+    return np.arctan2(velocity[:, 1], velocity[:, 0])[last]

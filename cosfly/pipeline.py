@@ -28,6 +28,7 @@ from cosfly.errors import InputError
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
+from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
 from cosfly.reading.limits import use_limits
 from cosfly.settings import RunConfig, manner_of_work
@@ -61,6 +62,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
     seed, working = cfg.seed, manner_of_work(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
+    others = walks.with_name(OTHERS_FILE) if cfg.pedestrians.has_others else None
     inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
 
     whole = [Source.of_files(tree, captions, inspected)]
@@ -75,7 +77,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
         stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **working),
         stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, **working),
-        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, seed=seed, **working),
+        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **working),
         stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
         stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
         _release(cfg, whole, into or out, resume),

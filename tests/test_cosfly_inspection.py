@@ -19,11 +19,12 @@ from cosfly.errors import InputError, NothingKept
 from cosfly.geometry import mask_box
 from cosfly.inspection.flight import InspectConfig, check_motion, check_plan, is_shifted
 from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region, png_problem
+from cosfly.inspection.others import check_others, others_told
 from cosfly.inspection.stage import run
 from cosfly.issues import Issue, Report
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
-from cosfly.products.frames import frame_name, read_instance
+from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, tree_position
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight, write_flight
@@ -318,6 +319,45 @@ def test_recorded_boxes_of_the_pixels_are_accepted(workplace):
     flight = first_flight(workplace)
     record_masks(flight, {})
     assert set(codes_of(inspect(workplace), flight)) == {"checksum"}  # of the edited file
+
+
+def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> OtherMeta:
+    return OtherMeta(
+        instance_id=number, semantic_id=KINDS[kind], world_location=tree_position(np.asarray(place_m, float)), yaw=0.0,
+        half_extents_m=(0.3, 0.3, 0.9), num_pixels=0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("beside", "shift_m", "codes"),
+    [
+        ("drone", (0.0, 0.0, -1.0), {"clearance"}),
+        ("drone", (0.0, 0.0, -8.0), set()),
+        ("target", (0.4, 0.0, 0.0), {"collision"}),
+        ("target", (0.7, 0.0, 0.0), set()),
+        ("kind", (50.0, 0.0, 0.0), {"broken_annotation"}),
+    ],
+    ids=["at_the_drone", "below_the_drone", "in_the_person", "beside_the_person", "a_tree"],
+)
+def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes):
+    flight, report, metrics = read_flight(first_flight(workplace)), Report(), {}
+    place_m = (flight.positions_m if beside == "drone" else flight.targets_m)[3] + np.array(shift_m)
+    other = other_at(place_m, "Vegetation" if beside == "kind" else "Pedestrians")
+    told = OthersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
+    check_others(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
+    assert {issue.code for issue in report.issues} == codes
+    assert (metrics["num_others"], metrics["occluded_by_others_share"], metrics["hidden_by_others_max"]) == (
+        1,
+        1.0,
+        0.25,
+    )
+
+
+def test_a_flight_without_others_has_no_figures_of_them(workplace):
+    flight, report, metrics = read_flight(first_flight(workplace)), Report(), {}
+    assert others_told(flight, list(range(len(flight)))) == {}
+    check_others(flight, {}, 2.5, report, metrics)
+    assert (metrics, report.issues) == ({}, [])
 
 
 def test_teleport_of_drone_and_person(workplace):

@@ -24,6 +24,7 @@ from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
+from cosfly.products.others import Company, Other, write_others
 from cosfly.products.playback import read_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import sha256_file
@@ -37,11 +38,13 @@ from cosfly.render.contract import (
     PosedPerson,
     has_own_ids,
     instance_ids,
+    other_id,
 )
 from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
 from cosfly.render.gl.scene import build_scene
+from cosfly.render.others import NOBODY, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.stage import RenderConfig, open_renderer, run, script_flight
@@ -144,6 +147,19 @@ def test_instance_ids_never_wrap():
     assert 0 not in ids
 
 
+def test_boxes_leave_the_ids_of_others_free():
+    boxes = make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 9], [MAX_BOX_ID, 7])
+    assert not has_own_ids(boxes, num_others=1)
+    assert instance_ids(boxes, num_others=1).tolist() == [1, 2]
+    n = MAX_BOX_ID + 5
+    many = make_box_map(np.zeros((n, 3)), np.ones((n, 3)), np.zeros((n, 3)), np.full(n, 3), np.arange(n) + 1)
+    ids = instance_ids(many, num_others=20)
+    others = [other_id(number) for number in range(20)]
+    assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
+    assert ids.max() == SHARED_ID
+    assert (ids == SHARED_ID).sum() == 25
+
+
 def test_an_id_of_zero_is_replaced():
     found = instance_ids(make_box_map(np.zeros((2, 3)), np.ones((2, 3)), np.zeros((2, 3)), [3, 3], [0, 1]))
     assert found.tolist() == [1, 2]
@@ -177,6 +193,44 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
     assert 0.80 < offset[:, 2].max() < 0.93, "the head ends at 1.8 m"
     assert ((body.records["tag"] >> 16) == PERSON_ID).all()
     assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
+
+
+def test_others_of_another_run_are_refused(tmp_path):
+    inputs = write_inputs(tmp_path / "in", [circling(4)])
+    others = tmp_path / "others.json"
+    write_others(others, [Company("path_007", [])], {})
+    with pytest.raises(InputError, match=r"no others for a walk.*path_000.*others\.json that was written beside"):
+        run(RenderConfig(), *inputs, tmp_path / "out", others=others)
+    stands = Other("Pedestrians", np.zeros((3, 3)), np.zeros(3))
+    write_others(others, [Company("path_000", [stands])], {})
+    with pytest.raises(InputError, match=r"of other times.*3 places.*4, one for each"):
+        run(RenderConfig(), *inputs, tmp_path / "out2", others=others)
+
+
+def test_a_shift_into_somebody_falls_back():
+    """Everybody stands round the person: whoever is moved by more than a little would touch one of them."""
+    n = 40
+    planned = Poses(
+        np.tile([0.0, -12.0, 9.0], (n, 1)),
+        np.tile([-36.0, 90.0, 0.0], (n, 1)),
+        np.tile([0.0, 0.0, 0.9], (n, 1)),
+        np.full(n, 50.0),
+    )
+    ring = [
+        Other("Pedestrians", np.tile([0.9 * np.cos(a), 0.9 * np.sin(a), 0.0], (n, 1)), np.zeros(n))
+        for a in np.arange(0, 6.2, 0.6)
+    ]
+    nothing = Surroundings(make_box_map([[0, 0, -0.5]], [[50, 50, 0.5]], np.zeros((1, 3)), [KINDS["Roads"]]))
+    cfg = PerturbationConfig(position_probability=1.0, rotation_probability=0.0)
+    cast = cast_of(ring, np.arange(n) * 0.5, np.random.default_rng(0))
+    free, among = (
+        perturb(planned, CAMERA, nothing, cfg, np.random.default_rng(3), others) for others in (NOBODY, cast)
+    )
+    fell = [state["position"] == "fallback: person in an obstacle" for state in among.states]
+    assert sum(fell) > n / 4
+    assert not any(state["position"] == "fallback: person in an obstacle" for state in free.states)
+    for i in range(n):
+        assert not cast.are_in_the_way(i, among.poses.targets_m[i])
 
 
 def test_gait_follows_motion_and_keeps_the_heading_when_standing():
@@ -587,7 +641,7 @@ class Curtain:
 
     def close(self) -> None: ...
 
-    def render(self, camera_pose, intrinsic, person) -> Frame:
+    def render(self, camera_pose, intrinsic, person, others=()) -> Frame:
         self.num_drawn += 1
         shape, is_hidden = (CAMERA.height_px, CAMERA.width_px), person.hip_m[0] > self.x_m
         ids = np.full(shape, 0 if is_hidden else PERSON_ID, dtype=np.uint16)

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import multiprocessing
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -19,21 +20,31 @@ import pytest
 
 from cosfly.config import build
 from cosfly.errors import EnvironmentMissing, RenderError
-from cosfly.geometry import intrinsic_matrix, look_at, rotation_matrices, world_from_camera
+from cosfly.frame_views import PEDESTRIAN_RGB, read_view
+from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
+from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.stage import run as inspect_tree
 from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
+from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
+from cosfly.products.others import Company, Other, write_others
 from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.render.camera import rendered_visibility, view_target
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.render.camera import hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,
     GROUND_PLANE_DROP_M,
     GROUND_PLANE_HALF_M,
+    MAX_BOX_ID,
     NEAR_M,
     NO_INSTANCE,
     PERSON_ID,
+    PosedCar,
+    PosedOther,
     PosedPerson,
+    other_id,
     plane_z_m,
 )
 from cosfly.render.person import choose_clothes
@@ -409,3 +420,121 @@ def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrender", None)
     with pytest.raises(EnvironmentMissing, match=r'pip install "cosfly\[pyrender\]"'):
         open_renderer("pyrender", street(), *SIZE)
+
+
+# --- others -----------------------------------------------------------------------------------------------------------
+
+BESIDE = PosedOther(
+    other_id(0), PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
+)
+CAR = PosedOther(other_id(1), PosedCar(HIP + np.array([-5.0, -1.0, -0.15]), 0.6, (2.2, 0.9, 0.75), 0.3))
+
+
+def test_others_are_drawn_with_ids_of_their_own_inside_their_boxes(renderer):
+    pose, camera = pose_towards((-4.0, -14.0, 9.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
+    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    alone = renderer.render(pose, camera.intrinsic, walker)
+    frame = renderer.render(pose, camera.intrinsic, walker, [BESIDE, CAR])
+    np.testing.assert_array_equal(frame.ids == PERSON_ID, alone.ids == PERSON_ID)
+    for other, kind, half in ((BESIDE, "Pedestrians", PERSON_HALF_EXTENTS_M), (CAR, "Car", (2.2, 0.9, 0.75))):
+        mask = frame.ids == other.instance_id
+        assert mask.sum() > 60
+        assert (frame.kinds[mask] == KINDS[kind]).all()
+        corners = box_corners(other.center_m, np.array(half), other.body.heading_rad)
+        uv, z = project(corners, pose, camera.intrinsic)
+        rows, columns = np.nonzero(mask)
+        assert (uv.min(axis=0) - 4 <= [columns.min(), rows.min()]).all()
+        assert (uv.max(axis=0) + 4 >= [columns.max(), rows.max()]).all()
+        assert ((frame.depth[mask] > z.min() - 0.2) & (frame.depth[mask] < z.max() + 0.2)).all()
+        assert mask.sum() > 0.25 * np.prod(np.ptp(uv, axis=0)) * (0.5 if kind == "Pedestrians" else 1.0)
+    untouched = ~np.isin(frame.ids, [BESIDE.instance_id, CAR.instance_id])
+    np.testing.assert_array_equal(frame.depth[untouched], alone.depth[untouched])
+    np.testing.assert_array_equal(frame.ids[untouched], alone.ids[untouched])
+
+
+def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer):
+    camera = Camera(*SIZE, intrinsic_matrix(*SIZE, 40.0))
+    pose = pose_towards(HIP + np.array([0.0, -12.0, 0.3]), HIP)
+    walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
+    view = view_target(HIP, pose, camera)
+    before = PosedOther(other_id(1), PosedCar(HIP + np.array([0.0, -4.0, -0.15]), 0.0, (2.2, 0.9, 0.75), 0.3))
+    ids = np.array([before.instance_id])
+    shares = []
+    for others in ((), (before,)):
+        frame = renderer.render(pose, camera.intrinsic, walker, others)
+        score, _ = rendered_visibility(frame, HIP, view, pose, camera)
+        by_others, by_map = hidden_shares(frame, HIP, view, pose, camera, ids)
+        assert score + by_others + by_map == pytest.approx(1.0), "all of the box lies in the image"
+        shares.append((score, by_others, by_map))
+    assert shares[0][0] > 0.98
+    assert shares[0][1] == 0.0
+    assert 0.2 < shares[1][1] < 0.95
+    assert shares[1][2] == shares[0][2]
+    behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
+    frame = renderer.render(behind, camera.intrinsic, walker, (before,))
+    assert hidden_shares(frame, HIP, view_target(HIP, behind, camera), behind, camera, ids) == (0.0, 1.0)
+
+
+def test_nobody_else_has_the_ids_of_others(renderer_name):
+    """A box with the highest id that boxes may have gives it up to an other."""
+    boxes = make_box_map([(0.0, 4.0, 1.0)], [(1.0, 1.0, 1.0)], np.zeros((1, 3)), [KINDS["Buildings"]], [MAX_BOX_ID])
+    pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
+    try:
+        renderer = open_renderer(renderer_name, boxes, *SIZE, num_others=2)
+    except EnvironmentMissing as error:
+        pytest.skip(str(error))
+    ids = np.unique(
+        renderer.render(
+            pose, intrinsic, None, [replace(CAR, body=replace(CAR.body, center_m=np.array([4.0, 0.0, 0.75])))]
+        ).ids
+    )
+    renderer.close()
+    assert ids.tolist() == [NO_INSTANCE, 1, other_id(1)]
+
+
+FEW = {"width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street"}
+
+
+def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:
+    """Others of a flight: one who walks 1 m beside the person, and a car that stands off; of `num` times."""
+    folder.mkdir(exist_ok=True)
+    feet = trace.targets_m[:num] - [0.0, 0.0, 0.9]
+    beside = Other("Pedestrians", feet + np.array([0.2, -1.0, 0.0]), np.zeros(num))
+    car = Other("Car", np.tile(feet[0] + [1.0, 3.5, 0.0], (num, 1)), np.full(num, 0.3))
+    write_others(folder / "others.json", [Company(trace.path_id, [beside, car])], {})
+    return folder / "others.json"
+
+
+def _red_px(frame: Path) -> int:
+    return int((read_view(frame, "segmentation") == PEDESTRIAN_RGB).all(axis=-1).sum())
+
+
+def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_path):
+    opened(renderer_name, street()).close()
+    trace = circling(6)
+    inputs, others = write_inputs(tmp_path / "in", [trace]), with_others(tmp_path / "in", 6, trace)
+    cfg = build(RenderConfig, {**FEW, "backend": renderer_name}, "test")
+    tree = run(cfg, *inputs, tmp_path / "tree", seed=5, others=others)
+    for folder in playback.find_flights(tree):
+        flight = playback.read_flight(folder)
+        for i in range(len(flight)):
+            meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]
+            assert [other.instance_id for other in meta.others.others] == [MAX_BOX_ID, MAX_BOX_ID - 1]
+            assert [other.semantic_id for other in meta.others.others] == [KINDS["Pedestrians"], KINDS["Car"]]
+            assert [other.num_pixels for other in meta.others.others] == [
+                int((ids == other_id(k)).sum()) for k in (0, 1)
+            ]
+            assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
+            assert (
+                meta.target.visibility + meta.others.target_hidden_by_others + meta.others.target_hidden_by_map
+                == pytest.approx(1.0, abs=1e-5)
+            )
+            assert _red_px(flight.frame_folder(i)) == meta.target.num_pixels, "the target alone is red for students"
+            assert meta.others.others[1].yaw == pytest.approx(-np.degrees(0.3), abs=1e-3), "the tree's axes are CARLA's"
+    product = inspect_tree(
+        InspectConfig(five_ray_mean_min=0, clearance_min_m=0), inputs[1], inputs[2], tree, tmp_path / "inspect"
+    )
+    for flight in read_inspection(product).flights:
+        assert {"clearance", "collision", "mask_disagrees"}.isdisjoint(issue.code for issue in flight.issues)
+        assert flight.metrics["num_others"] == 2
+        assert 4.0 < flight.metrics["others_clearance_min_m"] < 15.0

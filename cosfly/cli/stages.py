@@ -154,6 +154,9 @@ def render(
     simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
     traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
     out: Annotated[Path, typer.Option(help="Output folder, the playback tree.")],
+    others: Annotated[
+        Path | None, typer.Option(help="Who else moves: others.json, beside the walks' path.json.")
+    ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
@@ -167,8 +170,9 @@ def render(
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     options.set_aside(out, repair)
-    options.verify_first(verify, map_, simplified, traces, out)
-    product = stage.run(cfg.render, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
+    options.verify_first(verify, map_, simplified, traces, others, out)
+    given = options.manner(cfg, resume) | {"seed": cfg.seed, "others": others}
+    product = stage.run(cfg.render, map_, simplified, traces, out, **given)
     options.tell_product(product, out, cfg)
 
 

@@ -36,6 +36,7 @@ from cosfly.inspection.frames import (
     choose_frames,
     target_box,
 )
+from cosfly.inspection.others import check_others, others_told
 from cosfly.inspection.report import FlightView, draw_flight
 from cosfly.issues import Report
 from cosfly.products.coverage import Coverage, coverage_of
@@ -143,7 +144,7 @@ def inspect_flight(
     check_motion(flight, cfg, report)
     check_projection(flight, cfg, report)
     check_recorded(flight, root, recorded, report)
-    frames = _check_frames(flight, cfg, report)
+    frames = _check_frames(flight, cfg, report, metrics)
     _rendered_metrics(flight, frames, cfg, report, metrics)
     issues = report.merged()
     result: FlightResult = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
@@ -331,13 +332,16 @@ def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None
             report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
 
 
-def _check_frames(flight: Flight, cfg: InspectConfig, report: Report) -> FrameNumbers:
+def _check_frames(
+    flight: Flight, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+) -> FrameNumbers:
     complete = check_files(flight, report)
+    told = others_told(flight, complete)
+    check_others(flight, told, cfg.clearance_min_m, report, metrics)
     if cfg.check_checksums:
         check_checksums(flight, report)
-    return check_pixels(
-        flight, choose_frames(complete, cfg.check_pixels, cfg.pixel_sample), cfg.mask_visibility_min, report
-    )
+    chosen = choose_frames(complete, cfg.check_pixels, cfg.pixel_sample)
+    return check_pixels(flight, chosen, told, cfg.mask_visibility_min, report)
 
 
 def _rendered_metrics(

@@ -23,6 +23,7 @@ from cosfly.products.frames import (
     FRAMES_DIR,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
+    OthersMeta,
     frame_name,
     read_depth,
     read_instance,
@@ -191,8 +192,10 @@ def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int
     return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, num_sample).round().astype(int))]
 
 
-def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float, report: Report) -> FrameNumbers:
-    """Decode frames and compare colour, depth and mask with each other and with the geometry."""
+def check_pixels(
+    flight: Flight, indices: list[int], told: dict[int, OthersMeta], mask_visibility_min: float, report: Report
+) -> FrameNumbers:
+    """Decode frames and compare colour, depth and mask with each other and with the geometry. told: others, by frame."""
     numbers = FrameNumbers()
     previous: tuple[int, np.ndarray] | None = None
     for i in indices:
@@ -207,7 +210,7 @@ def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float,
                 continue
             rgb = read_rgb(frame)
             depth = read_depth(frame) if (frame / "depth.npy").exists() else None
-            kinds = read_instance(frame)[0] if (frame / "instance.png").exists() else None
+            kinds = _kinds_without(told.get(i), frame) if (frame / "instance.png").exists() else None
         except InputError as error:
             report.error("broken_image", where, f"{error.what}: {error.got}", "files that decode in full")
             continue
@@ -229,6 +232,14 @@ def check_pixels(flight: Flight, indices: list[int], mask_visibility_min: float,
 def _png_problem_of(path: Path) -> str | None:
     """As `png_problem`; None for a file of a tree that has none, of which `check_files` said so."""
     return png_problem(read_bytes(path, what="image", tree=tree_of(path.parent))) if path.exists() else None
+
+
+def _kinds_without(told: OthersMeta | None, frame: Path) -> np.ndarray:
+    """Read the kinds of pixels, (h, w); those of others are NONE: the pedestrian who is left is the target."""
+    kinds, ids = read_instance(frame)
+    if told is None:
+        return kinds
+    return np.where(np.isin(ids, [other.instance_id for other in told.others]), KINDS["NONE"], kinds)
 
 
 def _moved(flight: Flight, i: int, k: int) -> bool:

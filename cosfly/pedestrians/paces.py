@@ -1,15 +1,21 @@
 """At which pace people go: one row a profile, and what it makes of a route: the way that is walked, and where it stands still.
 
-Pure arithmetic on polylines, as walking.py, which gives the way its speeds and times.
+Arithmetic on polylines; walking.py gives the way its times.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cosfly.pedestrians.walking import menger_curvature, speed_profile
 from cosfly.products.walks import PLAIN_PACE
+
+if TYPE_CHECKING:
+    from cosfly.pedestrians.walkable import PedestriansConfig
 
 STOP_GAP_MIN = 2  # waypoints from one stop to the next: between two neighbours that are both stops nobody gets on
 
@@ -45,6 +51,11 @@ class Way:
     polyline_m: np.ndarray
     stops_s: np.ndarray
 
+    @cached_property
+    def along_m(self) -> np.ndarray:
+        """Length of the way to each waypoint, (k,) m."""
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1))])
+
     @classmethod
     def without_stops(cls, polyline_m: np.ndarray) -> Way:
         return cls(polyline_m, np.zeros(len(polyline_m)))
@@ -68,9 +79,24 @@ def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> Way:
     return way
 
 
+def speeds_at(way: Way, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
+    """Speeds at the waypoints of a way that is gone at a pace, (k,) m/s, 0 where it stops."""
+    speeds_mps = speed_profile(
+        menger_curvature(way.polyline_m),
+        rng,
+        cruise_speed_mps=cfg.hurry_speed_mps if pace.hurries else cfg.cruise_speed_mps,
+        curvature_gain_m=cfg.curvature_gain_m,
+        jitter=cfg.speed_jitter,
+        min_speed_mps=cfg.min_speed_mps,
+        max_speed_mps=max(cfg.max_speed_mps, cfg.hurry_speed_mps) if pace.hurries else cfg.max_speed_mps,
+    )
+    speeds_mps[way.stops_s > 0] = 0.0
+    return speeds_mps
+
+
 def _add_stops(way: Way, every_m: tuple[float, float], stop_s: tuple[float, float], rng: np.random.Generator) -> None:
     """Put stops on a way, in place."""
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way.polyline_m, axis=0), axis=1))])
+    along_m = way.along_m
     next_m, first = rng.uniform(*every_m), 1
     while next_m < along_m[-1]:
         waypoint = max(int(np.searchsorted(along_m, next_m)), first)

@@ -14,6 +14,7 @@ This module simplifies no map and knows nothing of drones. How people walk is in
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,10 @@ from pydantic import BaseModel
 from cosfly.chance import draw_by_share, rng_for
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
+from cosfly.pedestrians.lanes import Lane, lanes_of
+from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.overview import draw_overview
-from cosfly.pedestrians.paces import PACES, Pace, Way, take_pace
+from cosfly.pedestrians.paces import PACES, speeds_at, take_pace
 from cosfly.pedestrians.walkable import (
     Clock,
     PedestriansConfig,
@@ -34,13 +37,16 @@ from cosfly.pedestrians.walkable import (
     sample_start,
     walkable_ground,
 )  # fmt: skip
-from cosfly.pedestrians.walking import arrival_times, menger_curvature, resample, speed_profile
+from cosfly.pedestrians.walking import arrival_times, resample
 from cosfly.products.boxes import read_boxes
+from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, write_paths
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, result_of
 from cosfly.store import write_bytes, write_json
+
+log = logging.getLogger(__name__)
 
 STAGE = "pedestrians"
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.pedestrians_report", "1.0"
@@ -71,26 +77,11 @@ def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng:
     with clock("report"):
         name = draw_by_share(cfg.pace, pace_rng)
         way = take_pace(route_m, PACES[name], pace_rng)
-        time_s, positions_m, speeds_mps = walked(way, PACES[name], cfg, rng)
+        waypoint_mps = speeds_at(way, PACES[name], cfg, rng)
+        times_s = arrival_times(way.polyline_m, waypoint_mps)
+        time_s, positions_m, speeds_mps = resample(way.polyline_m, waypoint_mps, times_s, cfg.dt_s, way.stops_s)
         on_ground = np.column_stack([positions_m, ground.heights.height_at(positions_m)])
     return MadeWalk(Walk(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name), retries, clock.seconds)
-
-
-def walked(
-    way: Way, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Walk a way: times (n,) s, positions (n, 2) m and speeds (n,) m/s, as `resample` gives them."""
-    speeds_mps = speed_profile(
-        menger_curvature(way.polyline_m),
-        rng,
-        cruise_speed_mps=cfg.hurry_speed_mps if pace.hurries else cfg.cruise_speed_mps,
-        curvature_gain_m=cfg.curvature_gain_m,
-        jitter=cfg.speed_jitter,
-        min_speed_mps=cfg.min_speed_mps,
-        max_speed_mps=max(cfg.max_speed_mps, cfg.hurry_speed_mps) if pace.hurries else cfg.max_speed_mps,
-    )
-    speeds_mps[way.stops_s > 0] = 0.0
-    return resample(way.polyline_m, speeds_mps, arrival_times(way.polyline_m, speeds_mps), cfg.dt_s, way.stops_s)
 
 
 def _draw_route(
@@ -128,14 +119,19 @@ class _Made(BaseModel):
     path: dict[str, Any]
     retries: dict[str, int]
     seconds: dict[str, float]
+    company: dict[str, Any] = {}  # where others are wanted
 
 
-def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround) -> Work:
-    """Worker factory: gives the function that makes one walk."""
+def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes: list[Lane]) -> Work:
+    """Worker factory: gives the function that makes one walk, and its company where the settings ask for one."""
 
     def work(item: Item) -> Outcome:
         made = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id))
-        return Outcome({"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds})
+        result = {"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds}
+        if cfg.has_others:
+            rng = rng_for(seed, STAGE, f"{item.item_id}/others")
+            result["company"] = company_of(made.walk, ground, lanes, cfg, rng).as_json()
+        return Outcome(result)
 
     return work
 
@@ -182,6 +178,19 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
     }
 
 
+def _write_companies(path: Path, lines: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict[str, int]]:
+    """Write `others.json`; count who was wanted and who found a place, by kind, and tell in the log of which kind some are missing."""
+    companies = [Company.from_json(line, f"{path.parent}: items.jsonl") for line in lines]
+    write_others(path, companies, header)
+    counts = {}
+    for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
+        placed = sum(other.kind == kind for company in companies for other in company.others)
+        counts[kind] = {"wanted": wanted * len(companies), "placed": placed}
+        if placed < wanted * len(companies):
+            log.warning("pedestrians: %d of %d others of kind %s found a place", placed, wanted * len(companies), kind)
+    return counts
+
+
 def run(
     cfg: PedestriansConfig,
     simplified_map: Path,
@@ -193,7 +202,7 @@ def run(
     resume: Resume = "if-same",
     roi: Path | None = None,
 ) -> Path:
-    """Read `step2_simplified.json` (and a region of interest), write `path.json`, a report and `paths.png`.
+    """Read `step2_simplified.json` (and a region of interest), write `path.json`, a report and `paths.png`; with others, `others.json`.
 
     Args:
         roi: `roi_polygon.json`; None lets people walk on the whole map.
@@ -216,7 +225,10 @@ def run(
     items = [Item(f"path_{k:05d}") for k in range(cfg.num_paths)]
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    finished = run_items(stage, items, make_worker, (cfg, seed, lean), workers=workers, watch=watch, label="walks")
+    lanes = lanes_of(box_map) if cfg.traffic else []
+    finished = run_items(
+        stage, items, make_worker, (cfg, seed, lean, lanes), workers=workers, watch=watch, label="walks"
+    )
     if not finished.kept:
         raise stage.nothing_kept(finished.tally)
     results = [result_of(record, _Made) for record in finished.kept]
@@ -224,13 +236,17 @@ def run(
     for result in results:
         for step, taken_s in result.seconds.items():
             clock.add(step, taken_s)
+    outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
     with clock("report"):
         retries = [result.retries for result in results]
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
+        if cfg.has_others:
+            header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
+            outputs.append(out / OTHERS_FILE)
+            summary["others"] = _write_companies(outputs[-1], [result.company for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
-    outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
     stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)
     return product

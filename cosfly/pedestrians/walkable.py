@@ -82,6 +82,11 @@ class PedestriansConfig(Config):
         ge=SLOWEST_SPEED_MPS,
         description="speed on straight ground of who hurries, m/s; cut to it or max_speed_mps",
     )
+    others: int = Field(0, ge=0, le=500, description="other people who walk about during each walk; 0: nobody")
+    traffic: int = Field(
+        0, ge=0, le=500, description="cars that drive about during each walk, where the map has straight roads; 0: none"
+    )
+    others_reach_m: float = Field(40.0, gt=0, le=500, description="how near to a walk its others begin, m")
     dt_s: float = Field(
         DT_S,
         ge=0.05,
@@ -89,6 +94,11 @@ class PedestriansConfig(Config):
         description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames (caption.window, "
         "plan.muco.low_visibility_frames) and the thresholds of caption.label over a window's future are for 0.5",
     )
+
+    @property
+    def has_others(self) -> bool:
+        """Whether anybody else is to move while a walk lasts."""
+        return self.others + self.traffic > 0
 
     @field_validator("pace")
     @classmethod

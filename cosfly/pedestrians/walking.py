@@ -84,6 +84,13 @@ def resample(
     """
     num_samples = int(np.ceil((times_s[-1] + stops_s.sum()) / step_s - 1e-9)) + 1
     time_s = np.arange(num_samples) * step_s
+    return time_s, *sample(polyline_m, speeds_mps, times_s, stops_s, time_s)
+
+
+def sample(
+    polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline as `resample` takes it; after its end, the end."""
     now_s = np.minimum(time_s - stood_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]
@@ -92,7 +99,7 @@ def resample(
     walked_m = from_mps * since_s + 0.5 * (to_mps - from_mps) / duration_s * since_s**2
     along_m = polyline_m[piece + 1] - polyline_m[piece]
     share = np.clip(walked_m / np.linalg.norm(along_m, axis=1), 0.0, 1.0)
-    return time_s, polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * since_s / duration_s
+    return polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * since_s / duration_s
 
 
 def stood_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:

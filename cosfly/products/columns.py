@@ -21,7 +21,7 @@ def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
     return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
 
 
-def records(value: dict, name: str, path: Path) -> list[dict]:
+def records(value: dict, name: str, path: Path | str) -> list[dict]:
     records = value.get(name)
     if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
         raise InputError("not a list of objects", where=f"{path}: {name}")

@@ -109,6 +109,10 @@ def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:
     return TreeAngles(**dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True)))
 
 
+def tree_yaw(yaw_deg: float) -> float:
+    return float(mirror_rotations(np.array([0.0, yaw_deg, 0.0]))[1]) + 0.0
+
+
 def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
     return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
 
@@ -159,6 +163,36 @@ class PerturbationMeta(_Group):
     drone_rotation: TreeAngles
 
 
+class OtherMeta(_Group):
+    """Somebody beside the target: the middle of the box and its yaw in the tree's axes; how much of the picture."""
+
+    instance_id: int
+    semantic_id: int
+    world_location: TreePosition
+    yaw: float
+    half_extents_m: tuple[float, float, float]
+    num_pixels: int
+
+    @property
+    def center_m(self) -> np.ndarray:
+        """Middle of the box in the project's axes, (3,)."""
+        place = self.world_location
+        return mirror_positions(np.array([place.x, place.y, place.z]))
+
+    @property
+    def heading_rad(self) -> float:
+        """Counter-clockwise from east, as everywhere outside the tree."""
+        return float(np.radians(mirror_rotations(np.array([0.0, self.yaw, 0.0]))[1]))
+
+
+class OthersMeta(_Group):
+    """The others of a frame, and the shares of the target's box, 0 to 1, that they hide and that the map hides."""
+
+    target_hidden_by_others: float
+    target_hidden_by_map: float
+    others: list[OtherMeta]
+
+
 class FrameMeta(_Group):
     """`meta.json`: what a loader needs to know of one frame without opening anything else."""
 
@@ -173,6 +207,7 @@ class FrameMeta(_Group):
     target: TargetMeta
     perturbation: PerturbationMeta
     look: Look | None = None  # null in trees of before it stood here
+    others: OthersMeta | None = Field(None, exclude_if=lambda others: others is None)  # absent in runs without others
 
     def to_bytes(self) -> bytes:
         """The content of the file."""

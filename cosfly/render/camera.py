@@ -12,6 +12,7 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
+NOT_HIDDEN = -1  # no instance id
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
 
 # Pairs of corners (order of geometry.box_corners) that an edge of the box joins.
@@ -98,8 +99,33 @@ def rendered_visibility(
         Score in [0, 1], and the number of pixels of the person in the whole mask.
     """
     num_person_px = int(np.count_nonzero(frame.ids == PERSON_ID))
+    num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
+    return (float(np.count_nonzero(hiding == NOT_HIDDEN)) / num_rays if num_rays else 0.0), num_person_px
+
+
+def hidden_shares(
+    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera, other_ids: np.ndarray
+) -> tuple[float, float]:
+    """Tell what hides the target's box: the shares of it, in [0, 1], that others hide and that the map hides."""
+    num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
+    if num_rays == 0:
+        return 0.0, 0.0
+    num_others = int(np.isin(hiding, other_ids).sum())
+    return num_others / num_rays, float(np.count_nonzero(hiding != NOT_HIDDEN) - num_others) / num_rays
+
+
+def _rays_to_box(
+    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera
+) -> tuple[int, np.ndarray]:
+    """Look at the target's box through pixel centres.
+
+    Returns:
+        how many rays enter the box, those outside the image included; and for each inside the image, (k,), the id of what was drawn
+        in front of the box, NOT_HIDDEN where that is nothing or the person.
+    """
+    nothing = 0, np.empty(0, np.int64)
     if not view.in_view:
-        return 0.0, num_person_px
+        return nothing
     x0, y0, x1, y1 = view.box_px
     # A box that reaches far out of the image needs no ray for every pixel out there.
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
@@ -109,8 +135,8 @@ def rendered_visibility(
     near = box_depths(pixels + 0.5, np.asarray(target_m), half_m, camera_pose, camera.intrinsic)
     pixels, near = pixels[np.isfinite(near)].astype(np.int64), near[np.isfinite(near)]
     if len(pixels) == 0:
-        return 0.0, num_person_px
+        return nothing
     inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
     at = pixels[inside, 1], pixels[inside, 0]
     free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
-    return float(np.count_nonzero(free)) / len(pixels), num_person_px
+    return len(pixels), np.where(free, NOT_HIDDEN, frame.ids[at].astype(np.int64))

@@ -3,6 +3,7 @@
 Any renderer draws the same things in the same places, so that depth, kinds and ids do not depend on who draws:
 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
+- others that move, people and cars, each with the id that the caller gives it (`other_id`), nobody else's;
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain under everything (`ground_plane`), or, where the ground slopes, its triangles and the surfaces on it
   (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M;
@@ -11,6 +12,7 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -80,8 +82,33 @@ class PosedPerson:
     clothes: Clothes
 
 
+@dataclass(frozen=True)
+class PosedCar:
+    """One car in one moment: its box's middle center_m (3,) world, half_extents_m with x along the heading; seed in [0, 1) paints it."""
+
+    center_m: np.ndarray
+    heading_rad: float
+    half_extents_m: tuple[float, float, float]
+    seed: float
+
+
+@dataclass(frozen=True)
+class PosedOther:
+    """Somebody beside the target in one moment, and the id of `instance.png`."""
+
+    instance_id: int
+    body: PosedPerson | PosedCar
+
+    @property
+    def center_m(self) -> np.ndarray:
+        """Middle of the box, (3,) world."""
+        return self.body.hip_m if isinstance(self.body, PosedPerson) else self.body.center_m
+
+
 class Renderer(Protocol):
-    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look)` opens one; used from one thread.
+    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others)` opens one; used from one thread.
+
+    num_others: ids of `other_id` that no box may have.
 
     device: what draws, one line. Opening raises EnvironmentMissing where a package or driver is not there.
     """
@@ -91,7 +118,13 @@ class Renderer(Protocol):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
         """Get ready for a flight within these corners, (3,) each: shadows and the like."""
 
-    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+    def render(
+        self,
+        camera_pose: np.ndarray,
+        intrinsic: np.ndarray,
+        person: PosedPerson | None,
+        others: Sequence[PosedOther] = (),
+    ) -> Frame:
         """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 
         Raises:
@@ -106,22 +139,28 @@ class Renderer(Protocol):
 # --- the same for all -------------------------------------------------------------------------------------------------
 
 
-def has_own_ids(box_map: BoxMap) -> bool:
-    """Tell whether the boxes' own ids can be their ids in `instance.png`: all of them lie in 1..MAX_BOX_ID."""
-    return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID)).all())
+def other_id(number: int) -> int:
+    """Give the id of the other of this number: from MAX_BOX_ID downwards, which boxes leave free."""
+    return MAX_BOX_ID - number
 
 
-def instance_ids(box_map: BoxMap) -> np.ndarray:
+def has_own_ids(box_map: BoxMap, num_others: int = 0) -> bool:
+    """Tell whether the boxes' own ids can be their ids in `instance.png`: they lie in 1..MAX_BOX_ID, and none is an other's."""
+    return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID - num_others)).all())
+
+
+def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
     """Give every box its id for `instance.png`, (n,) uint16 in the map's order.
 
     The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not vegetation,
     then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
     """
-    if has_own_ids(box_map):
+    if has_own_ids(box_map, num_others):
         return box_map.ids.astype(np.uint16)
     order = np.argsort(box_map.kinds == KINDS["Vegetation"], kind="stable")
     ids = np.empty(len(box_map), dtype=np.uint16)
-    ids[order] = np.minimum(np.arange(1, len(box_map) + 1), SHARED_ID)
+    counted = np.arange(1, len(box_map) + 1)
+    ids[order] = np.where(counted <= MAX_BOX_ID - num_others, counted, SHARED_ID)
     return ids
 
 

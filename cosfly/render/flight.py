@@ -13,14 +13,15 @@ import numpy as np
 
 from cosfly.geometry import mask_box, world_from_camera
 from cosfly.products import frames
-from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, TargetMeta, frame_name
+from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import sha256_file
-from cosfly.render.camera import TargetView, rendered_visibility, view_target
+from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
+from cosfly.render.others import Cast
 from cosfly.render.person import Gait
 from cosfly.render.perturbation import HIDDEN, Perturbed, Poses
 from cosfly.runner import advance
@@ -43,6 +44,7 @@ class FlightScript:
     perturbed: Perturbed
     gait: Gait
     clothes: Clothes
+    others: Cast
     look: Look
     is_original: bool
     source: dict
@@ -59,6 +61,7 @@ class Seen:
     visibility: float
     num_pixels: int
     is_visible: bool
+    others: OthersMeta | None
 
 
 @dataclass(frozen=True)
@@ -119,12 +122,18 @@ def render_flight(
 def _draw(renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float) -> tuple[Frame, Seen]:
     """Draw frame i from the given poses and see what shows of the target."""
     pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
-    frame = renderer.render(pose, script.camera.intrinsic, script.gait.posed(i, target, script.clothes))
+    person, others = script.gait.posed(i, target, script.clothes), script.others.posed(i)
+    frame = renderer.render(pose, script.camera.intrinsic, person, others)
     view = view_target(target, pose, script.camera)
     score, num_px = rendered_visibility(frame, target, view, pose, script.camera)
     # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
     is_visible = view.in_view and score > threshold and num_px > 0
-    return frame, Seen(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible)
+    told = None
+    if len(script.others):
+        ids = np.array([other.instance_id for other in others])
+        hidden = hidden_shares(frame, target, view, pose, script.camera, ids)
+        told = script.others.meta(i, frame, *hidden)
+    return frame, Seen(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
 
 
 # --- files of one frame -----------------------------------------------------------------------------------------------
@@ -182,6 +191,7 @@ def _annotation(script: FlightScript, i: int, seen: Seen) -> FrameMeta:
             drone_rotation=frames.tree_angles(perturbed.rotation_offsets_deg[i]),
         ),
         look=script.look,
+        others=seen.others,
     )
 
 

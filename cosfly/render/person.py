@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosfly.geometry import headings_of
 from cosfly.render.contract import Clothes, PosedPerson
 
 STRIDE_M = 1.35  # two steps
@@ -49,10 +50,6 @@ def gait_of(targets_m: np.ndarray, time_s: np.ndarray) -> Gait:
         return Gait(np.zeros(1), np.zeros(1), np.zeros(1))
     steps = np.diff(targets_m[:, :2], axis=0)
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
-    velocity = np.gradient(targets_m[:, :2], time_s, axis=0)
-    speed = np.linalg.norm(velocity, axis=1)
-    headings = np.arctan2(velocity[:, 1], velocity[:, 0])
-    moving = np.flatnonzero(speed > 0.05)
-    last = np.maximum.accumulate(np.where(speed > 0.05, np.arange(n), -1))
-    last[last < 0] = moving[0] if len(moving) else 0
-    return Gait(headings[last], 2.0 * np.pi * walked / STRIDE_M, np.clip(speed / SLOW_MPS, 0.0, 1.0))
+    speed = np.linalg.norm(np.gradient(targets_m[:, :2], time_s, axis=0), axis=1)
+    phases = 2.0 * np.pi * walked / STRIDE_M
+    return Gait(headings_of(targets_m, time_s), phases, np.clip(speed / SLOW_MPS, 0.0, 1.0))

@@ -22,6 +22,7 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import Camera
 from cosfly.products.kinds import GROUND_KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.render.others import NOBODY, Cast
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"
@@ -131,7 +132,12 @@ class Surroundings:
 
 
 def perturb(
-    planned: Poses, camera: Camera, surroundings: Surroundings, cfg: PerturbationConfig, rng: np.random.Generator
+    planned: Poses,
+    camera: Camera,
+    surroundings: Surroundings,
+    cfg: PerturbationConfig,
+    rng: np.random.Generator,
+    others: Cast = NOBODY,
 ) -> Perturbed:
     """Perturb every frame of a flight. The same number of random draws is used for every frame, whatever happens in it."""
     unshifted = Perturbed.nothing(planned)
@@ -143,7 +149,7 @@ def perturb(
         view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
         position = NONE
         if events[0] < cfg.position_probability:
-            position = _shift(result, planned, i, person_offset, drone_offset, camera, surroundings, cfg)
+            position = _shift(result, planned, i, person_offset, drone_offset, camera, surroundings, cfg, others)
         if events[1] < cfg.rotation_probability:
             for each in (unshifted, result):
                 _turn(each, i, view_offset, camera, cfg)
@@ -162,7 +168,7 @@ def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, 
 
 def _shift(
     result: Perturbed, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
-    surroundings: Surroundings, cfg: PerturbationConfig,
+    surroundings: Surroundings, cfg: PerturbationConfig, others: Cast,
 ) -> str:  # fmt: skip
     """Apply one frame's position event and say so, or say why not."""
     target = planned.targets_m[i] + person_offset
@@ -177,9 +183,9 @@ def _shift(
     places = np.stack([drone, target, target + HEAD_OFFSET_M])
     distances, _ = signed_distances(surroundings.obstacles, places, CLEARANCE_CAP_M)
     kept_m = min(cfg.min_clearance_m, planned.clearances_m[i])  # a plan may be nearer, at its relaxed floor
-    if distances[0] < kept_m or drone[2] < ground_z + cfg.min_clearance_m:
+    if min(distances[0], others.distance_m(i, drone)) < kept_m or drone[2] < ground_z + cfg.min_clearance_m:
         return "fallback: drone clearance"
-    if distances[1:].min() < PERSON_HALF_EXTENTS_M[0]:
+    if distances[1:].min() < PERSON_HALF_EXTENTS_M[0] or others.are_in_the_way(i, target):
         return "fallback: person in an obstacle"
     if not in_frame(target, drone, aimed, camera, cfg.frame_margin):
         return OUT_OF_VIEW

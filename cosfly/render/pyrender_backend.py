@@ -8,6 +8,8 @@ that pyrender itself gives comes from a multisampled 24-bit buffer and is wrong 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.render import contract
-from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedPerson
+from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
@@ -32,6 +34,7 @@ COLORS = {
     "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16), "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63),
     "Car": (0.30, 0.05, 0.05), "Truck": (0.05, 0.10, 0.26), "Bus": (0.62, 0.44, 0.05), "Poles": (0.18, 0.18, 0.19),
 }  # fmt: skip
+CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
 HIP_Z_M, SHOULDER_Z_M, LEG_SWING_RAD, ARM_SWING_RAD = 0.90, 1.42, 0.25, 0.38  # heights over the feet
 
@@ -73,7 +76,7 @@ def _keep_display(platform: Any) -> None:
 class PyrenderRenderer:
     """Draws a map as plain boxes and round crowns. Positions on the device are relative to the map's middle."""
 
-    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
         self._screen, self._look = _open_screen(width_px, height_px), look
         import pyrender
         from OpenGL.GL import GL_RENDERER, glGetString
@@ -81,12 +84,18 @@ class PyrenderRenderer:
         self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
         self._origin = contract.scene_origin(box_map)
         self._scene = pyrender.Scene()
-        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin)))
+        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
         """Nothing holds for a flight alone: there are no shadows."""
 
-    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+    def render(
+        self,
+        camera_pose: np.ndarray,
+        intrinsic: np.ndarray,
+        person: PosedPerson | None,
+        others: Sequence[PosedOther] = (),
+    ) -> Frame:
         """Draw one frame, as the contract says."""
         contract.check_pose(camera_pose, intrinsic)
         import pyrender
@@ -97,7 +106,11 @@ class PyrenderRenderer:
         lens = [intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]]
         added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
         if person is not None:
-            added.append(self._scene.add(self._mesh(*_figure(person, self._origin))))
+            added.append(self._scene.add(self._mesh(*_figure(person, self._origin, contract.PERSON_ID))))
+        for other in others:
+            body, instance_id = other.body, other.instance_id
+            draw = partial(_figure, body) if isinstance(body, PosedPerson) else partial(_car, body)
+            added.append(self._scene.add(self._mesh(*draw(self._origin, instance_id))))
         tags, colors, bits = (self._draw(red) for red in (255, 128, 0))
         for node in added:
             self._scene.remove_node(node)
@@ -146,7 +159,7 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
-def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, colours and tags of every box and of the ground plane; crowns are ellipsoids, on stems that end in their middle."""
     import trimesh
 
@@ -157,7 +170,7 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndar
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
-    ids = np.append(contract.instance_ids(box_map), np.uint16(NO_INSTANCE))
+    ids = np.append(contract.instance_ids(box_map, num_others), np.uint16(NO_INSTANCE))
     tags = _tags(kinds, ids, np.append(contract.layers_of(box_map), 0))
     is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])
@@ -187,7 +200,7 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.concatenate(triangles), np.concatenate(colors), np.concatenate(tagged)
 
 
-def _figure(person: PosedPerson, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, colours and tags of a person of cylinders with a round head; x is forward and the feet are at 0."""
     import trimesh
 
@@ -206,8 +219,29 @@ def _figure(person: PosedPerson, origin: np.ndarray) -> tuple[np.ndarray, np.nda
     feet = person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M] - origin
     triangles = np.concatenate([solid.triangles for solid in solids]) @ turn.T + feet
     painted = np.concatenate([np.tile(color, (len(s.faces), 1)) for s, color in zip(solids, colors, strict=True)])
-    tag = _tags(np.array([KINDS["Pedestrians"]]), np.array([contract.PERSON_ID]), np.array([contract.STANDING_LAYER]))
-    return triangles, painted, np.repeat(tag, len(triangles), axis=0)
+    return triangles, painted, _standing_tags("Pedestrians", instance_id, len(triangles))
+
+
+def _car(car: PosedCar, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, colours and tags of a car of two boxes: the body up to its middle, and a shorter, narrower cabin."""
+    import trimesh
+
+    length, width, height = car.half_extents_m
+    turn, solids = rotation_matrix(0.0, car.heading_rad, 0.0), []
+    for size, place in (
+        ((2 * length, 2 * width, height), (0, 0, -height / 2)),
+        ((length, 1.6 * width, height), (-0.1 * length, 0, height / 2)),
+    ):
+        solids.append(trimesh.creation.box(extents=size).apply_translation(place).triangles)
+    triangles = np.concatenate(solids) @ turn.T + car.center_m - origin
+    paint = CAR_PAINTS[int(car.seed * len(CAR_PAINTS))]
+    return triangles, np.tile(paint, (len(triangles), 1)), _standing_tags("Car", instance_id, len(triangles))
+
+
+def _standing_tags(kind: str, instance_id: int, count: int) -> np.ndarray:
+    """Tags of what stands or moves on the ground, (count, 4)."""
+    tag = _tags(np.array([KINDS[kind]]), np.array([instance_id]), np.array([contract.STANDING_LAYER]))
+    return np.repeat(tag, count, axis=0)
 
 
 def _hanging(y: float, z: float, length: float, angle_rad: float, radius: float) -> Any:

@@ -20,13 +20,15 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.frames import Camera, FrameFile, Look
+from cosfly.products.others import Company, read_others
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.provenance import fingerprint
-from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids
+from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, render_flight
+from cosfly.render.others import NOBODY, Cast, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
@@ -39,6 +41,7 @@ RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer", "pyrender": "cosfly.re
 VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
+FROM_ONE_RUN = "give the others.json that was written beside the walks' path.json"
 IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 
 
@@ -107,8 +110,10 @@ class RenderConfig(Config):
         return town
 
 
-def open_renderer(name: str, box_map: BoxMap, width_px: int, height_px: int, look: Look | None = None) -> Renderer:
-    """Open a renderer of the table for one map.
+def open_renderer(
+    name: str, box_map: BoxMap, width_px: int, height_px: int, look: Look | None = None, num_others: int = 0
+) -> Renderer:
+    """Open a renderer of the table for one map and at most so many others.
 
     Raises:
         ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
@@ -116,14 +121,21 @@ def open_renderer(name: str, box_map: BoxMap, width_px: int, height_px: int, loo
     if name not in RENDERERS:
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)(box_map, width_px, height_px, look or Look())
+    return getattr(importlib.import_module(module), attribute)(box_map, width_px, height_px, look or Look(), num_others)
 
 
 # --- from traces to scripts -------------------------------------------------------------------------------------------
 
 
 def script_flight(
-    trace: DroneTrace, number: int, track: str, town: str, surroundings: Surroundings, cfg: RenderConfig, seed: int
+    trace: DroneTrace,
+    number: int,
+    track: str,
+    town: str,
+    surroundings: Surroundings,
+    cfg: RenderConfig,
+    seed: int,
+    others: Cast = NOBODY,
 ) -> FlightScript:
     """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view and clothes."""
     assert cfg.first_timestamp is not None, "`run` settles it"
@@ -134,7 +146,7 @@ def script_flight(
     planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
-        perturbed = perturb(planned, camera, surroundings, cfg.perturbation, rng)
+        perturbed = perturb(planned, camera, surroundings, cfg.perturbation, rng, others)
     else:
         perturbed = Perturbed.nothing(planned)
     return FlightScript(
@@ -146,6 +158,7 @@ def script_flight(
         perturbed=perturbed,
         gait=gait_of(trace.targets_m, trace.time_s),
         clothes=clothes,
+        others=others,
         look=cfg.look,
         is_original=track == "clean",
         segments=trace.segments,
@@ -174,15 +187,17 @@ def run(
     workers: int = 0,
     watch: Watch = Watch(),
     resume: Resume = "if-same",
+    others: Path | None = None,
 ) -> Path:
-    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance) and `drone_trace.json`; writes the playback tree.
+    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance), `drone_trace.json` and, where others move, `others.json`; writes
+    the playback tree.
 
     Flights that the planner's prefilter dropped are not drawn; the manifest counts them. Gives the tree's root, `out`.
 
     Raises:
         InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no renderer here.
     """
-    inputs = {"boxes": boxes, "simplified": simplified, "traces": traces}
+    inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -193,17 +208,17 @@ def run(
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
         raise stage.nothing_kept(tally, expected="a flight that the planner kept")
-    ids_record = _ids_record(box_map)
+    ids_record = _ids_record(box_map, num_others_of(_companies(others, all_traces)))
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
-    town, first_timestamp = _names(stage, cfg, box_map.name, traces, seed)
+    town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp})
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
         for number, trace in passed
         for track in cfg.tracks
     ]
-    arguments = (cfg, boxes, simplified, traces, out, town, seed, min(workers, len(items)))
+    arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file = out / town / "instance_ids.json"
     write_json(ids_file, ids_record, indent=None)
@@ -230,7 +245,43 @@ class _Rendered(BaseModel):
     num_frames: int
 
 
-def _names(stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, seed: int) -> tuple[str, int]:
+def _companies(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
+    """Read the others of every flight, by the walk's id; nobody without a file.
+
+    Raises:
+        InputError: the file is malformed, has nobody for a walk, or is of other times.
+    """
+    if others is None:
+        return {}
+    found = {company.path_id: company for company in read_others(others)}
+    for trace in traces:
+        company = found.get(trace.path_id)
+        if company is None:
+            raise InputError("no others for a walk", where=f"{others}: paths", expected=trace.path_id, fix=FROM_ONE_RUN)
+        for other in company.others:
+            if len(other.positions_m) != len(trace.time_s):
+                got, expected = (
+                    f"{len(other.positions_m)} places",
+                    f"{len(trace.time_s)}, one for each time of the flight",
+                )
+                raise InputError(
+                    "others of other times",
+                    where=f"{others}: {trace.path_id}",
+                    got=got,
+                    expected=expected,
+                    fix=FROM_ONE_RUN,
+                )
+    return found
+
+
+def num_others_of(companies: dict[str, Company]) -> int:
+    """How many ids the others of a tree need: as many as the largest company has."""
+    return max((len(company.others) for company in companies.values()), default=0)
+
+
+def _names(
+    stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
+) -> tuple[str, int]:
     """Give the town's folder and the number of the first trajectory; a tree that was begun goes on with those it has."""
     numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
     for record in stage.items():
@@ -239,7 +290,8 @@ def _names(stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, s
             place = place_of(Path(result_of(record, _Rendered).folder))
             return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
     town = town_folder(cfg.town or map_name)
-    what = dump_json([town, seed, fingerprint(traces), cfg.recorded()])
+    of_others = [] if others is None else [fingerprint(others)]
+    what = dump_json([town, seed, fingerprint(traces), cfg.recorded(), *of_others])
     derived = FIRST_S + int(sha256_bytes(what.encode()), 16) % SPAN_S
     return town, derived if cfg.first_timestamp is None else cfg.first_timestamp
 
@@ -249,34 +301,49 @@ def _check_ids(traces: list[DroneTrace], path: Path) -> None:
         raise InputError("two flights have one id", where=path, got=twice[0], expected="unique ids")
 
 
-def _ids_record(box_map: BoxMap) -> dict:
-    """Which box an id of `instance.png` stands for: rows of (instance id, box id)."""
-    ids = instance_ids(box_map)
+def _ids_record(box_map: BoxMap, num_others: int) -> dict:
+    """Which box an id of `instance.png` stands for: rows of (instance id, box id); and which ids are those of others."""
+    ids = instance_ids(box_map, num_others)
     return {
         "schema": IDS_SCHEMA,
         "schema_version": IDS_VERSION,
         "person": PERSON_ID,
         "shared": SHARED_ID,
+        **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),
         "num_shared": int((ids == SHARED_ID).sum()),
-        "are_box_ids": has_own_ids(box_map),
+        "are_box_ids": has_own_ids(box_map, num_others),
         "boxes": [[int(a), int(b)] for a, b in zip(ids, box_map.ids, strict=True) if a != SHARED_ID],
     }
 
 
 def make_worker(
-    cfg: RenderConfig, boxes: Path, simplified: Path, traces: Path, out: Path, town: str, seed: int, num_processes: int
+    cfg: RenderConfig,
+    boxes: Path,
+    simplified: Path,
+    traces: Path,
+    others: Path | None,
+    out: Path,
+    town: str,
+    seed: int,
+    num_processes: int,
 ) -> Work:
     """Open a renderer in this process and give the function that draws one (trace, track)."""
     if num_processes > 1:
         # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
-    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look)
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
+    companies = _companies(others, all_traces)
+    num_others = num_others_of(companies)
+    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, num_others)
     writing = Writing(tuple(cfg.modalities), cfg.png_compression, cfg.visible_threshold)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
-        script = script_flight(all_traces[number], number, track, town, surroundings, cfg, seed)
+        trace = all_traces[number]
+        company = companies.get(trace.path_id)
+        rng = rng_for(seed, "render", f"{trace.path_id}/others")
+        cast = NOBODY if company is None else cast_of(company.others, trace.time_s, rng)
+        script = script_flight(trace, number, track, town, surroundings, cfg, seed, cast)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             flight = render_flight(renderer, script, unfinished, writing, cfg.encoder_threads)

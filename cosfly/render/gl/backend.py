@@ -5,6 +5,7 @@ Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as floa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,15 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.reading.files import read_text
-from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedPerson, check_pose
+from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import Body, make_body
+from cosfly.render.gl.moving import MOST_CAPSULES, capsules_of, draw_others, placed
 from cosfly.render.gl.parts import LOOSE_VERTEX, PART
 from cosfly.render.gl.scene import Scene, build_scene
+from cosfly.render.gl.view import View
 
-SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
 LARGEST_SHADOW_AREA_M = 420.0
@@ -63,11 +65,12 @@ def _source(*names: str) -> str:
 class GlRenderer:
     """Draws a map on EGL. One object holds one GL context and belongs to the thread that made it."""
 
-    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look) -> None:
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
         self.context = open_context()
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
-        self.scene, self.width_px, self.height_px, self.look = build_scene(box_map), width_px, height_px, look
+        self.scene, self.look = build_scene(box_map, num_others), look
+        self.width_px, self.height_px = width_px, height_px
         with self.context:
             self._make_programs()
             self._make_targets()
@@ -209,15 +212,26 @@ class GlRenderer:
 
     # --- one frame ---
 
-    def render(self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None) -> Frame:
+    def render(
+        self,
+        camera_pose: np.ndarray,
+        intrinsic: np.ndarray,
+        person: PosedPerson | None,
+        others: Sequence[PosedOther] = (),
+    ) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         body = None if person is None else make_body(person)
-        eye = camera_pose[:3, 3] - self.scene.origin_m
+        view = View(
+            camera_pose[:3, :3], camera_pose[:3, 3] - self.scene.origin_m, intrinsic, self.width_px, self.height_px
+        )
+        moving = [] if body is None else [placed(body, self.scene.origin_m)]
+        moving += draw_others(others, self.scene.origin_m, view)
         with self.context:
-            self._set_camera(camera_pose[:3, :3], eye, intrinsic)
+            self._set_camera(camera_pose[:3, :3], view.eye, intrinsic)
             self._set_person(body)
-            rows = self._seen(camera_pose[:3, :3], eye, intrinsic)
+            self._set_others(capsules_of(others, self.scene.origin_m, view))
+            rows = view.rows(self.scene.parts)
             self._image.use()
             self._image.clear(depth=1.0)
             self.context.enable_only(self.context.DEPTH_TEST | self.context.CULL_FACE)
@@ -225,7 +239,7 @@ class GlRenderer:
             self.context.depth_func = "<="
             self._shadow.use(0)
             self._height.use(1)
-            self._draw_scene(rows, body)
+            self._draw_scene(rows, moving)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
@@ -268,30 +282,19 @@ class GlRenderer:
             _set(program, "person_num_bones", count)
             _set(program, "person_center", center)
 
-    def _seen(self, world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray) -> np.ndarray:
-        """Rows of the parts to draw, nearest objects first: in the frustum, large enough, in the right form."""
-        parts = self.scene.parts
-        in_camera = (parts.object_centers - eye.astype(np.float32)) @ world_from_camera.astype(np.float32)
-        x, y, z = in_camera.T
-        radius = parts.object_radii
-        middle, size = intrinsic[:2, 2], np.array([self.width_px, self.height_px])
-        tan_x, tan_y = np.maximum(middle, size - middle) / np.diag(intrinsic)[:2]  # the largest in the image
-        inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
-        inside &= np.abs(x) - z * tan_x < radius * np.sqrt(1.0 + tan_x**2)
-        inside &= np.abs(y) - z * tan_y < radius * np.sqrt(1.0 + tan_y**2)
-        size_px = float(intrinsic[0, 0]) * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)
-        inside &= (size_px >= np.maximum(parts.min_px, SMALLEST_PX)) & (size_px < parts.max_px)
-        rows = np.flatnonzero(inside)
-        return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
+    def _set_others(self, capsules: np.ndarray) -> None:
+        """Hand the shadows of the others to the shader, (k, 2, 4)."""
+        bones = np.zeros((MOST_CAPSULES, 2, 4), np.float32)
+        bones[: len(capsules)] = capsules
+        for program in self._materials:
+            if "other_bones" in program:
+                program["other_bones"].write(bones.tobytes())
+            _set(program, "num_others", len(capsules))
 
-    def _draw_scene(self, rows: np.ndarray, body: Body | None) -> None:
-        """Draw standing things before the ground, near before far: what is hidden costs nothing."""
-        records, groups = self.scene.parts.records[rows], self._groups[rows]
-        if body is not None:
-            placed = body.records.copy()
-            placed["center"] = body.centers_m - self.scene.origin_m
-            records = np.concatenate([placed, records])
-            groups = np.concatenate([_groups(placed, body.mesh), groups])
+    def _draw_scene(self, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Draw standing things before the ground, near before far: what is hidden costs nothing. moving: records and meshes."""
+        records = np.concatenate([*(part for part, _ in moving), self.scene.parts.records[rows]])
+        groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 self._draw(material, mesh, records[groups == material * MESH_STRIDE + mesh])

@@ -61,8 +61,8 @@ class _Figure:
         self.parts.append((meshes.LIMB, (low + high) / 2.0, turn, half, color))
 
 
-def make_body(person: PosedPerson) -> Body:
-    """Build the figure of a posed person."""
+def make_body(person: PosedPerson, instance_id: int = PERSON_ID) -> Body:
+    """Build the figure of a posed person, the target or another."""
     figure, swing, clothes = _Figure(), person.swing, person.clothes
     sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
     feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
@@ -71,7 +71,7 @@ def make_body(person: PosedPerson) -> Body:
         _arm(figure, side, phase, swing, clothes)
     _trunk_and_head(figure, swing, clothes)
     hip_m = np.asarray(person.hip_m, dtype=np.float64)
-    return _placed(figure, hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, hip_m)
+    return _placed(figure, hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, hip_m, instance_id)
 
 
 def _swung(angle_rad: float, length: float) -> np.ndarray:
@@ -119,13 +119,13 @@ def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
     figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.095))
 
 
-def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.ndarray) -> Body:
+def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.ndarray, instance_id: int) -> Body:
     turn = Rotation.from_euler("z", heading_rad).as_matrix()
     mesh, centers, turns, halves, colors = zip(*figure.parts, strict=True)
     records = np.zeros(len(mesh), PART)
     records["half"], records["color"][:, :3] = halves, colors
     records["quaternion"] = Rotation.from_matrix(turn @ np.array(turns)).as_quat()
-    records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), PERSON_ID))
+    records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), instance_id))
     records["bias"] = LAYER_STEP * STANDING_LAYER
     ends = np.array([[low, high] for low, high, _ in figure.bones]) @ turn.T + feet_m
     radii = np.array([radius for _, _, radius in figure.bones])

@@ -18,6 +18,8 @@ uniform vec4 person_bones[12];        // pairs: (from xyz, radius), (to xyz, unu
 uniform int person_num_bones;
 uniform vec3 person_center;
 uniform float ground_z;
+uniform vec4 other_bones[64];         // one capsule for each of the others: (from xyz, radius), (to xyz, instance id)
+uniform int num_others;
 
 layout(location = 0) out vec4 out_color;
 layout(location = 1) out float out_depth;
@@ -227,19 +229,38 @@ float sun_reaches(vec3 p, vec3 n) {
     return texture(shadow_map, c.xyz);                                           // compared and blended between four texels
 }
 
-// Shadow of the walking person: the ray to the sun against the capsules of the body.
+// The ray to the sun against a capsule from a to b: 0 in its shadow, 1 beside it.
+float capsule_lets_sun(vec3 p, vec3 a, vec3 b, float radius) {
+    vec3 u = b - a, w = p - a;
+    float uu = dot(u, u), us = dot(u, sun_direction), uw = dot(u, w), sw = dot(sun_direction, w);
+    float k = clamp((uw - us * sw) / max(uu - us * us, 1e-6), 0.0, 1.0);         // nearest point of the bone to the ray's line
+    vec3 gap = w - k * u;
+    float t = -dot(gap, sun_direction);
+    return t > 0.0 ? smoothstep(0.75, 1.25, length(gap + t * sun_direction) / radius) : 1.0;
+}
+
+// Shadow of the walking person, by the capsules of the body.
 float person_lets_sun(vec3 p) {
     vec3 d = p - person_center;
     int count = dot(d, d) > 30.0 ? 0 : person_num_bones;                         // a loop is left early, a branch is not
     float light = 1.0;
     for (int i = 0; i < count; i++) {
-        vec3 a = person_bones[2 * i].xyz, b = person_bones[2 * i + 1].xyz;
-        vec3 u = b - a, w = p - a;
-        float uu = dot(u, u), us = dot(u, sun_direction), uw = dot(u, w), sw = dot(sun_direction, w);
-        float k = clamp((uw - us * sw) / max(uu - us * us, 1e-6), 0.0, 1.0);     // nearest point of the bone to the ray's line
-        vec3 gap = w - k * u;
-        float t = -dot(gap, sun_direction);
-        if (t > 0.0) light = min(light, smoothstep(0.75, 1.25, length(gap + t * sun_direction) / person_bones[2 * i].w));
+        light = min(light, capsule_lets_sun(p, person_bones[2 * i].xyz, person_bones[2 * i + 1].xyz, person_bones[2 * i].w));
+    }
+    return light;
+}
+
+// What the others leave of the sun and of the sky, for everybody but themselves.
+vec2 others_let(vec3 p) {
+    vec2 light = vec2(1.0);
+    float own = float(f_tag >> 16);
+    for (int i = 0; i < num_others; i++) {
+        vec4 a = other_bones[2 * i], b = other_bones[2 * i + 1];
+        if (b.w == own) continue;
+        light.x = min(light.x, capsule_lets_sun(p, a.xyz, b.xyz, a.w));
+        vec2 u = b.xy - a.xy, w = p.xy - a.xy;
+        vec2 d = w - clamp(dot(u, w) / max(dot(u, u), 1e-6), 0.0, 1.0) * u;
+        light.y = min(light.y, 1.0 - 0.45 * exp(-0.36 * dot(d, d) / (a.w * a.w)) * step(p.z, max(a.z, b.z)));
     }
     return light;
 }
@@ -343,6 +364,11 @@ void main() {
     if (person_num_bones > 0 && material != CLOTH) {
         vec2 d = v_world.xy - person_center.xy;
         open_sky *= 1.0 - 0.45 * exp(-9.0 * dot(d, d)) * step(v_world.z, person_center.z);
+    }
+    if (num_others > 0) {
+        vec2 light = others_let(v_world);
+        sun *= light.x;
+        open_sky *= light.y;
     }
     vec3 ambient = mix(vec3(0.27, 0.25, 0.22), vec3(0.48, 0.56, 0.68), 0.5 + 0.5 * s.normal.z) * open_sky * s.shade;
     vec3 light = vec3(2.35, 2.12, 1.75) * sun * mix(1.0, s.shade, 0.5) + ambient;

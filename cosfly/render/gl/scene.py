@@ -34,9 +34,9 @@ class Scene:
     loose: dict[int, np.ndarray]
 
 
-def build_scene(box_map: BoxMap) -> Scene:
-    """Turn a map into drawable parts, with a ground plane under everything."""
-    origin, all_ids = scene_origin(box_map), instance_ids(box_map)
+def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
+    """Turn a map into drawable parts, with a ground plane under everything; the ids of others stay free."""
+    origin, all_ids = scene_origin(box_map), instance_ids(box_map, num_others)
     builder, lies = PartBuilder(), is_draped(box_map)
     # Surfaces on a slope are made as on a plain, so that they know their neighbours, and lifted afterwards.
     centers = box_map.centers - origin

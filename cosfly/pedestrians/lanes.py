@@ -1,0 +1,236 @@
+"""Where cars can drive: the lanes of a map's straight roads, and the curves from lane to lane at its junctions.
+
+A map knows its roads as boxes alone. A box of Roads that is longer than wide is a street; streets that cross, or that reach each
+other over road, meet in a junction. Maps whose roads are patches have no lanes, and nobody drives there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KINDS
+
+LONG = 1.5  # a street's box is this many times as long as wide; others are crossings and patches
+REACH = 2.0  # widths that a street is followed beyond its box, over other boxes of road, to the next junction
+NARROWEST_M = 5.0  # of a carriageway with two lanes
+STEP_M = 1.0  # between points along lanes and curves
+CLEAR_M = 1.1  # from the middle of a lane to what stands there: half a car, and a hand
+CAR_MIDDLE_M = 1.2  # over the ground: where what stands there is looked for
+LANE_SHARES = (0.25, 0.15, 0.08)  # of the width, from the middle line to a lane's: nearer to it where cars are parked
+SHORTEST_LANE_M = 8.0
+BEFORE_CURVE_M = 1.5  # a curve begins so far before the crossing carriageway
+SAME_PLACE_M = 3.0
+
+IsFree = Callable[[np.ndarray], bool]  # can a car drive through all of these places, (n, 2) m
+
+
+@dataclass(frozen=True)
+class Street:
+    """A straight carriageway: its middle line from start_m along a unit direction, both (2,); its box ends at 0 and length_m."""
+
+    start_m: np.ndarray
+    direction: np.ndarray
+    length_m: float
+    width_m: float
+    reach_m: tuple[float, float]  # how far road goes on before 0 and after length_m
+
+    def at(self, along_m: float) -> np.ndarray:
+        return self.start_m + along_m * self.direction
+
+    def reaches(self, along_m: float) -> bool:
+        return -self.reach_m[0] <= along_m <= self.length_m + self.reach_m[1]
+
+
+@dataclass
+class Lane:
+    """One way between two junctions: points_m (k, 2); onward: lanes that it leads to, each with the curve there, (j, 2)."""
+
+    points_m: np.ndarray
+    onward: list[tuple[int, np.ndarray]] = field(default_factory=list)
+
+    def distance_m(self, place_m: np.ndarray) -> float:
+        """From a place, (2,), to the nearest point."""
+        return float(np.linalg.norm(self.points_m - place_m, axis=1).min())
+
+
+def lanes_of(box_map: BoxMap) -> list[Lane]:
+    """Find the lanes of a map on which nothing stands; empty where it has no straight roads."""
+    from cosfly.kernels import obstacle_index, signed_distances
+
+    roads = box_map.select(box_map.kinds == KINDS["Roads"])
+    streets = _streets(roads)
+    obstacles = obstacle_index(box_map)
+
+    def is_free(points_m: np.ndarray) -> bool:
+        places = np.column_stack([points_m, box_map.ground.height_at(points_m) + CAR_MIDDLE_M])
+        return bool(
+            _on_road(roads, points_m).all() and (signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M).all()
+        )
+
+    junctions, stations = _junctions(streets)
+    lanes: list[Lane] = []
+    ways: list[_Way] = []
+    for street, along in zip(streets, stations, strict=True):
+        for low, high in pairwise(along):
+            for way in (_Way(street, low, high), _Way(street, high, low)):
+                line = way.line(junctions, is_free)
+                if line is not None:
+                    lanes.append(Lane(line))
+                    ways.append(way)
+    for lane, way in zip(lanes, ways, strict=True):
+        for number, after in enumerate(ways):
+            if way.leads_to(after):
+                curve = _curve(lane.points_m, lanes[number].points_m)
+                if is_free(curve):
+                    lane.onward.append((number, curve))
+    return lanes
+
+
+def _streets(roads: BoxMap) -> list[Street]:
+    """Streets of the boxes of road; a box that lies within a longer one of the same direction is part of it."""
+    streets = []
+    for center, half, rotation in zip(
+        roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg, strict=True
+    ):
+        yaw = np.radians(rotation[1]) + (np.pi / 2.0 if half[1] > half[0] else 0.0)
+        direction = np.array([np.cos(yaw), np.sin(yaw)])
+        long, short = half.max(), half.min()
+        if long >= LONG * short and 2.0 * short >= NARROWEST_M:
+            reach = [
+                _reach_m(roads, center + sign * long * direction, sign * direction, REACH * 2.0 * short)
+                for sign in (-1.0, 1.0)
+            ]
+            streets.append(Street(center - long * direction, direction, 2.0 * long, 2.0 * short, (reach[0], reach[1])))
+    return streets
+
+
+def _reach_m(roads: BoxMap, end_m: np.ndarray, direction: np.ndarray, most_m: float) -> float:
+    """How far road goes on from the end of a street."""
+    steps = np.arange(STEP_M, most_m, STEP_M)
+    is_road = _on_road(roads, end_m + steps[:, None] * direction)
+    return float(np.argmin(is_road) if not is_road.all() else len(steps)) * STEP_M
+
+
+def _on_road(roads: BoxMap, points_m: np.ndarray) -> np.ndarray:
+    """Tell which points lie on a box of road, (n,) bool."""
+    yaws = np.radians(roads.rotations_deg[:, 1])
+    offset = points_m[:, None] - roads.centers[None, :, :2]
+    x = offset[..., 0] * np.cos(yaws) + offset[..., 1] * np.sin(yaws)
+    y = offset[..., 1] * np.cos(yaws) - offset[..., 0] * np.sin(yaws)
+    half = roads.half_extents + 1e-6
+    return ((np.abs(x) <= half[:, 0]) & (np.abs(y) <= half[:, 1])).any(axis=1)
+
+
+@dataclass(frozen=True)
+class Junction:
+    """Where streets meet: place_m (2,); width_m of the widest."""
+
+    place_m: np.ndarray
+    width_m: float
+
+
+def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[float, int]]]]:
+    """Junctions, and for each street its stations in order: (m along it, junction), -1 for an end that meets nothing."""
+    junctions: list[Junction] = []
+    stations: list[dict[int, float]] = [{} for _ in streets]
+    for (i, one), (j, two) in combinations(enumerate(streets), 2):
+        meeting = _meeting(one, two)
+        if meeting is not None:
+            number = _number_of(one.at(meeting[0]), max(one.width_m, two.width_m), junctions)
+            stations[i].setdefault(number, meeting[0])
+            stations[j].setdefault(number, meeting[1])
+    lists = []
+    for street, found in zip(streets, stations, strict=True):
+        along = sorted((along, number) for number, along in found.items())
+        if not along or along[0][0] > street.width_m:
+            along.insert(0, (0.0, -1))
+        if along[-1][0] < street.length_m - street.width_m:
+            along.append((street.length_m, -1))
+        lists.append(along)
+    return junctions, lists
+
+
+def _number_of(place_m: np.ndarray, width_m: float, junctions: list[Junction]) -> int:
+    """The junction at a place, made or widened in the list."""
+    for number, known in enumerate(junctions):
+        if np.linalg.norm(known.place_m - place_m) < SAME_PLACE_M:
+            junctions[number] = Junction(known.place_m, max(width_m, known.width_m))
+            return number
+    junctions.append(Junction(place_m, width_m))
+    return len(junctions) - 1
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A stretch of a street between two stations, driven from the first to the second."""
+
+    street: Street
+    first: tuple[float, int]
+    last: tuple[float, int]
+
+    def leads_to(self, after: _Way) -> bool:
+        """Tell whether one gets onto another way at its end; nobody turns on the spot."""
+        is_back = after.street is self.street and after.last == self.first
+        return self.last[1] >= 0 and after.first[1] == self.last[1] and not is_back
+
+    def line(self, junctions: list[Junction], is_free: IsFree) -> np.ndarray | None:
+        """Its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None where something always does."""
+        sign = np.sign(self.last[0] - self.first[0])
+        (start, end) = (
+            along + toward * sign * (junctions[number].width_m / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
+            for toward, (along, number) in ((1.0, self.first), (-1.0, self.last))
+        )
+        if sign * (end - start) < SHORTEST_LANE_M:
+            return None
+        direction = sign * self.street.direction
+        right = np.array([direction[1], -direction[0]])
+        steps = np.linspace(start, end, int(abs(end - start) / STEP_M) + 2)
+        middle = self.street.start_m + steps[:, None] * self.street.direction
+        shifts = (share * self.street.width_m * right for share in LANE_SHARES)
+        return next((lane for shift in shifts if is_free(lane := middle + shift)), None)
+
+
+def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
+    """Where two streets meet, m along each; None where they do not reach each other."""
+    sine = _cross(one.direction, two.direction)
+    apart = two.start_m - one.start_m
+    if abs(sine) > 0.2:
+        place = _cross(apart, two.direction) / sine, _cross(apart, one.direction) / sine
+    else:
+        place = _in_line(one, two)
+    return place if one.reaches(place[0]) and two.reaches(place[1]) else None
+
+
+def _in_line(one: Street, two: Street) -> tuple[float, float]:
+    """Where the gap between two streets in one line has its middle, m along each; infinity where they are not in one line."""
+    ends = np.array([(two.at(along) - one.start_m) @ one.direction for along in (0.0, two.length_m)])
+    beside_m = abs(_cross(one.direction, two.start_m - one.start_m))
+    if beside_m > SAME_PLACE_M or (ends.min() < one.length_m and ends.max() > 0.0):
+        return np.inf, np.inf
+    after = ends.min() >= one.length_m
+    middle = float(one.length_m + ends.min() if after else ends.max()) / 2.0
+    return middle, float((one.at(middle) - two.start_m) @ two.direction)
+
+
+def _cross(one: np.ndarray, two: np.ndarray) -> float:
+    return float(one[0] * two[1] - one[1] * two[0])
+
+
+def _curve(one_m: np.ndarray, two_m: np.ndarray) -> np.ndarray:
+    """A curve from the end of a lane to the start of another, tangent to both, (j, 2) m without its two ends.
+
+    A cubic Bezier: its inner points lie on the lanes' lines, at 0.55 of the distance of a quarter circle.
+    """
+    start, end = one_m[-1], two_m[0]
+    leave, arrive = one_m[-1] - one_m[-2], two_m[1] - two_m[0]
+    gap_m = float(np.linalg.norm(end - start))
+    pull = 0.55 * gap_m / np.sqrt(2.0)
+    a, b = start + pull * leave / np.linalg.norm(leave), end - pull * arrive / np.linalg.norm(arrive)
+    share = np.linspace(0.0, 1.0, max(4, int(1.2 * gap_m / STEP_M)))[1:-1, None]
+    rest = 1.0 - share
+    return rest**3 * start + 3 * rest**2 * share * a + 3 * rest * share**2 * b + share**3 * end

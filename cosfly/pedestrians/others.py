@@ -1,0 +1,172 @@
+"""Who else moves while a walk lasts: people on routes of their own, and cars along lanes, all clear of the walker and of each other.
+
+One after the other is placed: the walker is there already, then the people, then the cars. Who would meet somebody waits a little way
+before; whom waiting does not help is drawn anew, and after some tries left out. So there may be fewer than the settings ask for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cosfly.chance import draw_by_share
+from cosfly.geometry import headings_of
+from cosfly.pedestrians.astar import find_route
+from cosfly.pedestrians.lanes import Lane
+from cosfly.pedestrians.paces import PACES, STOP_GAP_MIN, Way, speeds_at, take_pace
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
+from cosfly.pedestrians.walking import arrival_times, menger_curvature, sample
+from cosfly.products.ground import Ground
+from cosfly.products.others import Company, Other, gaps_m
+from cosfly.products.walks import Walk
+
+MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
+KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met
+TURN_S = 2.0  # people who are at the end of their route stand so long, and walk back
+OWN_SPEED = (0.8, 1.2)  # of a person's speeds, beside those of the same pace
+CAR_SPEED_MPS, CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = (
+    8.0,
+    2.0,
+    2.0,
+)  # 30 km/h; what is comfortable in a curve, and along the way
+SHORTEST_DRIVE_M = 15.0
+CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead and behind
+
+
+@dataclass(frozen=True)
+class Course:
+    """What one does: kind of BUILDS; the way, (k, 2) m, with its stops; limits_mps (k,), the speeds where nobody is in the way."""
+
+    kind: str
+    way: Way
+    limits_mps: np.ndarray
+
+    def moved(self, time_s: np.ndarray, heights: Ground) -> Other:
+        """Where the course leads at each time."""
+        positions_m = self._at(self.along_m(time_s))
+        if self.kind == "Car":
+            ahead, behind = (self._at(self.along_m(time_s) + sign * CHORD_M) for sign in (1.0, -1.0))
+            headings_rad = np.arctan2(*(ahead - behind).T[::-1])
+        else:
+            headings_rad = headings_of(positions_m, time_s)
+        return Other(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
+
+    def along_m(self, time_s: np.ndarray) -> np.ndarray:
+        """How far along the way one is at each time, (n,) m."""
+        speeds_mps = np.where(self.way.stops_s > 0, 0.0, self.limits_mps)
+        if self.kind == "Car":
+            speeds_mps = braked(speeds_mps, self.way.along_m)
+        line = np.column_stack([self.way.along_m, np.zeros(len(speeds_mps))])
+        return sample(line, speeds_mps, arrival_times(line, speeds_mps), self.way.stops_s, time_s)[0][:, 0]
+
+    def waiting(self, before_m: float) -> Course:
+        """The same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
+        at = max(0, int(np.searchsorted(self.way.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
+        near = slice(max(0, at - STOP_GAP_MIN + 1), at + STOP_GAP_MIN)
+        stops_s = self.way.stops_s.copy()
+        stops_s[near.start + int(np.argmax(stops_s[near])) if stops_s[near].any() else at] += WAIT_S
+        return replace(self, way=replace(self.way, stops_s=stops_s))
+
+    def _at(self, along_m: np.ndarray) -> np.ndarray:
+        known_m = self.way.along_m
+        return np.column_stack([np.interp(along_m, known_m, self.way.polyline_m[:, k]) for k in (0, 1)])
+
+
+def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
+    """Lower speeds at waypoints, (k,), so that none asks for more than CAR_FORWARD_MPS2 before or behind it."""
+    speeds = limits_mps.copy()
+    gains = 2.0 * CAR_FORWARD_MPS2 * np.diff(along_m)
+    for k in range(len(gains)):
+        speeds[k + 1] = min(speeds[k + 1], np.sqrt(speeds[k] ** 2 + gains[k]))
+    for k in reversed(range(len(gains))):
+        speeds[k] = min(speeds[k], np.sqrt(speeds[k + 1] ** 2 + gains[k]))
+    return speeds
+
+
+# --- one company ------------------------------------------------------------------------------------------------------
+
+
+def company_of(
+    walk: Walk, ground: WalkableGround, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
+) -> Company:
+    """Place the others of one walk."""
+    there = [Other("Pedestrians", walk.positions_m, headings_of(walk.positions_m, walk.time_s))]
+    for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
+        for _ in range(wanted):
+            for _ in range(cfg.num_retries + 1):
+                is_car = kind == "Car"
+                course = draw_drive(walk, lanes, cfg, rng) if is_car else draw_stroll(walk, ground, cfg, rng)
+                other = None if course is None else without_meeting(course, walk.time_s, there, ground.heights)
+                if other is not None:
+                    there.append(other)
+                    break
+    return Company(walk.path_id, there[1:])
+
+
+def without_meeting(course: Course, time_s: np.ndarray, there: list[Other], heights: Ground) -> Other | None:
+    """Move along a course and wait for those who are there already; None where that does not help."""
+    for _ in range(MOST_WAITS + 1):
+        other = course.moved(time_s, heights)
+        met = np.flatnonzero(np.min([gaps_m(other, one) for one in there], axis=0) < 0.0)
+        if len(met) == 0:
+            return other
+        before_m = float(course.along_m(time_s[met[:1] + 1])[0])
+        if met[0] == 0 and before_m < KEEP_BACK_M[course.kind]:
+            return None
+        course = course.waiting(before_m)
+    return None
+
+
+def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Course | None:
+    """Draw a person's route near a walk, at a pace of the settings, there and back for as long as the walk lasts; None without a goal."""
+    cells = ground.grid.cells_at(walk.polyline_m[rng.integers(len(walk.polyline_m))])
+    start = sample_goal(ground.parts, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
+    limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
+    goal = None if start is None else sample_goal(ground.parts, start, *limits, rng)
+    if start is None or goal is None:
+        return None
+    route = find_route(ground.walkable, start, goal)
+    assert route is not None, "two cells of one part have no route between them"
+    pace = PACES[draw_by_share(cfg.pace, rng)]
+    way = take_pace(ground.grid.centers_of(route), pace, rng)
+    speeds_mps = speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED)
+    course = Course("Pedestrians", way, speeds_mps)
+    while course.along_m(walk.time_s[-1:])[0] >= course.way.along_m[-1]:
+        course = _and_back(course)
+    return course
+
+
+def _and_back(course: Course) -> Course:
+    """The same, and back to its start after a stop."""
+    way = course.way
+    stops_s = np.concatenate([way.stops_s, way.stops_s[-2::-1]])
+    stops_s[len(way.stops_s) - 1] = TURN_S
+    back = Way(np.concatenate([way.polyline_m, way.polyline_m[-2::-1]]), stops_s)
+    return replace(course, way=back, limits_mps=np.concatenate([course.limits_mps, course.limits_mps[-2::-1]]))
+
+
+def draw_drive(walk: Walk, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator) -> Course | None:
+    """Draw a drive that begins near a walk and lasts as long, or up to a dead end; None where no lane is near."""
+    place_m = walk.polyline_m[rng.integers(len(walk.polyline_m))]
+    near = [k for k, lane in enumerate(lanes) if lane.distance_m(place_m) < cfg.others_reach_m]
+    if not near:
+        return None
+    number = near[rng.integers(len(near))]
+    begin = int(rng.integers(len(lanes[number].points_m) - 1))
+    pieces = [lanes[number].points_m[begin:]]
+    length_m, needed_m = 0.0, CAR_SPEED_MPS * float(walk.time_s[-1])
+    while length_m < needed_m and lanes[number].onward:
+        onward = lanes[number].onward
+        # Who may turn stays near the walk: traffic that leaves the picture for good is of no use to it.
+        weights = np.exp([-lanes[k].distance_m(place_m) / cfg.others_reach_m for k, _ in onward])
+        number, curve = onward[int(rng.choice(len(onward), p=weights / weights.sum()))]
+        pieces += [curve, lanes[number].points_m]
+        length_m += len(curve) + len(lanes[number].points_m)  # a metre from point to point
+    way = Way.without_stops(np.concatenate(pieces))
+    if way.along_m[-1] < SHORTEST_DRIVE_M:
+        return None
+    curvatures = np.maximum(menger_curvature(way.polyline_m), 1e-6)
+    limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
+    limits_mps[-1] = 0.0
+    return Course("Car", way, limits_mps)

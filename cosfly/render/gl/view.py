@@ -1,0 +1,55 @@
+"""What a camera can see of drawable parts: in the frustum, large enough, in the form for its size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosfly.render.contract import FAR_M, NEAR_M
+from cosfly.render.gl.parts import Parts
+
+SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera relative to the scene's origin: world_from_camera (3, 3), eye (3,), intrinsic (3, 3) px."""
+
+    world_from_camera: np.ndarray
+    eye: np.ndarray
+    intrinsic: np.ndarray
+    width_px: int
+    height_px: int
+
+    def rows(self, parts: Parts) -> np.ndarray:
+        """Rows of the parts to draw, nearest objects first."""
+        in_camera = self._in_camera(parts.object_centers)
+        z, radius = in_camera[:, 2], parts.object_radii
+        size_px = self._size_px(in_camera, radius)
+        inside = self._is_inside(in_camera, radius)
+        inside &= (size_px >= np.maximum(parts.min_px, SMALLEST_PX)) & (size_px < parts.max_px)
+        rows = np.flatnonzero(inside)
+        return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
+
+    def can_show(self, center: np.ndarray, radius: float) -> bool:
+        """Tell whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
+        in_camera, radii = self._in_camera(center[None]), np.array([radius], np.float32)
+        return bool(self._is_inside(in_camera, radii)[0] and self._size_px(in_camera, radii)[0] >= SMALLEST_PX)
+
+    def _in_camera(self, centers: np.ndarray) -> np.ndarray:
+        return (centers - self.eye.astype(np.float32)) @ self.world_from_camera.astype(np.float32)
+
+    def _is_inside(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        x, y, z = in_camera.T
+        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        tan_x, tan_y = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]  # the largest in the image
+        inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
+        inside &= np.abs(x) - z * tan_x < radius * np.sqrt(1.0 + tan_x**2)
+        inside &= np.abs(y) - z * tan_y < radius * np.sqrt(1.0 + tan_y**2)
+        return inside
+
+    def _size_px(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Radius on the image."""
+        x, y, z = in_camera.T
+        return float(self.intrinsic[0, 0]) * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)

@@ -1,0 +1,322 @@
+"""Who else moves: the product, lanes of a map, and the placing of people and cars about a walk."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly.chance import rng_for
+from cosfly.config import build
+from cosfly.errors import ConfigError, InputError
+from cosfly.pedestrians.lanes import lanes_of
+from cosfly.pedestrians.others import CAR_FORWARD_MPS2, braked, company_of
+from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
+from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.products.others import BUILDS, Company, Other, distances_to_boxes_m, gaps_m, read_others, write_others
+from cosfly.products.walks import read_paths
+from cosfly.store import dump_json
+
+PERSON, CAR = "Pedestrians", "Car"
+
+
+def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
+    """Two carriageways of 8 m that cross at the origin, pavement all about; more: (kind, center, half_extents)."""
+    rows = [
+        ("Sidewalks", (0, 0, -0.2), (80, 80, 0.15)),
+        ("Roads", (0, 0, -0.1), (80, 4, 0.1)),
+        ("Roads", (0, 42, -0.1), (4, 38, 0.1)),
+        ("Roads", (0, -42, -0.1), (4, 38, 0.1)),
+        *more,
+    ]
+    kinds = [KINDS[row[0]] for row in rows]
+    header = MapHeader(name="Crossing")
+    return make_box_map(
+        [row[1] for row in rows], [row[2] for row in rows], np.zeros((len(rows), 3)), kinds, header=header
+    )
+
+
+def standing(kind: str, x: float, y: float, heading_rad: float = 0.0, n: int = 2) -> Other:
+    return Other(kind, np.tile([x, y, 0.0], (n, 1)), np.full(n, heading_rad))
+
+
+def going(kind: str, start, end, n: int = 2) -> Other:
+    start, end = np.array([*start, 0.0]), np.array([*end, 0.0])
+    places = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
+    return Other(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
+
+
+# --- the product ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "gap_m"),
+    [
+        (standing(PERSON, 0, 0), standing(PERSON, 1, 0), 0.4),
+        (standing(PERSON, 0, 0), standing(PERSON, 0.5, 0), -0.1),
+        (going(PERSON, (-5, 0), (5, 0)), standing(PERSON, 0, 2), 1.4),  # nearest between the two times
+        (going(PERSON, (-5, 0), (5, 0)), going(PERSON, (5, 0), (-5, 0)), -0.6),  # through each other
+        (standing(CAR, 0, 0), standing(PERSON, 0, 2), 0.5),
+        (standing(CAR, 0, 0), standing(PERSON, 3.45, 0), 0.5),
+        (standing(CAR, 0, 0, np.pi / 2), standing(PERSON, 0, 3.45), 0.5),
+        (standing(CAR, 0, 0), standing(CAR, 0, 3), 0.6),
+    ],
+)
+def test_gaps_by_hand(one, two, gap_m):
+    assert gaps_m(one, two).tolist() == pytest.approx([gap_m])
+    assert gaps_m(two, one).tolist() == pytest.approx([gap_m])
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6))
+def test_gaps_agree_with_many_small_steps(seed):
+    rng = np.random.default_rng(seed)
+    one, two = (
+        Other(PERSON, np.column_stack([rng.uniform(-3, 3, (4, 2)), np.zeros(4)]), np.zeros(4)) for _ in range(2)
+    )
+    shares = np.linspace(0.0, 1.0, 2001)
+    for step, gap in enumerate(gaps_m(one, two)):
+        a, b = (
+            (1 - shares)[:, None] * who.positions_m[step] + shares[:, None] * who.positions_m[step + 1]
+            for who in (one, two)
+        )
+        assert gap == pytest.approx(np.linalg.norm(a - b, axis=1).min() - 0.6, abs=2e-3)
+
+
+def test_discs_cover_the_box_of_each_kind():
+    for kind, shape in BUILDS.items():
+        x, y = np.meshgrid(*(np.linspace(-half, half, 81) for half in shape.half_extents_m[:2]))
+        ground = np.column_stack([x.ravel(), y.ravel()])
+        nearest = np.min([np.linalg.norm(ground - [offset, 0.0], axis=1) for offset in shape.disc_offsets_m], axis=0)
+        slack_m = 0.13 if kind == PERSON else 0.0  # the corners of a person's box are air
+        assert nearest.max() <= shape.disc_radius_m + slack_m, kind
+
+
+def test_distance_to_a_turned_box():
+    car = standing(CAR, 1.0, 2.0, np.pi / 2, n=1)
+    assert distances_to_boxes_m(np.array([[1.0, 2.0, 9.5]]), car).tolist() == pytest.approx([8.0])
+    assert distances_to_boxes_m(np.array([[1.0, 5.2, 0.7]]), car).tolist() == pytest.approx([1.0])
+    assert distances_to_boxes_m(np.array([[2.9, 2.0, 0.7]]), car).tolist() == pytest.approx([1.0])
+
+
+def test_others_round_trip_and_bad_files(tmp_path):
+    path = tmp_path / "others.json"
+    write_others(
+        path, [Company("p", [going(CAR, (0, 0), (4, 3)), standing(PERSON, 1, 1)]), Company("q", [])], {"map": "T"}
+    )
+    first, second = read_others(path)
+    assert (first.path_id, second.path_id, second.others) == ("p", "q", [])
+    assert [other.kind for other in first.others] == [CAR, PERSON]
+    np.testing.assert_allclose(first.others[0].positions_m, [[0, 0, 0], [4, 3, 0]])
+    np.testing.assert_allclose(first.others[0].headings_rad, np.arctan2(3, 4), atol=1e-5)
+    for old, new, words in (
+        ('"Car"', '"Tank"', r"paths\[0\]\.others\[0\]\.kind: .*'Tank'.*Pedestrians or Car"),
+        ('"x":[0.0,4.0]', '"x":[0.0]', r"paths\[0\]\.others\[0\]\.y"),
+        ('"x":[0.0,4.0]', '"x":[0.0,null]', r"paths\[0\]\.others\[0\]\.x"),
+        ('"id":"q"', '"id":7', r"paths\[1\]\.id"),
+    ):
+        text = path.read_text()
+        assert old in text
+        (tmp_path / "bad.json").write_text(text.replace(old, new, 1))
+        with pytest.raises(InputError, match=words):
+            read_others(tmp_path / "bad.json")
+    value = json.loads(path.read_text())
+    for axis in ("x", "y", "z", "yaw"):
+        value["paths"][0]["others"][1][axis].append(1.0)
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=r"paths\[0\]\.others.*|different lengths"):
+        read_others(path)
+
+
+# --- lanes ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_crossing_has_two_lanes_an_arm_on_the_right_and_three_ways_on():
+    lanes = lanes_of(crossing_town())
+    assert len(lanes) == 8
+    for lane in lanes:
+        start, end = lane.points_m[[0, -1]]
+        ahead = (end - start) / np.linalg.norm(end - start)
+        right = np.array([ahead[1], -ahead[0]])
+        assert lane.points_m @ right == pytest.approx(np.full(len(lane.points_m), 2.0)), (
+            "a quarter of 8 m right of the middle"
+        )
+    arriving = [lane for lane in lanes if lane.onward]
+    assert len(arriving) == 4
+    assert {len(lane.onward) for lane in arriving} == {3}, "right, left and straight on, but not back"
+    for lane in arriving:
+        for number, curve in lane.onward:
+            line = np.concatenate([lane.points_m[-2:], curve, lanes[number].points_m[:2]])
+            steps = np.diff(line, axis=0)
+            turns = np.degrees(np.abs(np.diff(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))))
+            assert turns.max() < 40.0, "no corners"
+
+
+def test_lanes_keep_off_what_stands_there():
+    parked = ("Car", (-40, -3, 0.75), (2.2, 0.9, 0.75))
+    shifted = lanes_of(crossing_town(parked))
+    assert len(shifted) == 8
+    east = [
+        lane
+        for lane in shifted
+        if np.ptp(lane.points_m[:, 1]) < 1e-9 and lane.points_m[0, 0] < lane.points_m[-1, 0] < 0
+    ]
+    (lane,) = east
+    assert -1.3 < lane.points_m[0, 1] < -0.6, "nearer to the middle line, where a parked car stands"
+    blocked = lanes_of(crossing_town(("Walls", (-40, 0, 1.0), (0.2, 4, 1.0))))
+    assert len(blocked) == 6
+
+
+@pytest.mark.parametrize("kind", ["Terrain", "Ground"])
+def test_a_map_without_straight_roads_has_no_lanes(kind):
+    assert lanes_of(make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS[kind]])) == []
+    squares = make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS["Roads"]])
+    assert lanes_of(squares) == []
+
+
+def test_streets_in_one_line_with_road_between_are_one_way():
+    pieces = [((-25, 0, -0.1), (20, 4, 0.1)), ((25, 0, -0.1), (20, 4, 0.1)), ((0, 0, -0.1), (5, 4, 0.1))]
+    box_map = make_box_map(*zip(*pieces, strict=True), np.zeros((3, 3)), [KINDS["Roads"]] * 3)
+    lanes = lanes_of(box_map)
+    assert sum(len(lane.onward) for lane in lanes) == 2
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10**6))
+def test_braked_speeds_ask_for_no_more_than_a_car_gives(seed):
+    rng = np.random.default_rng(seed)
+    along = np.cumsum(rng.uniform(0.3, 2.0, 30))
+    limits = rng.uniform(0.0, 9.0, 30)
+    speeds = braked(limits, along)
+    assert (speeds <= limits).all()
+    assert (np.abs(np.diff(speeds**2)) <= 2.0 * CAR_FORWARD_MPS2 * np.diff(along) + 1e-9).all()
+    assert speeds.max() == limits.max() or (speeds < limits).any()
+
+
+# --- placing ----------------------------------------------------------------------------------------------------------
+
+CFG = PedestriansConfig(others=6, traffic=6, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
+
+
+@pytest.fixture(scope="module")
+def placed():
+    """(box_map, ground, lanes, walks with their companies)."""
+    box_map = crossing_town(("Buildings", (40, 40, 5), (20, 20, 5)), ("Buildings", (-40, 40, 5), (20, 20, 5)))
+    ground, lanes = walkable_ground(box_map, CFG), lanes_of(box_map)
+    made = []
+    for k in range(4):
+        walk = make_walk(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).walk
+        made.append((walk, company_of(walk, ground, lanes, CFG, rng_for(0, "others", str(k)))))
+    return box_map, ground, lanes, made
+
+
+def test_nobody_meets_anybody(placed):
+    for walk, company in placed[3]:
+        everybody = [Other(PERSON, walk.positions_m, np.zeros(len(walk.time_s))), *company.others]
+        for k, one in enumerate(everybody):
+            assert len(one.positions_m) == len(walk.time_s)
+            for two in everybody[:k]:
+                assert gaps_m(one, two).min() >= 0.0
+                apart = np.linalg.norm(one.positions_m - two.positions_m, axis=1).min()
+                assert apart >= 0.6
+
+
+def test_people_walk_where_people_walk_and_cars_drive_on_the_road(placed):
+    _, ground, _, made = placed
+    kinds = [other.kind for _, company in made for other in company.others]
+    assert kinds.count(PERSON) >= 20
+    assert kinds.count(CAR) >= 12
+    for walk, company in made:
+        for other in company.others:
+            step_mps = np.linalg.norm(np.diff(other.positions_m, axis=0), axis=1) / np.diff(walk.time_s)
+            assert step_mps.max() <= (10.0 if other.kind == CAR else 2.0)
+            assert step_mps.max() > 0.5, "somebody who moves"
+            if other.kind == PERSON:
+                x, y = ground.grid.cells_at(other.positions_m).T
+                assert not ground.grid.occupied[y, x].any()
+            else:
+                x, y = np.abs(other.positions_m[:, :2]).T
+                assert (np.minimum(x, y) < 4.0 + 1e-6).all()
+                turn = np.abs(np.degrees(np.diff(np.unwrap(other.headings_rad))))
+                assert turn.max() < 60.0, "a car turns along its way"
+                moving = step_mps > 1.0
+                along = np.diff(other.positions_m[:, :2], axis=0)[moving]
+                heading = other.headings_rad[:-1][moving]
+                ahead = (along * np.column_stack([np.cos(heading), np.sin(heading)])).sum(axis=1)
+                assert (ahead > 0.5 * np.linalg.norm(along, axis=1)).all(), "forwards"
+
+
+def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
+    _, ground, lanes, made = placed
+    walk, company = made[0]
+    again = company_of(walk, ground, lanes, CFG, rng_for(0, "others", "0"))
+    assert dump_json(again.as_json()) == dump_json(company.as_json())
+    other = company_of(walk, ground, lanes, CFG, rng_for(1, "others", "0"))
+    assert dump_json(other.as_json()) != dump_json(company.as_json())
+    fewer = company_of(
+        walk, ground, lanes, CFG.model_copy(update={"others": 2, "traffic": 0}), rng_for(0, "others", "0")
+    )
+    assert [o.as_json() for o in fewer.others] == [o.as_json() for o in company.others[:2]]
+
+
+def test_where_there_is_no_road_there_is_nobody_to_drive(placed):
+    _, ground, _, made = placed
+    company = company_of(made[0][0], ground, [], CFG, np.random.default_rng(0))
+    assert {other.kind for other in company.others} == {PERSON}
+
+
+def test_who_finds_no_place_is_left_out():
+    """A corridor two cells wide, walked by everybody: nobody can pass the walker who comes towards them."""
+    walls = [("Walls", (0, sign * 41, 1.0), (80, 39.5, 1.0)) for sign in (-1, 1)]
+    box_map = crossing_town(*walls)
+    cfg = CFG.model_copy(update={"others": 12, "traffic": 0, "min_component_cells": 50, "num_retries": 1})
+    ground = walkable_ground(box_map, cfg)
+    walk = make_walk("p", ground, cfg, rng_for(0, "pedestrians", "0")).walk
+    assert len(company_of(walk, ground, [], cfg, np.random.default_rng(0)).others) < 12
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, caplog):
+    write_boxes(tmp_path / "map.json", crossing_town(("Terrain", (0, 0, -1.0), (90, 90, 0.5))))
+    plain = PedestriansConfig(num_paths=3)
+    run(plain, tmp_path / "map.json", tmp_path / "none")
+    assert not (tmp_path / "none/others.json").exists()
+    assert "others" not in json.loads((tmp_path / "none/pedestrians_report.json").read_text())
+    cfg = replace_settings(plain, others=3, traffic=2)
+    for folder, workers in (("one", 1), ("two", 2)):
+        run(cfg, tmp_path / "map.json", tmp_path / folder, workers=workers)
+    one, two = ((tmp_path / folder / "others.json").read_bytes() for folder in ("one", "two"))
+    assert one == two
+    walks, companies = read_paths(tmp_path / "one/path.json"), read_others(tmp_path / "one/others.json")
+    assert [walk.path_id for walk in walks] == [company.path_id for company in companies]
+    for before, walk in zip(read_paths(tmp_path / "none/path.json"), walks, strict=True):
+        np.testing.assert_array_equal(before.positions_m, walk.positions_m)
+    counts = json.loads((tmp_path / "one/pedestrians_report.json").read_text())["others"]
+    placed = [sum(other.kind == kind for company in companies for other in company.others) for kind in (PERSON, CAR)]
+    assert counts == {PERSON: {"wanted": 9, "placed": placed[0]}, CAR: {"wanted": 6, "placed": placed[1]}}
+
+
+def test_a_map_without_roads_says_how_many_cars_are_missing(tmp_path, caplog):
+    lawn = make_box_map([[0, 0, -0.1]], [[80, 80, 0.1]], np.zeros((1, 3)), [KINDS["Ground"]])
+    write_boxes(tmp_path / "map.json", lawn)
+    run(PedestriansConfig(num_paths=2, traffic=4), tmp_path / "map.json", tmp_path / "out")
+    counts = json.loads((tmp_path / "out/pedestrians_report.json").read_text())["others"]
+    assert counts["Car"] == {"wanted": 8, "placed": 0}
+    assert "0 of 8 others of kind Car found a place" in caplog.text
+
+
+def replace_settings(cfg: PedestriansConfig, **changes) -> PedestriansConfig:
+    return build(PedestriansConfig, {**cfg.model_dump(), **changes}, "test")
+
+
+@pytest.mark.parametrize(
+    "bad", [{"others": -1}, {"traffic": 501}, {"others_reach_m": 0}], ids=["negative", "many", "reach"]
+)
+def test_bad_numbers_are_config_errors(bad):
+    with pytest.raises(ConfigError, match=next(iter(bad))):
+        build(PedestriansConfig, bad, "test")
