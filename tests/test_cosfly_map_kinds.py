@@ -235,6 +235,13 @@ def test_a_malformed_sequence_or_template_names_the_line_and_the_field(tmp_path:
         load(tmp_path, data)
 
 
+def test_an_outline_whose_parts_are_not_in_the_file_is_kept(tmp_path: Path):
+    model = with_an_outline(city())
+    (outline,) = [value for value in model["CityObjects"].values() if value.get("children")]
+    outline["children"] = ["somewhere else"]
+    assert "outline_of_parts" not in load(tmp_path, document(model)).header.dropped_objects
+
+
 def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
     """99 buildings of 3D BAG, CityJSON 1.1: outlines at level 0, parts at 1.2, 1.3 and 2.2."""
     path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"
