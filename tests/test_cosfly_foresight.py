@@ -10,7 +10,7 @@ from cosfly import flight_metrics, kernels
 from cosfly.chance import rng_for
 from cosfly.planners.contract import PlanConfig, load_planner
 from cosfly.planners.foresight import foresight, lattice, search, smooth
-from cosfly.planners.stage import make_scenario
+from cosfly.planners.stage import make_scenario, plan_flight
 
 CFG = PlanConfig()
 
@@ -208,6 +208,13 @@ def test_it_climbs_over_what_blocks_every_ring():
     made = fly("foresight", scenario, obstacles)
     assert made.solver["start"] == "climbing search"
     assert made.positions_m[:, 2].min() >= 34.0 + 3.0
+
+
+def test_an_orbit_without_room_is_flown_as_far_as_there_is_room():
+    towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
+    obstacles, cfg = kernels.obstacle_index(town_of(*towers)), PlanConfig(planner="foresight", styles={"orbit_left": 1})
+    trace = plan_flight(walk_along("straight", [(0, 0), (90, 0)]), obstacles, cfg, 0)
+    assert trace.clearances_m.min() >= cfg.relaxed_safety_m
 
 
 def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():

@@ -11,6 +11,8 @@ from cosfly.planners.contract import Scenario
 
 NUM_AZIMUTHS = 36
 BETWEEN_KEYS_S, BETWEEN_KEYS_CLIMBING_S = 1.5, 3.0  # the latter lets the drone climb from one of CLIMBS to the next
+# Azimuths between one key frame and the next, against those that the wish turns by: climbing, an orbit without room can stand still.
+MAX_TURN, MAX_TURN_CLIMBING = 2, 6
 
 # Rings as (steps outwards, steps up) from the wished place. Who is hidden below canopies is seen from farther off, who is hidden behind
 # a house from above; CLIMBS lead over what blocks the way.
@@ -35,6 +37,7 @@ class Lattice:
 
     frames: (m,) places in the walk. places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) whatever is seen from there.
     links: (r, r) rings that can be reached from each, itself first, then -1. radius_max_m: of the largest ring.
+    max_turn: azimuths between one key frame and the next.
     """
 
     frames: np.ndarray
@@ -42,6 +45,7 @@ class Lattice:
     costs: np.ndarray
     links: np.ndarray
     radius_max_m: float
+    max_turn: int
 
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
@@ -72,7 +76,8 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if wish.any_bearing else (BEARING_COST, HIGH_COST)
     aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
-    return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()))
+    max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
+    return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
 
 
 def _links(rings: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ from cosfly.planners.foresight.lattice import Lattice
 from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
 
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
-MAX_TURN = 2  # azimuths between one key frame and the next: 20 degrees
 NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
 SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
 REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
@@ -57,7 +56,7 @@ def search_flight(
     own += lattice.costs.reshape(own.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=0)
     chosen = _cheapest(
-        places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, MAX_TURN, WAY_COST
+        places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn, WAY_COST
     )
     if chosen[0] < 0:
         return None
