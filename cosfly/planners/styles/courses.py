@@ -74,6 +74,12 @@ def without_jumps(
     )
 
 
+def places_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
+    """Give the places of a course as it is drawn, jumps and all, (n, 3)."""
+    away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
+    return np.column_stack([targets_m[:, :2] + away, ground_m + course[:, 2]])
+
+
 def _best_course(
     style: Style, part: slice, before: float | None, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig,
     rng: np.random.Generator,
@@ -85,8 +91,7 @@ def _best_course(
     best, best_score = np.empty(0), -np.inf
     for _ in range(DRAWS):
         course = _course(style, targets_m, heading_rad, before, scenario.dt_s, rng)
-        away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
-        places = np.column_stack([targets_m[:, :2] + away, scenario.ground_m[part] + course[:, 2]])
+        places = places_of(course, targets_m, scenario.ground_m[part])
         is_near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
         score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
         if before is not None:

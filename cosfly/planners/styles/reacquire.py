@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.courses import without_jumps
+from cosfly.planners.styles.courses import places_of, without_jumps
 from cosfly.planners.styles.table import HIDING
 from cosfly.products.kinds import KINDS
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
     from cosfly.products.boxes import BoxMap
 
-TRIES = 64
+TRIES = 40
 LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # longest time without sight
 BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least so long before it is lost, and at the end
 SEEN = 0.5  # mean visibility that counts as seen
@@ -50,8 +50,8 @@ def wish_of_reacquire(
     targets, ground, dt_s = scenario.targets_m, scenario.ground_m, scenario.dt_s
     for _ in range(TRIES):
         course, climb_m, near_m = _watching(scenario, rng), rng.uniform(*CLIMBS_M), rng.uniform(*SEARCHES_FROM_M)
-        waiting = without_jumps(course, scenario, cfg)
-        lost = first_loss(visibility(screens, waiting.places_m(targets, ground), targets), dt_s, DEEP_LOSS_S)
+        seen = visibility(screens, places_of(course, targets, ground), targets)
+        lost = first_loss(seen, dt_s, DEEP_LOSS_S)
         if lost is None:
             continue
         searching = np.arange(len(course)) >= lost + round(WAITS_S / dt_s)
