@@ -127,6 +127,16 @@ def test_the_default_is_the_papers_flight_and_draws_nothing():
     assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 
 
+@pytest.mark.parametrize("style", NAMES)
+@pytest.mark.parametrize(("way_m", "dt_s"), [(0.7, 0.5), (3.0, 0.5), (60.0, 5.0)])
+def test_walks_of_few_points_are_flown_too(style, way_m, dt_s):
+    walk = walk_along("few", [(0, 0), (way_m, 0)], dt_s=dt_s)
+    trace = plan_flight(walk, OPEN, styled(style, segment_s=0.01, styles_fallback="follow"), 0)
+    assert np.isfinite(trace.positions_m).all()
+    assert trace.drop_reason is None
+    assert len(trace.segments) <= max(2, len(walk.time_s) // 4)
+
+
 def test_parts_draw_their_styles_and_cover_the_flight():
     cfg = PlanConfig(styles={"side": 1, "rise": 1, "hold": 0}, segment_s=15)
     trace = plan_flight(STRAIGHT, OPEN, cfg, 1)

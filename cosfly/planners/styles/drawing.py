@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its distance.
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
 
+POINTS_LEAST = 4  # of a part
+
 NO_HIDING_PLACE, NOT_FOUND_AGAIN, NOT_HELD = "no_hiding_place", "not_lost_and_found", "style_not_held"
 
 
@@ -55,7 +57,7 @@ def draw_intent(
         if wish is None:
             return Intent(scenario.wish, (segment,), impossible=NO_HIDING_PLACE)
         return Intent(wish, (segment,))
-    names = _parts(name, num * scenario.dt_s, cfg, rng)
+    names = _parts(name, num, scenario.dt_s, cfg, rng)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     segments = tuple(Segment(*part) for part in zip(names, cuts[:-1], cuts[1:], strict=True))
     is_paper = set(names) == {FOLLOW}
@@ -73,10 +75,11 @@ def _draw(shares: dict[str, float], rng: np.random.Generator) -> str:
     return names[int(rng.choice(len(names), p=weights / weights.sum()))]
 
 
-def _parts(name: str, lasts_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[str]:
+def _parts(name: str, num_points: int, dt_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[str]:
     """Give the styles of a flight's parts, of which the first is `name` if it takes parts at all."""
     shares = {style: share for style, share in cfg.styles.items() if style not in WHOLE and share > 0} or {FOLLOW: 1.0}
-    num = max(1, round(lasts_s / cfg.segment_s)) if cfg.segment_s else 1
+    num = round(num_points * dt_s / cfg.segment_s) if cfg.segment_s else 1
+    num = max(1, min(num, num_points // POINTS_LEAST))
     return [name if k == 0 and name not in WHOLE else _draw(shares, rng) for k in range(num)]
 
 

@@ -83,7 +83,7 @@ def _watching(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
 
 def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> int | None:
     """Give the first frame of a loss of at least `least_s` that follows a time of sight; None where there is none."""
-    before = round(BEFORE_S / dt_s)
+    before = max(1, round(BEFORE_S / dt_s))
     for begin, end in _hidden_runs(seen):
         if begin >= before and (end - begin) * dt_s >= least_s and seen[begin - before : begin].mean() >= SEEN:
             return begin
@@ -95,7 +95,7 @@ def finds_again(seen: np.ndarray, dt_s: float) -> bool:
     if first_loss(seen, dt_s) is None:
         return False
     longest_s = max(end - begin for begin, end in _hidden_runs(seen)) * dt_s
-    return bool(longest_s <= LOST_MOST_S and seen[-round(AFTER_S / dt_s) :].mean() >= SEEN and seen[-1] > 0)
+    return bool(longest_s <= LOST_MOST_S and seen[-max(1, round(AFTER_S / dt_s)) :].mean() >= SEEN and seen[-1] > 0)
 
 
 def _hidden_runs(seen: np.ndarray) -> list[tuple[int, int]]:
