@@ -1,0 +1,522 @@
+"""Everything that cosfly, caption, distill and release read, in one folder of honest specimens, and how each is read: READERS."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import numpy as np
+from specimens_distill import make_captions
+from specimens_planning import walk_along
+
+from caption.run import stage as caption_stage
+from caption.run.asking import read_quarantine
+from caption.run.flights import named_flights
+from caption.schema import CaptionConfig, EvidenceConfig
+from caption.teachers.foreign import read_foreign, read_student
+from caption.truth.facts import Facts
+from caption.truth.gold import GOLD_PROSE, read_gold_prose
+from caption.truth.prose.judging import judge_sentences
+from caption.truth.references import parse_reference
+from caption.writing.slots import Slots
+from cosfly import provenance
+from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
+from cosfly.chat.protocol import (
+    base_url,
+    error_words,
+    read_body,
+    read_completion,
+    read_models,
+    retry_after_s,
+    shown_url,
+)
+from cosfly.chat.refusals import kind_of
+from cosfly.cli.options import resolve
+from cosfly.config import apply_overrides, build
+from cosfly.gallery import contact_sheet, preview_gif
+from cosfly.inspection import stage as inspection
+from cosfly.inspection.flight import InspectConfig
+from cosfly.items import Item
+from cosfly.journal import Journal
+from cosfly.maps import cityjson, simworld
+from cosfly.pedestrians import stage as pedestrians
+from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.planners import compare
+from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
+from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.inspection import read_inspection
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import find_flights, read_flight, read_twin
+from cosfly.products.predictions import read_predictions
+from cosfly.products.roi import read_roi
+from cosfly.products.town import read_town_map, write_town_map
+from cosfly.products.traces import DroneTrace, read_traces, write_traces
+from cosfly.products.walks import read_paths, write_paths
+from cosfly.reading.documents import read_json
+from cosfly.render import older_trees
+from cosfly.settings import RunConfig
+from cosfly.simplify import stage as simplify
+from cosfly.simplify.passes import SimplifyConfig
+from cosfly.stage_events import EventLog, read_events
+from cosfly.stage_folder import StageFolder, read_failures, read_manifest
+from cosfly.store import CHECKSUMS, write_checksums, write_json
+from distill import checkpoint, dataset, evaluate, student
+from distill.infer import make_prediction
+from distill.schema import read_split
+from release import package
+from release.record import read_record
+from release.sources import Source
+from release.validate import verify
+from specimens import make_playback_tree
+
+ANSWER = {
+    "critical_components": "The pedestrian walks 12.4 m ahead, 3 px left of the centre; the drone flies 1.2 m/s at 8 m.",
+    "reasoning_trace": "The pedestrian keeps its heading from t0 to t4, so the drone tracks straight.",
+    "flight_decision": "track_straight",
+}
+PLAIN = {
+    "critical_components": "The person can be made out on the road in front of the drone.",
+    "reasoning_trace": "Nothing stands in the way, and this manoeuvre is as good as any other here.",
+    "flight_decision": "hover",
+}
+REPLY = {
+    "id": "1", "model": "m", "choices": [{"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": json.dumps(ANSWER), "reasoning_content": "so"}}],
+    "usage": {"prompt_tokens": 10, "completion_tokens": 20, "total_tokens": 30}, "error": None, "data": [{"id": "m", "max_model_len": 4096}],
+}  # fmt: skip
+CITY = {
+    "type": "CityJSON", "version": "2.0", "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"},
+    "transform": {"scale": [0.001] * 3, "translate": [1000.0, 0.0, 0.0]},
+    "vertices": [[x, y, z] for z in (2000, 14_000) for x, y in ((0, 0), (9000, 0), (9000, 8000), (0, 8000))]
+    + [[x, y, 2000] for x, y in ((-9000, -9000), (60_000, -9000), (60_000, -3000), (-9000, -3000))],
+    "CityObjects": {
+        "house": {"type": "Building", "attributes": {"fclass": "x"}, "children": ["part"]},
+        "part": {"type": "BuildingPart", "parents": ["house"], "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [
+            [[[3, 2, 1, 0]], [[4, 5, 6, 7]], [[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]]}]},
+        "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[8, 9, 10, 11]]]}]},
+        "tree": {"type": "SolitaryVegetationObject", "geometry": [{"type": "GeometryInstance", "template": 0, "boundaries": [1],
+            "transformationMatrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}]},
+    },
+    "geometry-templates": {"templates": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2]], [[0, 1, 3]]]}],
+        "vertices-templates": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 5.0]]},
+}  # fmt: skip
+FRAME = "frames_playback/frame_00006"
+TREE = "render/Town01/trajectory_1776047127"
+TEXTS = {
+    "answer.json": json.dumps(ANSWER),
+    "answer.txt": f"<think>The {{\"draft\": 1}}</think>\nHere it is:\n```json\n{json.dumps(ANSWER, indent=1)}\n``` // done",
+    "answer_zh.txt": "｛“critical_components”：“行人位于前方12.4米”，“reasoning_trace”：“因此直线跟踪”，“flight_decision”：“track_straight”，｝",
+    "prose.txt": f"{ANSWER['critical_components']} It turned 14.5 degrees to the left over the last three frames, twice as far as before.\n{ANSWER['reasoning_trace']}",
+    "prose_zh.txt": "行人位于前方12.4米，偏左3像素；无人机以1.2米每秒飞行，高度约为八米。\n最近三帧向左转了十四点五度，因此无人机左偏航跟随。",
+    "slots.txt": "The pedestrian is {distance_m@t4} m ahead, {offset_x_px@t0..t4:trend}.\nIt walks on, so the drone tracks straight {speed_mps@t3}.",
+    "set.txt": "pedestrians.num_paths=3", "set_url.txt": "caption.teacher=https://user:word@host:8000/v1?key=1#x", "set_list.txt": "plan={planner: [muco, 1.5e3], a: &a [x], b: *a}",
+    "url.txt": "https://user:word@[::1]:8000/v1/chat/completions?key=1#x",
+    "header.txt": "120",
+    "reply.json": json.dumps(REPLY),
+}  # fmt: skip
+
+
+class Reader(NamedTuple):
+    """files: what is changed, one at a time. call: reads it, with a scratch folder for what it writes. share: of the inputs."""
+
+    files: tuple[str, ...]
+    call: Callable[[Path, Path], object]
+    share: float = 1.0
+
+
+# --- the specimens ----------------------------------------------------------------------------------------------------
+
+
+def make_specimens(root: Path) -> Path:
+    """Write one of each file. Flights of 12 frames, pictures of 64 x 36."""
+    _maps(root)
+    tree = make_playback_tree(root / "render", 3, 12)
+    write_town_map(tree / "Town01", MapHeader(name="Town01"))
+    for folder in find_flights(tree):
+        write_checksums(
+            folder, {name: digest for name, digest in provenance.folder_digests(folder).items() if name != CHECKSUMS}
+        )
+    captions = root / "captions.jsonl"
+    made = make_captions(captions, tree)
+    given = [{"sample_id": c.sample_id, "en": PLAIN, "therefore": None} for c in made[:4]]
+    (root / "foreign.jsonl").write_text("".join(json.dumps(line) + "\n" for line in given))
+    with open(GOLD_PROSE, encoding="utf-8") as gold:
+        (root / "gold.jsonl").write_text("".join(islice(gold, 4)), encoding="utf-8")
+    inspection.run(InspectConfig(), None, None, tree, root / "inspect")
+    flights = read_inspection(root / "inspect/inspect.json")
+    accepted = [flight.model_copy(update={"result": "accepted", "issues": []}) for flight in flights.flights]
+    counts = {"accepted": len(accepted), "review": 0, "rejected": 0, "reasons": {}}
+    funnel = flights.funnel.model_copy(update={"flights": flights.funnel.flights.model_copy(update=counts)})
+    inspection.write_inspection(
+        root / "inspect.json", flights.model_copy(update={"flights": accepted, "funnel": funnel})
+    )
+    package.run(RELEASE, [Source("one", tree, captions, root / "inspect.json")], root / "release")
+    _students(root, captions, tree)
+    _records(root)
+    for name, text in TEXTS.items():
+        (root / name).write_text(text, encoding="utf-8")
+    return root
+
+
+METRICS = dict.fromkeys((*(name for name, *_ in compare.FIGURES), "collision_fraction"), 1.0)
+RELEASE = package.ReleaseConfig(num_frames=6, shard_mb=1, row_group_mb=1, licence="cc-by-4.0")
+
+
+def _maps(root: Path) -> None:
+    write_boxes(root / "boxes_3d.json", _street())
+    walk = walk_along("p0", [(-20, 0), (20, 0), (20, 2)])
+    write_paths(root / "path.json", [walk], {"map": "hand", "seed": 0})
+    n = len(walk.time_s)
+    up = walk.positions_m + np.array([0, 0, 10.0])
+    ones = np.ones(n)
+    traces = [
+        DroneTrace(
+            f"p{k}", "muco", walk.time_s, up, np.zeros((n, 3)), walk.positions_m, ones, ones * 5, METRICS, {"b": 2}
+        )
+        for k in range(2)
+    ]
+    write_traces(root / "drone_trace.json", traces, {"map": "hand", "seed": 0})
+    ring = [[-30, -8], [30, -8], [30, 8], [-30, 8]]
+    write_json(
+        root / "roi.json",
+        {
+            "closed": True,
+            "points_world": ring,
+            "holes": [[[0, 0], [1, 0], [1, 1]]],
+            "polygons": [{"points_world": ring, "holes": []}],
+        },
+    )
+    (root / "city.json").write_text(json.dumps(CITY))
+    (root / "city.json.gz").write_bytes(gzip.compress(json.dumps(CITY).encode(), mtime=0))
+    head = {k: v for k, v in CITY.items() if k != "geometry-templates"} | {"CityObjects": {}, "vertices": []}
+    objects = {k: v for k, v in CITY["CityObjects"].items() if k != "tree"}
+    feature = {"type": "CityJSONFeature", "id": "house", "CityObjects": objects, "vertices": CITY["vertices"]}
+    (root / "city.jsonl").write_text(f"{json.dumps(head)}\n{json.dumps(feature)}\n")
+    nodes = [_node("BP_Building_01_C", 5000, 3000, 30.0), _node("BP_Tree1_C", 100, 200), _node("BP_Can_C", 9, 9)]
+    (root / "world.json").write_text(json.dumps({"base_map": "x", "nodes": nodes}))
+    table = {"BP_Building_01_C": (2000, 1000, 3000), "BP_Tree1_C": (800, 600, 1200), "BP_Can_C": (256, 256, 256)}
+    write_json(
+        root / "Bbox.json",
+        {"all": {name: {"bbox": dict(zip("xyz", size, strict=True))} for name, size in table.items()}},
+    )
+
+
+def _street() -> BoxMap:
+    """A street of 80 m with a house, a wall and a tree."""
+    rows = [
+        ((0, 0, -0.5), (40, 20, 0.5), 0, "Ground"),
+        ((0, 14, 8), (12, 5, 8), 0, "Buildings"),
+        ((20, -9, 1), (4, 0.2, 1), 30, "Walls"),
+        ((-20, -12, 4), (2, 2, 4), 0, "Vegetation"),
+    ]
+    kinds = [KINDS[kind] for *_, kind in rows]
+    return make_box_map(
+        [r[0] for r in rows], [r[1] for r in rows], [(0, r[2], 0) for r in rows], kinds, header=MapHeader(name="street")
+    )
+
+
+def _node(name: str, x: float, y: float, yaw: float = 0.0) -> dict[str, Any]:
+    place = {
+        "location": {"x": x, "y": y, "z": 0},
+        "orientation": {"pitch": 0, "yaw": yaw, "roll": 0},
+        "scale": {"x": 1, "y": 1, "z": 1},
+    }
+    return {"id": f"GEN_{name}", "instance_name": name, "properties": place}
+
+
+def _students(root: Path, captions: Path, tree: Path) -> None:
+    dataset.run(dataset.PrepareConfig(), captions, tree, root / "train")
+    samples = list(read_split(root / "train", "val"))
+    lines = [make_prediction(sample, "val", sample.answer, 20, True).model_dump_json() for sample in samples]
+    (root / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    step = root / "checkpoints/step_000002"
+    step.mkdir(parents=True)
+    write_json(step / "state.json", {"schema": "cosfly.checkpoint", "schema_version": "1.0", "step": 2})
+    write_checksums(step, {"state.json": provenance.fingerprint(step / "state.json")})
+    (root / "log.jsonl").write_text("".join(f'{{"step": {k}, "loss": 0.5}}\n' for k in range(4)))
+    model = root / "model"
+    model.mkdir()
+    write_json(model / "config.json", {"model_type": student.MODEL_TYPE})
+    (model / "model.safetensors").write_bytes(b"weights")
+    write_json(
+        model / checkpoint.ADAPTER_FACTS,
+        {
+            "schema": "cosfly.adapter",
+            "schema_version": "1.0",
+            "base_sha256": checkpoint.base_digests(model),
+            "max_pixels": 4,
+        },
+    )
+
+
+def _records(root: Path) -> None:
+    (root / "run.yaml").write_text(
+        "name: a\nseed: 3\npedestrians: {num_paths: 3}\ncaption:\n  teacher: http://host/v1\n  window: {num_frames: 5}\nrelease: {licence: cc-by-4.0}\n"
+    )
+    write_json(
+        root / "summary.json",
+        {"stages": [{"stage": "maps", "counts": {"input": 1}, "seconds": 1.0}], "peak_memory_mb": 100.0},
+    )
+    (root / "failures.jsonl").write_text('{"id": "a", "code": "input", "message": "no"}\n')
+    (root / "quarantine.jsonl").write_text('{"id": "a", "code": "no_answer", "message": "no"}\n')
+    usage = {"prompt_tokens": 3, "completion_tokens": 4}
+    with Journal(root / "answers" / journal_name("flight")) as journal:
+        for k in range(3):
+            journal.append(
+                {
+                    "key": f"k{k}",
+                    "sample_id": "s",
+                    "purpose": "en",
+                    "model": "m",
+                    "text": "{}",
+                    "usage": usage,
+                    "structured": "native",
+                    "finish_reason": "stop",
+                    "latency_s": 0.1,
+                }
+            )
+    with Journal(root / "answers" / journal_name("closed")) as journal:
+        journal.append({TOTALS: {"answers": 1, **usage}})
+    log = EventLog(root)
+    log._journal.append({"at_s": 1.0, "event": "probe", "worker": 1, "rss_mib": {"1": 2.0}, "disk_free_mib": 1.0})
+    log.close()
+    traces = read_traces(root / "drone_trace.json")
+    (root / "compare").mkdir()
+    names = list(compare.PLANNERS)[:2]
+    timings = {name: {"mean_ms": 1.0, "max_ms": 1.0} for name in names}
+    flown = compare.summarize(dict.fromkeys(names, traces))
+    write_json(root / "compare/compare.json", {"settings": {}} | flown)
+    write_json(
+        root / "compare/manifest.json",
+        {
+            "schema": "cosfly.manifest",
+            "schema_version": "1.0",
+            "stage": "x",
+            "outputs": [],
+            "counts": {},
+            "seconds": 1.0,
+            "timings": timings,
+        },
+    )
+
+
+# --- how each is read -------------------------------------------------------------------------------------------------
+
+
+def _bytes(path: Path) -> bytes:
+    return path.read_bytes() if path.is_file() and path.stat().st_size < 1e9 else b""
+
+
+def _facts() -> Facts:
+    return next(read_gold_prose()).facts
+
+
+def _answer(root: Path, name: str, language: Any = "en") -> None:
+    text = _bytes(root / name).decode("utf-8", "replace")
+    parse_answer(text, language, ("claims",) if len(text) % 2 else (), "length" if len(text) % 3 == 0 else None)
+
+
+def _prose(root: Path, name: str, language: Any = "en") -> None:
+    text = _bytes(root / name).decode("utf-8", "replace")[:20_000]
+    components, _, trace = text.partition("\n")
+    coc = Coc.model_construct(critical_components=components, reasoning_trace=trace, flight_decision="track_straight")
+    judge_sentences(coc, _facts(), EvidenceConfig(), language)
+
+
+def _slots(root: Path) -> None:
+    text = _bytes(root / "slots.txt").decode("utf-8", "replace")
+    components, _, trace = text.partition("\n")
+    coc = Coc.model_construct(critical_components=components, reasoning_trace=trace, flight_decision="track_straight")
+    Slots().read(Parsed(coc, therefore="track_straight"), _facts())
+    for word in components.split():
+        parse_reference(word.strip("{}"))
+
+
+def _reply(root: Path) -> None:
+    data = _bytes(root / "reply.json")
+    response = httpx.Response(200, content=data)
+    for structured in ("native", "plain"):
+        read_completion(response, structured)
+    read_models(response)
+    kind_of(400, data.decode("utf-8", "replace"))
+    try:
+        error_words(read_body(data))
+    except ValueError:
+        return  # what it says of a body that is no JSON
+
+
+def _header(root: Path) -> None:
+    retry_after_s(httpx.Response(429, headers={"retry-after": _bytes(root / "header.txt")[:5000]}))
+
+
+def _setting(root: Path, name: str) -> None:
+    build(RunConfig, apply_overrides({}, [_bytes(root / name).decode("utf-8", "replace")]), "--set")
+
+
+def _url(root: Path) -> None:
+    text = _bytes(root / "url.txt").decode("utf-8", "replace")
+    base_url(text)
+    cfg = build(RunConfig, {"caption": {"teacher": text}}, "--teacher").caption
+    shown_url(cfg.teacher)
+
+
+def _stage(run: Callable[..., object], folder: Path) -> None:
+    """Do a stage; a bug in an item, which it records, counts as a traceback."""
+    run()
+    path = folder / "failures.jsonl"
+    bugs = [failure.message for failure in read_failures(path) if failure.code == "bug"] if path.exists() else []
+    if bugs:
+        raise AssertionError(f"recorded as a bug: {bugs[0]}")
+
+
+def _inspected(root: Path, scratch: Path) -> None:
+    work = inspection.make_worker(InspectConfig(), root / "boxes_3d.json", root / "drone_trace.json", root / "render")
+    work(Item("a", f"{TREE.removeprefix('render/')}/ORI"))
+
+
+def _captioned(root: Path, scratch: Path, **settings: Any) -> None:
+    cfg = build(CaptionConfig, {"limit": 4, **settings}, "x")
+    _stage(lambda: caption_stage.run(cfg, root / "render", scratch / "out"), scratch / "out")
+
+
+def _resumed(root: Path, scratch: Path) -> None:
+    inputs = {"data": root / "render"}
+    record = provenance.read_stage_record(root / "inspect")
+    stage = StageFolder(root / "inspect", record.stage, True)
+    list(stage.items())
+    provenance.checked_inputs(inputs | {"inspect": root / "inspect/inspect.json"})
+    provenance.was_made_of(root / "inspect/inspect.json", "data")
+
+
+def _checkpoint(root: Path, scratch: Path) -> None:
+    newest = checkpoint.newest_checkpoint(root / "checkpoints")
+    if newest is not None:
+        int(read_json(newest / "state.json")["step"])
+
+
+def _log(root: Path, scratch: Path) -> None:
+    copy = scratch / "log.jsonl"
+    copy.write_bytes(_bytes(root / "log.jsonl"))
+    checkpoint.cut_log(copy, 2)
+
+
+def _tree(root: Path, scratch: Path) -> None:
+    named_flights(root / "render")
+    contact_sheet(root / "render", scratch / "sheet.png")
+    preview_gif(root / "render", scratch / "preview.gif")
+
+
+def _tables(root: Path, scratch: Path) -> None:
+    compare.text_tables(root / "compare/compare.json")
+
+
+def _simplified(root: Path, scratch: Path) -> None:
+    simplify.run(SimplifyConfig(), root / "boxes_3d.json", scratch / "simplify")
+
+
+def _walked(root: Path, scratch: Path) -> None:
+    cfg = PedestriansConfig(num_paths=1, min_component_cells=20)
+    _stage(
+        lambda: pedestrians.run(cfg, root / "boxes_3d.json", scratch / "walks", roi=root / "roi.json"),
+        scratch / "walks",
+    )
+
+
+def _evaluated(root: Path, scratch: Path) -> None:
+    evaluate.run(evaluate.EvaluateConfig(), root / "predictions.jsonl", root / "train", scratch / "scores")
+
+
+def _released(root: Path, scratch: Path) -> None:
+    source = Source("one", root / "render", root / "captions.jsonl", root / "inspect.json")
+    _stage(lambda: package.run(RELEASE, [source], scratch / "release"), scratch / "release")
+
+
+def _one(name: str, read: Callable[[Path], object]) -> Reader:
+    return Reader((name,), lambda root, scratch: read(root / name))
+
+
+FLIGHT = (f"{TREE}/ORI/trajectory.json",)
+PICTURES = tuple(f"{TREE}/ORI/{FRAME}/{name}" for name in ("rgb.png", "depth.npy", "instance.png"))
+READERS: dict[str, Reader] = {
+    "boxes": _one("boxes_3d.json", read_boxes),
+    "region of interest": _one("roi.json", read_roi),
+    "walks": _one("path.json", read_paths),
+    "traces": _one("drone_trace.json", read_traces),
+    "city model": _one("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
+    "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
+    "city model, packed": _one("city.json.gz", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
+    "SimWorld": Reader(("world.json", "Bbox.json"), lambda root, _: simworld.load(simworld.SimWorldConfig(world=root / "world.json"))),
+    "simplify": Reader(("boxes_3d.json",), _simplified, share=0.2),
+    "pedestrians": Reader(("boxes_3d.json", "roi.json"), _walked, share=0.1),
+    "flight": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI")),
+    "flight, tolerant": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI", strict=False)),
+    "flight and its twin": Reader(FLIGHT, lambda root, _: read_twin(read_flight(root / TREE / "aug_001", strict=False))),
+    "annotation": _one(f"{TREE}/ORI/{FRAME}/meta.json", lambda path: read_meta(path.parent)),
+    "rgb": _one(PICTURES[0], lambda path: read_rgb(path.parent)),
+    "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
+    "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
+    "town": _one("render/Town01/map.json", lambda path: read_town_map(path.parent)),
+    "flight's checksums": _one(f"{TREE}/ORI/{CHECKSUMS}", lambda path: provenance.folder_digests(path.parent)),
+    "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),
+    "inspect": Reader((*FLIGHT, *PICTURES, f"{TREE}/ORI/{FRAME}/meta.json", f"{TREE}/ORI/{CHECKSUMS}", "drone_trace.json", "boxes_3d.json"), _inspected, share=0.2),
+    "convert-tree": Reader(FLIGHT, lambda root, scratch: older_trees.convert_flight(root / TREE / "ORI", scratch / "ORI"), share=0.5),
+    "caption": Reader(FLIGHT, _captioned, share=0.1),
+    "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2),
+    "captions": _one("captions.jsonl", lambda path: list(read_captions(path))),
+    "foreign captions": _one("foreign.jsonl", read_foreign),
+    "gold captions": _one("gold.jsonl", lambda path: [(gold.coc, gold.facts) for gold in read_gold_prose(path)]),
+    "predictions": _one("predictions.jsonl", read_predictions),
+    "student's captions": _one("predictions.jsonl", read_student),
+    "quarantine": _one("quarantine.jsonl", lambda path: read_quarantine(path.parent)),
+    "answers kept": Reader(
+        (f"answers/{journal_name('flight')}", f"answers/{journal_name('closed')}"),
+        lambda root, _: AnswerBook(root / "answers").latency_s("flight", "s"),
+    ),
+    "samples": _one("train/train.jsonl", lambda path: list(read_split(path.parent, "train"))),
+    "prepare": Reader(("captions.jsonl",), lambda root, scratch: dataset.run(dataset.PrepareConfig(), root / "captions.jsonl", root / "render", scratch / "train"), share=0.3),
+    "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated),
+    "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
+    "training log": Reader(("log.jsonl",), _log),
+    "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
+    "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
+    "inspection": _one("inspect.json", read_inspection),
+    "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1),
+    "release record": _one("release/dataset/release.json", read_record),
+    "release, verify": Reader(
+        tuple(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md", "data/train-00000-of-00001.parquet")),
+        lambda root, _: verify(root / "release/dataset"), share=0.4),
+    "shard": Reader(("release/dataset/data/train-00000-of-00001.parquet",), lambda root, _: _shard(root)),
+    "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
+    "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4),
+    "verify": Reader(("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"), lambda root, _: provenance.verify([root / "inspect", root / "render"]), share=0.3),
+    "failures": _one("failures.jsonl", read_failures),
+    "events": _one("events.jsonl", lambda path: read_events(path.parent)),
+    "summary": _one("summary.json", read_json),
+    "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
+    "settings": _one("run.yaml", lambda path: resolve(path, None)),
+    "--set": Reader(("set.txt",), lambda root, _: _setting(root, "set.txt")),
+    "--set, a URL": Reader(("set_url.txt",), lambda root, _: _setting(root, "set_url.txt")),
+    "--set, a list": Reader(("set_list.txt",), lambda root, _: _setting(root, "set_list.txt")),
+    "URL": Reader(("url.txt",), lambda root, _: _url(root)),
+    "reply of a server": Reader(("reply.json",), lambda root, _: _reply(root)),
+    "header of a server": Reader(("header.txt",), lambda root, _: _header(root)),
+    "answer": Reader(("answer.json",), lambda root, _: _answer(root, "answer.json")),
+    "answer with thoughts": Reader(("answer.txt",), lambda root, _: _answer(root, "answer.txt")),
+    "answer in Chinese": Reader(("answer_zh.txt",), lambda root, _: _answer(root, "answer_zh.txt", "zh")),
+    "prose": Reader(("prose.txt",), lambda root, _: _prose(root, "prose.txt")),
+    "prose in Chinese": Reader(("prose_zh.txt",), lambda root, _: _prose(root, "prose_zh.txt", "zh")),
+    "slots": Reader(("slots.txt",), lambda root, _: _slots(root)),
+}  # fmt: skip
+
+
+def _shard(root: Path) -> None:
+    from cosfly.reading.tables import num_rows, rows_of
+
+    path = root / "release/dataset/data/train-00000-of-00001.parquet"
+    num_rows(path)
+    list(rows_of(path))
