@@ -15,6 +15,7 @@ from cosfly.cli import app
 from cosfly.errors import ConfigError, NoPathError, NothingKept, ResumeError
 from cosfly.planners import compare, compare_plots
 from cosfly.planners.compare import CompareConfig
+from cosfly.planners.compare_tables import text_tables
 from cosfly.planners.contract import PLANNERS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
@@ -199,7 +200,7 @@ def test_the_command_prints_the_tables(inputs, made):
 
 
 def test_rows_for_the_terminal(made):
-    figures, axes, *against, _, wins = compare.text_tables(made / "compare.json")
+    figures, axes, *against, _, wins = text_tables(made / "compare.json")
     assert len(figures.rows) == len(compare.FIGURES) + 1
     assert figures.columns[:4] == ["figure", "foresight", "TA* + Smooth", "MuCO"]
     assert figures.columns[4:] == ["less TA* + Smooth", "%", "less MuCO", "%"]
@@ -234,7 +235,7 @@ def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
     assert {row["delta"] for row in record["deltas"]["again"].values()} == {0.0}
     assert record["deltas"]["track_astar"]["length_m"]["delta"] != 0
     assert len(read_traces(out / "drone_trace_again.json")) == 2
-    tables = compare.text_tables(out / "compare.json")
+    tables = text_tables(out / "compare.json")
     assert tables[0].columns == ["figure", "MuCO", "again", "TA* + Smooth", "less again", "%", "less TA* + Smooth", "%"]
     assert {len(row) for row in tables[0].rows} == {8}
     assert [table.title for table in tables[4:]] == [

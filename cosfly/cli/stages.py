@@ -131,6 +131,7 @@ def plan_compare(
     from cosfly.config import build
     from cosfly.console import console
     from cosfly.planners import compare
+    from cosfly.planners.compare_tables import text_tables
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     options.set_aside(out, repair)
@@ -138,7 +139,7 @@ def plan_compare(
     compared = build(compare.CompareConfig, settings, "--planner")
     options.verify_first(verify, map_, paths, out)
     product = compare.run(compared, map_, paths, out, seed=cfg.seed, **options.manner(cfg, resume))
-    for text in compare.text_tables(product):
+    for text in text_tables(product):
         table = Table(title=text.title, title_justify="left")
         for k, column in enumerate(text.columns):
             table.add_column(column, justify="right" if k else "left")

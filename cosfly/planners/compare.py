@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,13 @@ from pydantic import BaseModel, Field, field_validator
 
 from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
-from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner, title_of
+from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner
 from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.reading.documents import read_json
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest, result_of
+from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, result_of
 from cosfly.store import write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "2.1"
@@ -308,58 +306,3 @@ def _timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str,
         times_ms = np.array([result_of(record, _Compared).times_ms.get(name, 0.0) for record in shared])
         table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
     return table
-
-
-# --- for the terminal -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table for the terminal; the first column is words, the others are numbers."""
-
-    title: str
-    columns: list[str]
-    rows: list[list[str]]
-
-
-def text_tables(product: Path) -> list[TextTable]:
-    """Read `compare.json` and its manifest back as tables of text: figures, axes, and wins against each other planner."""
-    record = read_json(product, what="comparison")
-    first, *others = planners = list(record["means"])
-    titles = [title_of(planner) for planner in planners]
-    axes = [
-        [name.replace("_", " "), *(f"{record['axes'][planner][name]:.3f}" for planner in planners)]
-        for name in (*AXES, "mean")
-    ]
-    differences = ["difference"] if len(others) == 1 else [f"less {title_of(other)}" for other in others]
-    columns = ["figure", *titles, *(column for title in differences for column in (title, "%"))]
-    figures = _figure_rows(record, read_manifest(product.parent).facts["timings"])
-    tables = [
-        TextTable("Means over the walks that all fly", columns, figures),
-        TextTable("Axis scores, higher is better", ["axis", *titles], axes),
-    ]
-    for other, differences in record["axis_differences"].items():
-        rows = [
-            [name.replace("_", " "), *(f"{value:+.3f}" for value in row.values())] for name, row in differences.items()
-        ]
-        title = f"Axis scores, {title_of(first)} less {title_of(other)}, and 95 % of what other walks would give"
-        tables.append(TextTable(title, ["axis", "difference", "from", "to"], rows))
-    for other, rates in record["win_rates"].items():
-        rows = [
-            [name.replace("_", " "), f"{row['count']} of {row['of']}", f"{row['rate']:.3f}"]
-            for name, row in rates.items()
-        ]
-        title = f"{title_of(first)} against {title_of(other)}, walk by walk"
-        tables.append(TextTable(title, ["criterion", "count", "rate"], rows))
-    return tables
-
-
-def _figure_rows(record: dict, timings: dict) -> list[list[str]]:
-    means, rows = record["means"], []
-    for name, title, digits in FIGURES:
-        rows.append([title, *(f"{figures[name]:.{digits}f}" for figures in means.values())])
-        for change in record["deltas"].values():
-            relative = change[name]["relative_percent"]
-            rows[-1] += [f"{change[name]['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
-    times = [f"{timings[planner]['mean_ms']:.1f}" for planner in means]
-    return [*rows, ["planning time (ms)", *times, *[""] * 2 * len(record["deltas"])]]
