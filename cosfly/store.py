@@ -133,13 +133,20 @@ def remove_partials(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
+
+
 def inside(root: Path, name: str) -> Path:
     """Join a name from a file to a root.
 
     Raises:
-        InputError: the name leads out of the root, or a link that stands there does.
+        InputError: the name leads out of the root, or a link that stands there does; or no file can have it.
     """
     plain = os.path.normpath(name)
+    if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
+        raise InputError(
+            "not a name of a file", where=root, got=name, expected=f"parts of at most {LONGEST_NAME} bytes"
+        )
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
     check_stays_below(root / plain, root)

@@ -55,6 +55,10 @@ def test_names_stay_inside(tmp_path):
     for name in ("../x", "/etc/passwd", "a/../../x"):
         with pytest.raises(InputError, match="leads out"):
             inside(tmp_path, name)
+    assert inside(tmp_path, "a" * 255)
+    for name in ("a" * 256, "b/" + "行" * 86 + "/c", "a\0b"):
+        with pytest.raises(InputError, match="not a name of a file"):
+            inside(tmp_path, name)
 
 
 @given(st.lists(st.dictionaries(st.text(max_size=5), st.text(max_size=20), max_size=3), max_size=6), st.data())
