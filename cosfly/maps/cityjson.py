@@ -158,9 +158,9 @@ def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], n
     """Move the middle of the map to the origin and the usual height of roads to z = 0; gives the offset too."""
     corners = np.concatenate([item.corners() for item in objects])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    if max(high[:2] - low[:2]) > 20_000:
+    if not (high - low <= 20_000).all():
         raise InputError(
-            "the map is too wide", where=f"{path}: vertices", got=f"{high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m",
+            "the map is too wide or too high", where=f"{path}: vertices", got=" x ".join(f"{size:.6g}" for size in high - low) + " m",
             expected="at most 20 km", fix="cut a part out, or mend the stray vertex",
         )  # fmt: skip
     roads = [item.corners() for item in objects if item.rule.kind in ("Roads", "Sidewalks")]
