@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -58,7 +57,7 @@ class GoldCaption(BaseModel):
 
     id: str
     language: Language = Field(alias="lang")
-    series: dict[str, Any] = Field(alias="facts")
+    facts: Facts
     label: str | None
     critical_components: str
     reasoning_trace: str
@@ -69,11 +68,6 @@ class GoldCaption(BaseModel):
     @property
     def coc(self) -> Coc:
         return Coc(**{name: getattr(self, name) for name in Coc.model_fields})
-
-    @property
-    def facts(self) -> Facts:
-        series: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in self.series.items()}
-        return Facts(**series)
 
 
 def read_gold_prose(path: Path = GOLD_PROSE) -> Iterator[GoldCaption]:
