@@ -71,12 +71,20 @@ def cut_log(path: Path, num_steps: int) -> None:
     kept = []
     if path.exists():
         for line in read_lines(path, what="log"):
-            try:
-                if parse_json(line)["step"] <= num_steps and line.endswith(b"\n"):
-                    kept.append(line)
-            except ValueError:
-                continue  # cut short by a kill
+            step = _step_of(line)
+            if step is not None and step <= num_steps:
+                kept.append(line)
     write_bytes(path, b"".join(kept))
+
+
+def _step_of(line: bytes) -> int | None:
+    """Read the step of a line of the log; None where a kill cut it short, or it is no line of a log."""
+    try:
+        record = parse_json(line) if line.endswith(b"\n") else None
+    except ValueError:
+        return None
+    step = record.get("step") if isinstance(record, dict) else None
+    return step if isinstance(step, int) else None
 
 
 # --- adapters -----------------------------------------------------------------------------------------------------------
