@@ -9,15 +9,20 @@ TOOLS := $(VENV)-tools
 PINNED := docs/container/requirements.txt
 RUN ?= runs/quickstart
 SLOW ?=
+FUZZ_INPUTS ?= 100000
+FUZZ_SEED ?= 1
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
-.PHONY: quickstart test lint format audit sbom lock clean
+.PHONY: quickstart test fuzz lint format audit sbom lock clean
 
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
 
 test: lint  ## What must hold, without the tests that take long; with SLOW=1 everything
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(if $(SLOW),,-m "not slow")
+
+fuzz: $(VENV)/.installed-dev  ## Hostile inputs to every reader, about an hour; fewer with FUZZ_INPUTS=5000, others with FUZZ_SEED=2
+	$(BIN)/python tests/fuzz.py --inputs $(FUZZ_INPUTS) --seed $(FUZZ_SEED)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

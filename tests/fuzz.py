@@ -20,22 +20,40 @@ import sys
 import tempfile
 import time
 import traceback
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-from fuzzing import Instead, clear, mutated, put
+from fuzzing import HUGE, Instead, clear, mutated, put
 
 from cosfly.errors import CosflyError
 
 CPU_S = 5.0
 MEMORY_MB = 1_000
-SILENT_S = 120.0  # of the clock, without an input finished: blocked, for its CPU time would have ended it
+SILENT_S = 30.0  # of the clock, asleep without any CPU time: blocked. A child that waits for its turn is not asleep
 LONGEST_LINE = 5_000  # characters of a message
+BREAKING = ("Cc", "Zl", "Zp", "Cs")  # Unicode's controls, line breaks, half pairs
+TURNING = (
+    "\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # what changes the direction of writing
+)
 MOST_TRIALS = 150  # to make an input smaller
 SHOWN_BYTES = 300
 SHOW_EVERY_S = 10.0
+
+
+class Reader(NamedTuple):
+    """files: what is changed, one at a time. call: reads it, with a scratch folder for what it writes. share: of the inputs.
+
+    hashes: it reads every byte of a file, however large, for its digest: its files are not made huge.
+    """
+
+    files: tuple[str, ...]
+    call: Callable[[Path, Path], object]
+    share: float = 1.0
+    hashes: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,7 +101,9 @@ def outcome_of(call: Callable[[], object]) -> str | None:
         call()
     except CosflyError as error:
         line = str(error)
-        if len(line) > LONGEST_LINE or not line.isprintable():
+        if len(line) > LONGEST_LINE or any(
+            unicodedata.category(letter) in BREAKING or letter in TURNING for letter in line
+        ):
             return f"{type(error).__name__} that is no line: {line[:80]!r}, {len(line)} characters"
         return None
     except MemoryError:
@@ -99,12 +119,14 @@ def outcome_of(call: Callable[[], object]) -> str | None:
 class Input:
     """One changed file of a reader's specimens, in place while the context is open."""
 
-    def __init__(self, root: Path, reader: str, files: Sequence[str], seed: int, number: int) -> None:
-        rng = random.Random(f"{reader}/{seed}/{number}")
-        self.file = rng.choice(files)
+    def __init__(self, root: Path, name: str, reader: Reader, seed: int, number: int) -> None:
+        rng = random.Random(f"{name}/{seed}/{number}")
+        self.file = rng.choice(reader.files)
         self.path = root / self.file
         self.honest = self.path.read_bytes()
         self.content: bytes | Instead = mutated(self.file, self.honest, rng)
+        if reader.hashes and self.content == HUGE:
+            self.content = "nothing"
 
     @contextlib.contextmanager
     def in_place(self, content: bytes | Instead | None = None) -> Iterator[None]:
@@ -128,7 +150,7 @@ def _reset_peak() -> float:
 
 
 def read_all(
-    root: Path, readers: Mapping, state: Path, todo: Mapping[str, Sequence[int]], seed: int, cpu_s: float
+    root: Path, readers: Mapping[str, Reader], state: Path, todo: Mapping[str, Sequence[int]], seed: int, cpu_s: float
 ) -> None:
     """Read the inputs of these numbers; a line of `state` before each, a line for each finding."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -145,7 +167,7 @@ def read_all(
         out.write('"end"\n')
 
 
-def _warm_up(root: Path, reader) -> None:
+def _warm_up(root: Path, reader: Reader) -> None:
     """Read the honest specimens: what is compiled or imported once is no input's time and memory."""
     scratch = root.with_name("scratch")
     shutil.rmtree(scratch, ignore_errors=True)
@@ -154,7 +176,7 @@ def _warm_up(root: Path, reader) -> None:
 
 
 def _read_one(
-    root: Path, readers: Mapping, reader: str, which: tuple[int, int], cpu_s: float, known: set[str], out
+    root: Path, readers: Mapping[str, Reader], reader: str, which: tuple[int, int], cpu_s: float, known: set[str], out
 ) -> None:
     scratch = root.with_name("scratch")
 
@@ -168,7 +190,7 @@ def _read_one(
         signal.setitimer(signal.ITIMER_PROF, 0)
         return "memory" if _peak_mb() - before_mb > MEMORY_MB else place
 
-    item = Input(root, reader, readers[reader].files, *which)
+    item = Input(root, reader, readers[reader], *which)
     out.write(json.dumps({"file": item.file}) + "\n")
     place = ends()
     if place is None:
@@ -260,16 +282,24 @@ def _child(
 
 def _followed(process: subprocess.Popen, state: Path, silent_s: float, tick: Callable[[object], None]) -> bool:
     """Wait for the end of a child; False where it does nothing more."""
-    since_s = time.monotonic()
+    since_s, before = time.monotonic(), 0
     with open(state, encoding="utf-8") as lines:
         while process.poll() is None:
             for line in lines:
-                since_s = time.monotonic()
                 tick(json.loads(line))
+            is_asleep, ticks = _activity(process.pid)
+            if not is_asleep or ticks != before:
+                since_s, before = time.monotonic(), ticks
             if time.monotonic() - since_s > silent_s:
                 return False
             time.sleep(0.02)
     return True
+
+
+def _activity(pid: int) -> tuple[bool, int]:
+    """Tell whether a child sleeps, and how many ticks of CPU time it has taken."""
+    fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+    return fields[0] == b"S", int(fields[11]) + int(fields[12])
 
 
 def _take(lines: list, reason: str, summary: Summary, todo: dict[str, list[int]]) -> None:
@@ -306,9 +336,11 @@ class _Progress:
 
     def __init__(self, numbers: Mapping[str, Sequence[int]]) -> None:
         self.num_all, self.num, self.at_s = sum(map(len, numbers.values())), 0, 0.0
+        self.told: set[tuple[str, str]] = set()
 
     def __call__(self, line: object) -> None:
-        if isinstance(line, dict) and "place" in line:
+        if isinstance(line, dict) and "place" in line and (line["reader"], line["place"]) not in self.told:
+            self.told.add((line["reader"], line["place"]))
             print(f"  {Finding(**line)}", flush=True)
         elif isinstance(line, list):
             self.num += 1

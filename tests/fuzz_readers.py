@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import httpx
 import numpy as np
+from fuzz import Reader
 from specimens_distill import make_captions
 from specimens_planning import walk_along
 
@@ -26,16 +27,16 @@ from caption.truth.references import parse_reference
 from caption.writing.slots import Slots
 from cosfly import provenance
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
+from cosfly.chat.contract import Request
 from cosfly.chat.protocol import (
     base_url,
     error_words,
     read_body,
     read_completion,
     read_models,
-    retry_after_s,
-    shown_url,
 )
 from cosfly.chat.refusals import kind_of
+from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
 from cosfly.config import apply_overrides, build
 from cosfly.gallery import contact_sheet, preview_gif
@@ -47,6 +48,7 @@ from cosfly.maps import cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
+from cosfly.planners.compare_tables import text_tables
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
@@ -114,19 +116,11 @@ TEXTS = {
     "prose.txt": f"{ANSWER['critical_components']} It turned 14.5 degrees to the left over the last three frames, twice as far as before.\n{ANSWER['reasoning_trace']}",
     "prose_zh.txt": "行人位于前方12.4米，偏左3像素；无人机以1.2米每秒飞行，高度约为八米。\n最近三帧向左转了十四点五度，因此无人机左偏航跟随。",
     "slots.txt": "The pedestrian is {distance_m@t4} m ahead, {offset_x_px@t0..t4:trend}.\nIt walks on, so the drone tracks straight {speed_mps@t3}.",
-    "set.txt": "pedestrians.num_paths=3", "set_url.txt": "caption.teacher=https://user:word@host:8000/v1?key=1#x", "set_list.txt": "plan={planner: [muco, 1.5e3], a: &a [x], b: *a}",
-    "url.txt": "https://user:word@[::1]:8000/v1/chat/completions?key=1#x",
+    "set.txt": "pedestrians.num_paths=3", "set_url.txt": "caption.teacher=https://host:8000/v1", "set_list.txt": "caption.endpoint={extra_body: {a: &a [x, 1.5e3], b: *a}}",
+    "url.txt": "https://[::1]:8000/v1/chat/completions",
     "header.txt": "120",
     "reply.json": json.dumps(REPLY),
 }  # fmt: skip
-
-
-class Reader(NamedTuple):
-    """files: what is changed, one at a time. call: reads it, with a scratch folder for what it writes. share: of the inputs."""
-
-    files: tuple[str, ...]
-    call: Callable[[Path, Path], object]
-    share: float = 1.0
 
 
 # --- the specimens ----------------------------------------------------------------------------------------------------
@@ -289,7 +283,7 @@ def _records(root: Path) -> None:
     (root / "compare").mkdir()
     names = list(compare.PLANNERS)[:2]
     timings = {name: {"mean_ms": 1.0, "max_ms": 1.0} for name in names}
-    flown = compare.summarize(dict.fromkeys(names, traces))
+    flown = compare.summarize(dict.fromkeys(names, traces), np.random.default_rng(0))
     write_json(root / "compare/compare.json", {"settings": {}} | flown)
     write_json(
         root / "compare/manifest.json",
@@ -339,19 +333,18 @@ def _slots(root: Path) -> None:
 
 def _reply(root: Path) -> None:
     data = _bytes(root / "reply.json")
-    response = httpx.Response(200, content=data)
+    response = Response(200, data)
+    request = Request([{"role": "user", "content": "x"}], [], {}, {})
     for structured in ("native", "plain"):
-        read_completion(response, structured)
+        read_completion(response, request, structured)
     read_models(response)
     kind_of(400, data.decode("utf-8", "replace"))
-    try:
+    with contextlib.suppress(ValueError):  # what it says of a body that is no JSON
         error_words(read_body(data))
-    except ValueError:
-        return  # what it says of a body that is no JSON
 
 
 def _header(root: Path) -> None:
-    retry_after_s(httpx.Response(429, headers={"retry-after": _bytes(root / "header.txt")[:5000]}))
+    retry_after_s(_bytes(root / "header.txt").decode("latin-1"), 0.0)
 
 
 def _setting(root: Path, name: str) -> None:
@@ -361,8 +354,7 @@ def _setting(root: Path, name: str) -> None:
 def _url(root: Path) -> None:
     text = _bytes(root / "url.txt").decode("utf-8", "replace")
     base_url(text)
-    cfg = build(RunConfig, {"caption": {"teacher": text}}, "--teacher").caption
-    shown_url(cfg.teacher)
+    build(RunConfig, {"caption": {"teacher": text, "judge": {"url": text}}}, "--teacher")
 
 
 def _stage(run: Callable[..., object], folder: Path) -> None:
@@ -412,7 +404,7 @@ def _tree(root: Path, scratch: Path) -> None:
 
 
 def _tables(root: Path, scratch: Path) -> None:
-    compare.text_tables(root / "compare/compare.json")
+    text_tables(root / "compare/compare.json")
 
 
 def _simplified(root: Path, scratch: Path) -> None:
@@ -451,8 +443,8 @@ READERS: dict[str, Reader] = {
     "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, packed": _one("city.json.gz", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "SimWorld": Reader(("world.json", "Bbox.json"), lambda root, _: simworld.load(simworld.SimWorldConfig(world=root / "world.json"))),
-    "simplify": Reader(("boxes_3d.json",), _simplified, share=0.2),
-    "pedestrians": Reader(("boxes_3d.json", "roi.json"), _walked, share=0.1),
+    "simplify": Reader(("boxes_3d.json",), _simplified, share=0.2, hashes=True),
+    "pedestrians": Reader(("boxes_3d.json", "roi.json"), _walked, share=0.1, hashes=True),
     "flight": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI")),
     "flight, tolerant": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI", strict=False)),
     "flight and its twin": Reader(FLIGHT, lambda root, _: read_twin(read_flight(root / TREE / "aug_001", strict=False))),
@@ -461,12 +453,12 @@ READERS: dict[str, Reader] = {
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
     "town": _one("render/Town01/map.json", lambda path: read_town_map(path.parent)),
-    "flight's checksums": _one(f"{TREE}/ORI/{CHECKSUMS}", lambda path: provenance.folder_digests(path.parent)),
+    "flight's checksums": Reader((f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True),
     "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),
-    "inspect": Reader((*FLIGHT, *PICTURES, f"{TREE}/ORI/{FRAME}/meta.json", f"{TREE}/ORI/{CHECKSUMS}", "drone_trace.json", "boxes_3d.json"), _inspected, share=0.2),
+    "inspect": Reader((*FLIGHT, *PICTURES, f"{TREE}/ORI/{FRAME}/meta.json", f"{TREE}/ORI/{CHECKSUMS}", "drone_trace.json", "boxes_3d.json"), _inspected, share=0.2, hashes=True),
     "convert-tree": Reader(FLIGHT, lambda root, scratch: older_trees.convert_flight(root / TREE / "ORI", scratch / "ORI"), share=0.5),
-    "caption": Reader(FLIGHT, _captioned, share=0.1),
-    "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2),
+    "caption": Reader(FLIGHT, _captioned, share=0.1, hashes=True),
+    "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2, hashes=True),
     "captions": _one("captions.jsonl", lambda path: list(read_captions(path))),
     "foreign captions": _one("foreign.jsonl", read_foreign),
     "gold captions": _one("gold.jsonl", lambda path: [(gold.coc, gold.facts) for gold in read_gold_prose(path)]),
@@ -478,22 +470,22 @@ READERS: dict[str, Reader] = {
         lambda root, _: AnswerBook(root / "answers").latency_s("flight", "s"),
     ),
     "samples": _one("train/train.jsonl", lambda path: list(read_split(path.parent, "train"))),
-    "prepare": Reader(("captions.jsonl",), lambda root, scratch: dataset.run(dataset.PrepareConfig(), root / "captions.jsonl", root / "render", scratch / "train"), share=0.3),
-    "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated),
+    "prepare": Reader(("captions.jsonl",), lambda root, scratch: dataset.run(dataset.PrepareConfig(), root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
+    "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),
     "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),
-    "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1),
+    "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
     "release record": _one("release/dataset/release.json", read_record),
     "release, verify": Reader(
         tuple(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md", "data/train-00000-of-00001.parquet")),
-        lambda root, _: verify(root / "release/dataset"), share=0.4),
+        lambda root, _: verify(root / "release/dataset"), share=0.4, hashes=True),
     "shard": Reader(("release/dataset/data/train-00000-of-00001.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
-    "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4),
-    "verify": Reader(("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"), lambda root, _: provenance.verify([root / "inspect", root / "render"]), share=0.3),
+    "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),
+    "verify": Reader(("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"), lambda root, _: provenance.verify([root / "inspect", root / "render"]), share=0.3, hashes=True),
     "failures": _one("failures.jsonl", read_failures),
     "events": _one("events.jsonl", lambda path: read_events(path.parent)),
     "summary": _one("summary.json", read_json),

@@ -28,6 +28,7 @@ Instead = Literal[
 INSTEAD: tuple[Instead, ...] = (
     "pipe", "folder", "device", "link out", "link to itself", "link to nothing", "nothing", "20 GB of nothing",
 )  # fmt: skip
+HUGE: Instead = "20 GB of nothing"
 Random = random.Random
 
 TOKENS = [
@@ -87,7 +88,7 @@ def put(path: Path, content: bytes | Instead) -> None:
         import os
 
         os.mkfifo(path)
-    elif content == "20 GB of nothing":
+    elif content == HUGE:
         with open(path, "wb") as file:
             file.truncate(20_000_000_000)
     elif content != "nothing":
@@ -199,9 +200,7 @@ def _change(group: Any, key: Any, rng: Random, places: list, plain: Callable[[An
     elif way == 3 and isinstance(old, list):
         group[key] = old * rng.choice((0, 2, 300)) if len(old) < 1000 else old[: rng.randrange(len(old))]
     elif way == 4 and isinstance(old, int | float):
-        group[key] = rng.choice(
-            (-old, old + 1, old - 1, old * 1e6, old * 1e-6, old * 1e300, str(old), [old], float(old), int(old))
-        )
+        group[key] = rng.choice((-old, old + 1, old - 1, old * 1e6, old * 1e-6, old * 1e300, str(old), [old], not old))
     elif way == 5 and isinstance(old, str):
         group[key] = (
             mutated_text(old, rng)
