@@ -79,7 +79,7 @@ class Other:
     @classmethod
     def from_json(cls, record: dict, where: str) -> Other:
         kind = record.get("kind")
-        if kind not in BUILDS:
+        if not isinstance(kind, str) or kind not in BUILDS:
             raise InputError("no such kind", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS))
         x = column(record, "x", where)
         y, z, yaw = (column(record, name, where, len(x)) for name in ("y", "z", "yaw"))
