@@ -54,6 +54,7 @@ from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
+from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
 from cosfly.products.playback import find_flights, read_flight, read_twin
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
@@ -166,6 +167,8 @@ def _maps(root: Path) -> None:
     walk = walk_along("p0", [(-20, 0), (20, 0), (20, 2)])
     write_paths(root / "path.json", [walk], {"map": "hand", "seed": 0})
     n = len(walk.time_s)
+    company = [Other(kind, walk.positions_m, np.zeros(n)) for kind in BUILDS]
+    write_others(root / "others.json", [Company("p0", company)], {"map": "hand", "seed": 0, "dt_s": 0.5})
     up = walk.positions_m + np.array([0, 0, 10.0])
     ones = np.ones(n)
     traces = [
@@ -438,6 +441,7 @@ READERS: dict[str, Reader] = {
     "boxes": _one("boxes_3d.json", read_boxes),
     "region of interest": _one("roi.json", read_roi),
     "walks": _one("path.json", read_paths),
+    "others": _one("others.json", read_others),
     "traces": _one("drone_trace.json", read_traces),
     "city model": _one("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
