@@ -47,6 +47,8 @@ def cut_windows(
     for current, keyframe in zip(currents, keyframes, strict=True):
         observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders, files)
         problem = "missing_frame" if missing.intersection(observed.indices) else None
+        if problem is None and order_comes_within(flight.mission, current, cfg.future_frames):
+            problem = "order_to_come"
         future = cut_future(flight, motion, current, cfg.future_frames)
         yield Window(observed, future, problem, keyframe)
 
@@ -113,6 +115,11 @@ def _observe(flight: Flight, span: slice, folders: list[Path], files: list[froze
 def known_of(mission: Mission | None, frame: int) -> str | None:
     """Give the kind of a mission at a frame at which its order stands; before, nobody knows that there will be one."""
     return None if mission is None or mission.order_at(frame) is None else mission.kind
+
+
+def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
+    """Tell whether an order of which nobody knows at frame `current` moves the drone after it: no label could be told from what is seen."""
+    return mission is not None and current < mission.at_frame <= current + future_frames
 
 
 def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:

@@ -52,6 +52,13 @@ def test_a_mission_gives_labels_and_is_known_from_its_first_frame_on(tree, order
         assert (label, known) == ((plain[now], None) if now < 8 else ("break_off", "battery"))
 
 
+def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
+    """The turn for home, seen from before the order, would be a turn after the walker."""
+    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3)))
+    problems = {w.observed.indices[-1]: w.problem for w in windows}
+    assert problems == {now: "order_to_come" if now in (5, 6, 7) else None for now in range(4, 13)}
+
+
 def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     def users(root):
         asked = [

@@ -8,8 +8,8 @@ from scipy.ndimage import gaussian_filter1d
 from cosfly.geometry import look_at
 from cosfly.planners.styles.drawing import Intent
 
-TURNS_S = 0.8  # standard deviation of the smoothing of a turn away from the target
-HOME_PITCH_DEG = -15.0
+TURNS_S = 0.8  # standard deviation of the smoothing of a turn while it searches
+HOME_PITCH_DEG, HOME_TURN_DPS = -15.0, 45.0  # how fast the view turns at most, on the way home
 STANDING_MPS = 0.5  # slower than this the direction of flight says nothing
 # While it searches the camera looks where the target would be had it gone on for a while, and to both sides of that.
 GOES_ON_S, SWEEP_DEG, SWEEP_S = 2.0, 18.0, 6.0
@@ -34,15 +34,15 @@ def view_of(
 def _turned_home(
     pitch: np.ndarray, yaw: np.ndarray, positions_m: np.ndarray, at: int, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Look in the direction of flight from frame `at` on."""
-    flown = np.gradient(positions_m[:, :2], dt_s, axis=0) if len(positions_m) > 1 else np.zeros((1, 2))
+    """Turn into the direction of flight from frame `at` on, no faster than a drone turns."""
+    flown, step = np.gradient(positions_m[:, :2], dt_s, axis=0), np.radians(HOME_TURN_DPS) * dt_s
     pitch, yaw = pitch.copy(), yaw.copy()
     for i in range(at + 1, len(yaw)):
         is_flying = np.hypot(*flown[i]) >= STANDING_MPS
-        yaw[i] = np.arctan2(flown[i, 1], flown[i, 0]) if is_flying else yaw[i - 1]
-        pitch[i] = np.radians(HOME_PITCH_DEG)
-    is_turned = np.arange(len(yaw)) > at
-    return _eased(pitch, is_turned, dt_s), _wrapped(_eased(np.unwrap(yaw), is_turned, dt_s))
+        wanted = np.arctan2(flown[i, 1], flown[i, 0]) if is_flying else yaw[i - 1]
+        yaw[i] = yaw[i - 1] + np.clip(_wrapped(wanted - yaw[i - 1]), -step, step)
+        pitch[i] = pitch[i - 1] + np.clip(np.radians(HOME_PITCH_DEG) - pitch[i - 1], -step, step)
+    return pitch, _wrapped(yaw)
 
 
 def _searching(
