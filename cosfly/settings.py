@@ -100,7 +100,7 @@ class RunConfig(Config):
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {
             "name": name, "seed": int(rng_for(self.seed, "run", name).integers(2**31)),
         }  # fmt: skip
-        return build(RunConfig, _merged(shared, changes) | {"maps": maps}, f"towns.{name}")
+        return build(RunConfig, _merged(self, shared, changes) | {"maps": maps}, f"towns.{name}")
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:
@@ -109,12 +109,13 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
     return value
 
 
-def _merged(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Give the settings with the changes in them, group by group."""
+def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Give the settings of a group with the changes in them, group by group; a mapping that is one value, as shares are, is replaced."""
     merged = dict(settings)
     for name, value in changes.items():
-        before = settings.get(name)
-        merged[name] = _merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
+        within = getattr(group, name, None)
+        is_group = isinstance(within, Config) and isinstance(value, dict)
+        merged[name] = _merged(within, settings[name], value) if is_group else value
     return merged
 
 

@@ -482,3 +482,15 @@ def test_a_run_of_towns_goes_on_from_its_own_run_yaml(towns):
 def test_a_town_that_cannot_be_is_refused(given, words):
     with pytest.raises(ConfigError, match=words):
         load(RunConfig, None, [given])
+
+
+def test_shares_of_a_town_replace_those_of_the_run():
+    given = [
+        "plan.segment_s=20",
+        "towns={a: {plan: {styles: {top: 1}}, pedestrians: {pace: {hurry: 1}, traffic: 2}}, b: {}}",
+    ]
+    cfg = load(RunConfig, None, given)
+    town = cfg.of_town("a")
+    assert (town.plan.styles, town.plan.segment_s) == ({"top": 1.0}, 20.0)
+    assert (town.pedestrians.pace, town.pedestrians.traffic) == ({"hurry": 1.0}, 2)
+    assert cfg.of_town("b").plan == cfg.plan

@@ -146,6 +146,19 @@ def test_parts_draw_their_styles_and_cover_the_flight():
     assert trace.segments[-1].end == len(trace.time_s)
 
 
+def test_the_order_of_the_shares_draws_nothing_else():
+    """Settings that say the same are equal, so a run begun with one order may go on with another."""
+    shares = {"top": 1.0, "side": 2.0, "follow": 1.0, "rise": 1.0}
+    turned = dict(reversed(shares.items()))
+    scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
+    for seed in range(6):
+        one, other = (
+            draw_intent(scenario, OPEN, OPEN, PlanConfig(styles=styles, segment_s=10), np.random.default_rng(seed))
+            for styles in (shares, turned)
+        )
+        assert one.styles == other.styles
+
+
 def test_walks_of_two_maps_with_one_id_draw_apart():
     moved = replace(STRAIGHT, positions_m=STRAIGHT.positions_m + np.array([7.0, 0, 0]))
     assert style_rng(STRAIGHT, 0).random() != style_rng(moved, 0).random()
@@ -238,6 +251,8 @@ def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
     is_under_way = np.hypot(flown[:, 0], flown[:, 1]) > 1.0
     turned = np.abs(wrap_deg(course_deg - trace.rotations_deg[mission.home_frame + 4 : -5, 1]))
     assert turned[is_under_way].max() < 25
+    assert np.abs(wrap_deg(np.diff(trace.rotations_deg[:, 1]))).max() <= 45.0 * 0.5 + 1e-6  # it turns, it does not jump
+    assert np.abs(np.diff(trace.rotations_deg[mission.at_frame :, 0])).max() <= 45.0 * 0.5 + 1e-6
     assert trace.metrics["five_ray_mean"] == 1.0  # of the pursuit alone
     assert [mission.order_at(i) for i in (mission.at_frame - 1, mission.at_frame, mission.home_frame)] == [
         None,

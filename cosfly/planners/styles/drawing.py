@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cosfly.chance import draw_by_share
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles.courses import wish_of
 from cosfly.planners.styles.mission import wish_of_mission
@@ -50,7 +51,7 @@ def draw_intent(
     scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> Intent:
     """Draw the style or styles of a flight. screens: the obstacles that hide a person for certain."""
-    name, num = _draw(cfg.styles, rng), len(scenario.targets_m)
+    name, num = draw_by_share(cfg.styles, rng), len(scenario.targets_m)
     if name == REACQUIRE:
         wish = wish_of_reacquire(scenario, obstacles, screens, cfg, rng)
         segment = Segment(name, 0, num, keeps_sight=False)
@@ -70,17 +71,12 @@ def draw_intent(
     return Intent(wish, (*before, Segment(RETURN_HOME, at, num, keeps_sight=False)), mission)
 
 
-def _draw(shares: dict[str, float], rng: np.random.Generator) -> str:
-    names, weights = list(shares), np.array(list(shares.values()), dtype=float)
-    return names[int(rng.choice(len(names), p=weights / weights.sum()))]
-
-
 def _parts(name: str, num_points: int, dt_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[str]:
     """Give the styles of a flight's parts, of which the first is `name` if it takes parts at all."""
     shares = {style: share for style, share in cfg.styles.items() if style not in WHOLE and share > 0} or {FOLLOW: 1.0}
     num = round(num_points * dt_s / cfg.segment_s) if cfg.segment_s else 1
     num = max(1, min(num, num_points // POINTS_LEAST))
-    return [name if k == 0 and name not in WHOLE else _draw(shares, rng) for k in range(num)]
+    return [name if k == 0 and name not in WHOLE else draw_by_share(shares, rng) for k in range(num)]
 
 
 def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
