@@ -114,6 +114,7 @@ def test_others_round_trip_and_bad_files(tmp_path):
     np.testing.assert_allclose(first.others[0].headings_rad, np.arctan2(3, 4), atol=1e-5)
     for old, new, words in (
         ('"Car"', '"Tank"', r"paths\[0\]\.others\[0\]\.kind: .*'Tank'.*Pedestrians or Car"),
+        ('"Car"', '["Car"]', r"paths\[0\]\.others\[0\]\.kind"),
         ('"x":[0.0,4.0]', '"x":[0.0]', r"paths\[0\]\.others\[0\]\.y"),
         ('"x":[0.0,4.0]', '"x":[0.0,null]', r"paths\[0\]\.others\[0\]\.x"),
         ('"id":"q"', '"id":7', r"paths\[1\]\.id"),

@@ -25,11 +25,8 @@ MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is 
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met
 TURN_S = 2.0  # people who are at the end of their route stand so long, and walk back
 OWN_SPEED = (0.8, 1.2)  # of a person's speeds, beside those of the same pace
-CAR_SPEED_MPS, CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = (
-    8.0,
-    2.0,
-    2.0,
-)  # 30 km/h; what is comfortable in a curve, and along the way
+CAR_SPEED_MPS = 8.0  # 30 km/h
+CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = 2.0, 2.0  # what is comfortable in a curve, and along the way
 SHORTEST_DRIVE_M = 15.0
 CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead and behind
 

@@ -43,10 +43,8 @@ ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
 TWIN_TOLERANCE_S = 1e-3
-HEADING_FRAMES, STANDS_M = (
-    2,
-    0.1,
-)  # whither a person walks: the way from so many frames before to so many after; less is standing
+# Whither a person walks: the way from so many frames before to so many after; who goes less than so far stands.
+HEADING_FRAMES, STANDS_M = 2, 0.1
 
 
 @dataclass(frozen=True)

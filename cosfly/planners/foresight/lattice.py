@@ -18,10 +18,8 @@ MAX_TURN, MAX_TURN_CLIMBING = 2, 6
 # a house from above; CLIMBS lead over what blocks the way.
 RINGS = ((-1, 0), (0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (-1, 1), (0, 1))
 CLIMBS = ((0, 2), (1, 4), (2, 7), (2, 11))
-STEP_OUT_SHARE, STEP_OUT_MAX_M = (
-    0.3,
-    8.0,
-)  # of the wished distance; farther apart, the drone could not change rings between keys
+# Of the wished distance; farther apart, the drone could not change rings between keys.
+STEP_OUT_SHARE, STEP_OUT_MAX_M = 0.3, 8.0
 STEP_UP_M = 7.0
 
 # Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished distance. Where the
