@@ -114,8 +114,9 @@ def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) ->
     merged = dict(settings)
     for name, value in changes.items():
         within = getattr(group, name, None)
-        is_group = isinstance(within, Config) and isinstance(value, dict)
-        merged[name] = _merged(within, settings[name], value) if is_group else value
+        if isinstance(within, Config) and isinstance(value, dict):
+            value = _merged(within, settings[name], value)
+        merged[name] = value
     return merged
 
 

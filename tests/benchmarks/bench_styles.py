@@ -13,7 +13,7 @@ import numpy as np
 
 from caption.schema import FutureMotion, LabelConfig, WindowConfig
 from caption.truth.actions import label_of, measure
-from caption.windows import current_frames
+from caption.windows import current_frames, order_comes_within
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.traces import DroneTrace, read_traces
 
@@ -27,6 +27,8 @@ def labels_of(trace: DroneTrace, window: WindowConfig, label: LabelConfig) -> li
     in_view = (aside < HALF_WIDTH_DEG) & (np.abs(pitch - trace.rotations_deg[:, 0]) < HALF_HEIGHT_DEG)
     visible, dt_s, found = in_view & (trace.visibility > 0), float(trace.time_s[1] - trace.time_s[0]), []
     for now in current_frames(len(trace.time_s), window):
+        if order_comes_within(trace.mission, now, window.future_frames):
+            continue
         span = slice(now, now + window.future_frames + 1)
         before_mps = float(np.linalg.norm(trace.positions_m[now] - trace.positions_m[now - 1])) / dt_s
         order = None if trace.mission is None else trace.mission.order_at(now)
