@@ -36,13 +36,14 @@ def repair(folder: Path) -> int:
     below = sorted(
         path for depth in ("*", "*/*") for path in folder.glob(depth) if path.is_dir()
     )  # stages; those of towns
-    return sum(_repair_stage(stage) for stage in (folder, *below))
+    return sum(_repair_stage(stage, folder) for stage in (folder, *below))
 
 
-def _repair_stage(stage: Path) -> int:
+def _repair_stage(stage: Path, out: Path) -> int:
+    root = out.resolve()  # only the folder that was named may itself be a link
     found = [(path, read) for pattern, read in JOURNALS.items() for path in sorted(stage.glob(pattern))]
-    found = [(path, read) for path, read in found if path.is_file() and not path.is_symlink()]
-    if not found or stage.is_symlink():
+    found = [(path, read) for path, read in found if path.is_file() and path.resolve() == root / path.relative_to(out)]
+    if not found:
         return 0
     lock = hold_folder(stage)
     try:

@@ -108,7 +108,14 @@ def test_damaged_lines_are_set_aside_too_and_links_are_left_alone(tmp_path):
     elsewhere.write_bytes(b"garbage\n")
     (tmp_path / "run/render").mkdir()
     (tmp_path / "run/render/items.jsonl").symlink_to(elsewhere)
-    assert repair(tmp_path / "run") == 2
+    private = tmp_path / "private/plan/items.jsonl"
+    private.parent.mkdir(parents=True)
+    private.write_bytes(b"garbage\n")
+    (tmp_path / "run/another town").symlink_to(tmp_path / "private")
+    (tmp_path / "run/render/answers").symlink_to(tmp_path)
+    (tmp_path / "named").symlink_to(tmp_path / "run")
+    assert repair(tmp_path / "named") == 2, "the folder that is named may be a link"
+    assert private.read_bytes() == b"garbage\n"
     assert (stage / "items.jsonl").read_bytes() == b"".join(lines)
     assert (stage / "items.jsonl.aside").read_bytes() == b"garbage\n0123456789abcdef {torn\n"
     assert elsewhere.read_bytes() == b"garbage\n"
