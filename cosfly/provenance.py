@@ -92,9 +92,9 @@ def fingerprint(path: Path) -> str:
         raise InputError(
             "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
         )
-    manifest = path / "manifest.json"
-    if manifest.is_file():
-        return sha256_bytes(dump_json(read_object(manifest, what="manifest").get("outputs", [])).encode())
+    if _has_record(path, "manifest.json", MANIFEST_SCHEMA):
+        outputs = read_object(path / "manifest.json", what="manifest").get("outputs", [])
+        return sha256_bytes(dump_json(outputs).encode())
     digest = hashlib.sha256()
     for file in sorted(path.rglob(FLIGHT)):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
@@ -271,7 +271,7 @@ def verify(paths: Iterable[Path]) -> int:
     """
     start_s, num_bytes, wrong = time.monotonic(), 0, []
     digests: dict[Path, str] = {}
-    folders = list(dict.fromkeys(_stage_folder(path) or path for path in paths))
+    folders = list(dict.fromkeys(_stage_folder(path) or path for path in map(Path.absolute, paths)))
     for folder in folders:
         listed, strangers = _recorded_files(folder) if folder.is_dir() else ({}, [])
         if not listed:

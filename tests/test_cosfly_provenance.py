@@ -126,6 +126,13 @@ def test_a_converted_tree_goes_with_the_captions_of_the_older_one(run):
     provenance.checked_inputs({"data": converted, "captions": run / "caption/captions.jsonl"})
 
 
+def test_a_file_and_a_folder_beside_it_are_verified_as_one_types_them(run, monkeypatch):
+    monkeypatch.chdir(run)
+    (run / "render/Town1/trajectory_1/ORI/frames_playback/frame_00000/rgb.png").write_text("another")
+    with pytest.raises(VerifyError, match=r"rgb.png has other bytes"):
+        provenance.verify([Path("caption/captions.jsonl"), Path("render")])
+
+
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()
@@ -143,6 +150,14 @@ def test_records_of_others_are_not_ours(tmp_path, caplog):
     provenance.checked_inputs({"map": tmp_path / "map.json"})
     assert provenance.verify([tmp_path / "map.json"]) == 0
     assert "there is no record to hold it against" in caplog.text
+
+
+def test_a_tree_of_others_with_a_manifest_of_theirs_is_known_by_its_flights(tmp_path):
+    write_json(tmp_path / "manifest.json", {"name": "a data set"})
+    write_json(tmp_path / "flight/trajectory.json", 1)
+    before = provenance.fingerprint(tmp_path)
+    write_json(tmp_path / "flight/trajectory.json", 2)
+    assert provenance.fingerprint(tmp_path) != before
 
 
 def test_a_folder_without_checksums_is_as_good_as_one_with_them(run):
