@@ -107,7 +107,11 @@ def _header(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str) 
     descr, order, shape = (match.group(1).decode() for match in found if match)
     with contextlib.suppress(TypeError, ValueError):
         header = ArrayHeader(np.dtype(descr), _lengths(shape), order == "True", first + length)
-        if math.prod(header.shape) * header.dtype.itemsize == size - header.offset:
+        # With a length of 0 the product says nothing of the others, which may be beyond every machine.
+        if (
+            math.prod(header.shape) * header.dtype.itemsize == size - header.offset
+            and max(header.shape, default=0) <= size
+        ):
             return header
     raise _no_array(where, what, f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
 

@@ -1,7 +1,7 @@
 """How much a file may ask of this machine before it is refused, and which links are followed: settings `reading.*`.
 
 They decide what is refused and never what is made, so they are the process's and not a stage's; workers get those of the process that
-started them (runner.py).
+started them (worker_pool.py).
 """
 
 from __future__ import annotations
