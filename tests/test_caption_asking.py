@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 import json
 import logging
@@ -449,6 +450,20 @@ def test_a_lost_line_of_totals_costs_time_only(tmp_path, damage):
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 20
         assert book.get(flight_name(3), record(3, 2).key) == record(3, 2)
+
+
+def test_a_disk_that_fails_in_its_own_way_holds_nobody_up(tmp_path, monkeypatch):
+    def fails(_) -> None:
+        raise OSError(errno.ESTALE, "stale file handle")
+
+    async def put() -> None:
+        async with asyncio.timeout(30):
+            with AnswerBook(tmp_path) as book:
+                await book.put(flight_name(0), record(0, 0))
+
+    monkeypatch.setattr(Journal, "sync", fails)
+    with pytest.raises(OSError, match="stale file handle"):
+        asyncio.run(put())
 
 
 def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):

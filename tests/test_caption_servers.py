@@ -18,13 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import httpx
 import pytest
 from teacher_server import MODEL, Sent, TeacherServer, Wild, is_mirror, kept_answers, obedient_answer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
-from cosfly.chat.wire import retry_after_s
+from cosfly.chat.wire import _Body, retry_after_s
 from cosfly.errors import NothingKept, TeacherError
 from specimens import make_playback_tree
 
@@ -410,6 +411,13 @@ def test_of_a_bomb_no_more_is_unpacked_than_the_limit(tree, tmp_path):
         peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()
     assert peak_mb < 60  # 200 unpacked
+
+
+def test_what_follows_a_packed_body_is_not_kept():
+    body = _Body("gzip", 1000)
+    body.add(gzip.compress(b"{}"))
+    with pytest.raises(httpx.DecodingError, match="more than"):
+        body.add(bytes(1000))
 
 
 def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):

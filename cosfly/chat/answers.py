@@ -176,10 +176,10 @@ class AnswerBook:
         while self._waiting:
             batch, self._waiting = self._waiting, []
             journals = {journal for journal, _ in batch}
-            error: CosflyError | None = None
+            error: CosflyError | OSError | None = None
             try:
                 await loop.run_in_executor(self._disk, _sync_all, journals)
-            except CosflyError as found:  # a full disk: every window that waits for it is told
+            except (CosflyError, OSError) as found:  # a disk that is full or gone: every window that waits is told
                 error = found
             for _, on_disk in batch:
                 if on_disk.done():

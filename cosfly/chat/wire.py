@@ -125,6 +125,8 @@ class _Body:
     def add(self, packed: bytes) -> None:
         """Add what has arrived; of a bomb no more is unpacked than fits."""
         room = self._most - len(self._read)
+        if self._unzip is not None and self._unzip.eof:  # zlib would keep all of it
+            raise httpx.DecodingError("more than the gzip data that it claims to be")
         try:
             found = packed if self._unzip is None else self._unzip.decompress(packed, room + 1)
         except zlib.error as error:
