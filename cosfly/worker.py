@@ -99,6 +99,8 @@ def work_through(connection: Connection, manner: Manner) -> None:
             voice.finish(record)
     except Exception as error:
         if not isinstance(error, CosflyError):
+            if type(error).__module__ != "builtins":  # many of those do not cross the pipe; their words do
+                error = RuntimeError(f"a bug in a worker: {type(error).__name__}: {error}")
             error.add_note(traceback.format_exc())  # a bug keeps its traceback, which does not cross the pipe
         voice.send(Broken(error))
 

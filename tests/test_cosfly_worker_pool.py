@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from toy_workers import make_counting_worker, make_talking_worker, make_worker, stage_in
+from toy_workers import make_broken_worker, make_counting_worker, make_talking_worker, make_worker, stage_in
 
 from cosfly.errors import EnvironmentMissing
 from cosfly.journal import Journal
@@ -71,6 +71,12 @@ def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
     assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]
     # The machine is fit again.
     assert len(work_on(tmp_path, ["nothing"] * 31, workers=1).kept) == 31
+
+
+def test_a_bug_in_making_a_worker_is_told_in_its_words(tmp_path):
+    with pytest.raises(RuntimeError, match=r"a bug in a worker: Local: the GPU is on fire") as caught:
+        run_items(stage_in(tmp_path), [Item("a")], make_broken_worker, workers=1)
+    assert "in make_broken_worker" in caught.value.__notes__[0]
 
 
 # --- what the parent's end leaves behind ------------------------------------------------------------------------------
