@@ -1,4 +1,4 @@
-"""Files that are never half written: atomic writes, checksummed journals, folders that appear whole."""
+"""Files that are never half written: atomic writes, lists of checksums, folders that appear whole."""
 
 from __future__ import annotations
 
