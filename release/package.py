@@ -30,7 +30,8 @@ from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_ite
 from cosfly.stage_folder import Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes, write_checksums
 from release import columns
-from release.card import compute_numbers, render_card
+from release.card import render_card
+from release.card_numbers import compute_numbers
 from release.record import (
     CaptionHistory,
     FlightHistory,
