@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 from specimens_prose import CASES, FOLLOW, HOLD, SECOND_SET, WINDOWS, Case
 
 from caption.schema import EvidenceConfig
+from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
 from caption.truth.gold import read_gold_prose
 from caption.truth.prose.judging import check_evidence, judge_sentences
@@ -134,6 +137,46 @@ def test_any_text_is_read_without_an_error(text):
             judged = judge_sentences(coc, facts, CFG, language)
             assert [one.name for one in judged] == [name for name, _ in sentences_of(coc)]
             assert all(bool(one.problems) == (one.state == "contradicted") for one in judged)
+
+
+@pytest.mark.parametrize(
+    "text", ["The drone flies four times as fast as the walker.", "The walker does a quarter of our speed."]
+)
+def test_a_multiple_of_a_speed_that_is_zero_is_judged(text):
+    """Where one of the two stood at a frame, there is a quotient one way only."""
+    standing = dataclasses.replace(FOLLOW, target_speeds_mps=(None, 0.0, 0.0, 1.3, 1.4), target_speed_mps=0.7)
+    hovering = dataclasses.replace(FOLLOW, speed_mps=(None, 0.0, 0.0, 0.0, 0.0))
+    for facts in (standing, hovering):
+        coc = Coc(critical_components=text, reasoning_trace=FILLER["en"], flight_decision="hover")
+        assert len(judge_sentences(coc, facts, CFG, "en")) == 2
+
+
+def torn(facts: Facts, rng: np.random.Generator) -> Facts:
+    """Make values zero, unknown where the type allows it, or a later series unmeasured, at random."""
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(Facts):
+        series, as_what = getattr(facts, field.name), rng.integers(4)
+        if field.name == "visibility" or not isinstance(series, tuple):
+            continue
+        if as_what == 0 and field.default == ():
+            changed[field.name] = ()
+        elif as_what == 1:
+            changed[field.name] = tuple(v if v is None or rng.random() < 0.5 else type(v)(0) for v in series)
+        elif as_what == 2 and "None" in str(field.type):
+            changed[field.name] = tuple(None if rng.random() < 0.5 else v for v in series)
+    means = {name: rng.choice(np.array([None, 0.0, 0.7])) for name in ("target_speed_mps", "target_turn_deg")}
+    return dataclasses.replace(facts, **changed, **means)
+
+
+def test_captions_are_judged_against_windows_of_which_little_is_known():
+    """Each against its own window and that of another, with holes and zeros: nothing raises."""
+    rng = np.random.default_rng(0)
+    lines = list(read_gold_prose(SECOND_SET))
+    for line, other in zip(lines, reversed(lines), strict=True):
+        for facts in (line.facts, other.facts):
+            holed = torn(facts, rng)
+            assert judge_sentences(line.coc, holed, CFG, line.language)
+            assert judge_claims(line.coc, line.claims, holed, CFG, line.language)
 
 
 def test_true_prose_of_our_own_passes():

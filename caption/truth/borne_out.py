@@ -89,7 +89,7 @@ def _ratios(facts: Facts) -> Iterator[float]:
             for _, value in known[:-1]:
                 if value and last:
                     yield from both_ways(abs(last / value))
-    if facts.travelled_m and facts.travelled_m[-1]:
+    if facts.displacement_m and facts.travelled_m and facts.travelled_m[-1]:
         yield facts.displacement_m[-1] / facts.travelled_m[-1]
     sizes = (facts.box_width_px, facts.box_height_px, facts.offset_x_px, facts.offset_y_px)
     for series, whole in zip(sizes, (facts.width_px, facts.height_px) * 2, strict=True):

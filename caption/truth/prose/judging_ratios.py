@@ -75,12 +75,20 @@ def _with_share(s: Statement, ratio: float) -> Iterator[float]:
         yield abs(ratio - 1.0)
 
 
+def _ways_round(s: Statement, ratio: float) -> Iterator[float]:
+    """Yield the drone's speed over the target's, or the inverse, as it is told; both where nothing tells."""
+    if s.side >= 0:
+        yield ratio
+    if s.side <= 0 and ratio:
+        yield 1.0 / ratio
+
+
 def _ratios(s: Statement, measured: Measured) -> Iterator[float]:
     """Yield what the words mean: the two speeds now, or a series now against its earlier frames."""
     for name in s.names:
         if name == "speed_ratio":
             for ratio in _of_speeds(measured, now=s.frames is not None):
-                for true in [ratio] * (s.side >= 0) + [1.0 / ratio] * (s.side <= 0 and ratio > 0.0):
+                for true in _ways_round(s, ratio):
                     yield from _with_share(s, true)
             continue
         series = [abs(v) for v in measured.known(name)]
@@ -115,5 +123,8 @@ def _at_other_frames(s: Statement, measured: Measured) -> Iterator[float]:
         ours = measured.known("speed")
         ours = [*ours, sum(ours) / len(ours)] if ours else []
         for a, b in product(ours, [*measured.known("target_speed"), *measured.known("target_mean")]):
-            for ratio in [a / b] * (b > 0 and s.side >= 0) + [b / a] * (a > 0 and s.side <= 0):
-                yield from _with_share(s, ratio)
+            if b:
+                for ratio in _ways_round(s, a / b):
+                    yield from _with_share(s, ratio)
+            elif a and s.side <= 0:
+                yield from _with_share(s, 0.0)  # standing against flying
