@@ -11,6 +11,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +26,7 @@ from cosfly.products.places import stand
 from cosfly.provenance import warn_unbound
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_file, dump_json
+from distill.balance import Cut, Ranks, cost_of
 from distill.schema import SPLITS, Sample, Split, read_split, split_path
 
 log = logging.getLogger(__name__)
@@ -66,6 +68,16 @@ class PrepareConfig(Config):
     weigh_proved: bool = Field(
         False,
         description="multiply a sample's weight by that share (half at least, so that what is unread still counts)",
+    )
+    balance: Literal["none", "decisions"] = Field(
+        "none",
+        description="decisions: training windows of a decision beyond `balance_ratio` are left out; validation and test stay",
+    )
+    balance_ratio: float = Field(
+        1.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="most training windows of a decision, as a multiple of an equal share (windows / decisions that occur)",
     )
 
     @model_validator(mode="after")
@@ -208,19 +220,37 @@ def _weight(caption: Caption, proved: float | None, cfg: PrepareConfig) -> float
     return weight * (0.5 + 0.5 * (proved or 0.0)) if cfg.weigh_proved else weight
 
 
-def _samples(cfg: PrepareConfig, captions: Path, data: Path) -> Iterator[Sample | str]:
-    """Yield, for each caption and wanted language, its sample or the reason for leaving it out."""
+@dataclass(frozen=True)
+class _Window:
+    """What the languages of one caption give: samples, and the reasons for leaving others out."""
+
+    sample_id: str
+    samples: list[Sample]
+    left_out: list[str]
+
+    @property
+    def decision(self) -> str:
+        """That of the first language, should they differ."""
+        return self.samples[0].decision
+
+
+def _windows(cfg: PrepareConfig, captions: Path, data: Path) -> Iterator[_Window]:
     for caption in read_captions(captions):
         for name in (caption.town, caption.trajectory, caption.variant):
             if name != Path(name).name or name in ("", ".", ".."):
                 raise InputError("not a folder name", where=f"{captions}: {caption.sample_id}", got=name)
         folder = stand(data, f"{caption.town}/{caption.trajectory}/{caption.variant}")
         caption.town = folder.parent.parent.name  # the tree may have been converted since
+        window = _Window(caption.sample_id, [], [])
         for language in cfg.languages:
             sample = make_sample(caption, language, cfg)
-            if isinstance(sample, Sample) and not all((data / image).is_file() for image in sample.images):
-                sample = "missing_image"
-            yield sample
+            if isinstance(sample, str):
+                window.left_out.append(sample)
+            elif not all((data / image).is_file() for image in sample.images):
+                window.left_out.append("missing_image")
+            else:
+                window.samples.append(sample)
+        yield window
 
 
 def run(
@@ -238,21 +268,22 @@ def run(
     if stage.is_complete:
         return out
     warn_unbound([captions])
-    excluded = Counter[str]()
-    groups = set()
-    # Two passes: the splits must be known before the first line is written.
-    for sample in _samples(cfg, captions, data):
-        if isinstance(sample, str):
-            excluded[sample] += 1
-        else:
-            groups.add(sample.group(cfg.split_by))
-    if not groups:
-        tally = Tally(input=excluded.total(), dropped=dict(excluded))
+    # Two passes: the splits, and what is too much of train, must be known before the first line is written.
+    ranks, excluded = _survey(cfg, captions, data, seed)
+    if not ranks.groups:
+        tally = Tally(input=excluded.total(), dropped=excluded)
         raise stage.nothing_kept(tally, expected="accepted captions whose images stand below --data")
-    split_of = assign_splits(groups, cfg, seed)
-    facts = _write_splits(cfg, captions, data, out, split_of)
+    split_of = assign_splits(ranks.groups, cfg, seed)
+    train = [group for group, split in split_of.items() if split == "train"]
+    cut = ranks.cut(train, cfg.balance_ratio) if cfg.balance == "decisions" else None
+    facts, left_out = _write_splits(cfg, captions, data, out, split_of, cut)
     counts = check_no_leak({split: read_split(out, split) for split in SPLITS}, cfg.split_by)
-    tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=dict(excluded))
+    if cut is not None:
+        excluded += Counter(balance=left_out.total())
+        cost = cost_of(cut, left_out)
+        facts["train"]["balance"] = cost.model_dump()
+        log.info("distill.prepare: %s", cost)
+    tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=excluded)
     for split in SPLITS:
         facts[split]["groups"] = sum(1 for owner in split_of.values() if owner == split)
         if not counts[split]:
@@ -261,27 +292,45 @@ def run(
     return out
 
 
+def _survey(cfg: PrepareConfig, captions: Path, data: Path, seed: int) -> tuple[Ranks, Counter[str]]:
+    """Go over all windows once: the ranks of those that can be used, and why samples are left out."""
+    ranks, excluded = Ranks(seed), Counter[str]()
+    for window in _windows(cfg, captions, data):
+        excluded.update(window.left_out)
+        if window.samples:
+            ranks.add(window.samples[0].group(cfg.split_by), window.decision, window.sample_id)
+    return ranks, excluded
+
+
 def _write_splits(
-    cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, Split]
-) -> dict[str, dict]:
-    """Write the three files and give the counts of each: samples, by language, by decision, repaired."""
+    cfg: PrepareConfig, captions: Path, data: Path, out: Path, split_of: dict[str, Split], cut: Cut | None
+) -> tuple[dict[str, dict], Counter[str]]:
+    """Write the three files.
+
+    Returns:
+        split -> counts of its samples, by language, by decision, repaired; decision -> samples that the cut left out of train.
+    """
     names = ("language", "decision", "repair")
     counters: dict[str, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
+    left_out = Counter[str]()
     with ExitStack() as stack:
         files = {split: stack.enter_context(atomic_file(split_path(out, split))) for split in SPLITS}
-        for sample in _samples(cfg, captions, data):
-            if isinstance(sample, str):
-                continue
-            split = split_of[sample.group(cfg.split_by)]
-            files[split].write((dump_json(sample.model_dump(mode="json")) + "\n").encode())
-            counter = counters[split]
-            counter["language"][sample.language] += 1
-            counter["decision"][sample.decision] += 1
-            counter["repair"][sample.repair or "none"] += 1
-    return {
+        for window in _windows(cfg, captions, data):
+            for sample in window.samples:
+                split = split_of[sample.group(cfg.split_by)]
+                if split == "train" and cut is not None and not cut.keeps(window.decision, window.sample_id):
+                    left_out[window.decision] += 1
+                    continue
+                files[split].write((dump_json(sample.model_dump(mode="json")) + "\n").encode())
+                counter = counters[split]
+                counter["language"][sample.language] += 1
+                counter["decision"][sample.decision] += 1
+                counter["repair"][sample.repair or "none"] += 1
+    facts: dict[str, dict] = {
         split: {
             "samples": found["language"].total(),
             **{f"by_{name}": dict(sorted(counter.items())) for name, counter in found.items()},
         }
         for split, found in counters.items()
     }
+    return facts, left_out

@@ -17,7 +17,7 @@ from specimens_distill import make_caption, make_captions
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
 from distill.dataset import PrepareConfig, assign_splits, check_no_leak, make_sample, run
-from distill.schema import SPLITS, Sample, read_split
+from distill.schema import SPLITS, Sample, read_split, split_path
 from specimens import make_playback_tree
 
 
@@ -266,6 +266,57 @@ def test_run_counts_what_it_leaves_out(tree, tmp_path):
     counts = json.loads((out / "manifest.json").read_text())["counts"]
     assert counts["dropped"] == {"dropped_hard_conflict": 2, "missing_image": 2, "no_zh": 1}
     assert counts["input"] == counts["kept"] + 5
+
+
+def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, caplog):
+    records = make_captions(tmp_path / "captions.jsonl", tree)
+    mixed = [  # every window of straight tracking is judged by its English, whatever the Chinese says
+        record.model_copy(update={"zh": record.zh.model_copy(update={"flight_decision": "hover"})})
+        if record.frame_index == 5 and record.en.flight_decision == "track_straight"
+        else record
+        for record in records
+    ]
+    write_captions(tmp_path / "captions.jsonl", mixed)
+    plain = run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "plain")
+    write_captions(tmp_path / "captions.jsonl", mixed[::-1])
+    caplog.set_level("INFO", logger="distill")
+    out = run(PrepareConfig(balance="decisions"), tmp_path / "captions.jsonl", tree, tmp_path / "balanced")
+
+    lines = {
+        (folder, split): sorted(split_path(folder, split).read_text().splitlines())
+        for folder in (plain, out)
+        for split in SPLITS
+    }
+    assert all(lines[plain, split] == lines[out, split] for split in ("val", "test"))
+    assert set(lines[out, "train"]) < set(lines[plain, "train"])
+    languages = Counter(sample.sample_id for sample in read_split(out, "train"))
+    assert set(languages.values()) == {2}
+    english = Counter(sample.decision for sample in read_split(out, "train") if sample.language == "en")
+    assert english == {"track_straight": 8, "yaw_left_to_follow": 6, "slow_down": 6}  # of 12, 6, 6: an equal share is 8
+
+    manifest = json.loads((out / "manifest.json").read_text())
+    counts, cost = manifest["counts"], manifest["splits"]["train"]["balance"]
+    assert counts["dropped"] == {"balance": 4 * 2}
+    assert counts["kept"] + 8 == counts["input"] == json.loads((plain / "manifest.json").read_text())["counts"]["input"]
+    assert (cost["windows"], cost["windows_left_out"], cost["samples_left_out"]) == (24, 4, 8)
+    assert manifest["splits"]["train"]["samples"] == 40
+    assert "balance left 4 of 24 training windows out (8 samples)" in caplog.text
+
+
+def test_a_bound_that_nothing_reaches_gives_the_files_of_no_balance(tree, captions, tmp_path):
+    plain = run(PrepareConfig(), captions, tree, tmp_path / "plain")
+    wide = run(PrepareConfig(balance="decisions", balance_ratio=100), captions, tree, tmp_path / "wide")
+    for split in SPLITS:
+        assert split_path(plain, split).read_bytes() == split_path(wide, split).read_bytes()
+    facts = [json.loads((folder / "manifest.json").read_text()) for folder in (plain, wide)]
+    assert facts[0]["counts"] == facts[1]["counts"]
+    assert ["balance" in found["splits"]["train"] for found in facts] == [False, True]
+
+
+@pytest.mark.parametrize("ratio", [0, -1, float("inf"), float("nan")], ids=str)
+def test_a_bound_that_is_none_is_refused(ratio):
+    with pytest.raises(ValidationError, match="balance_ratio"):
+        PrepareConfig(balance="decisions", balance_ratio=ratio)
 
 
 def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):

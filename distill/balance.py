@@ -1,0 +1,155 @@
+"""A training split in which no decision crowds out the others.
+
+Windows are ranked by a hash of the seed and their name. Of a decision that has too many the first in rank stay, so neither the order of the
+captions nor the number of workers matters. A window goes or stays with all its languages.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from array import array
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.products.captions import ACTIONS
+
+
+def _rank(sample_id: str, seed: int) -> int:
+    return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Which windows of the training split stay."""
+
+    seed: int
+    ratio: float
+    most_windows: int  # of one decision
+    windows: Mapping[str, int]  # decision -> windows before the cut
+    last_rank: Mapping[str, int]  # decision that has too many -> rank of the last window that stays
+
+    def keeps(self, decision: str, sample_id: str) -> bool:
+        return decision not in self.last_rank or _rank(sample_id, self.seed) <= self.last_rank[decision]
+
+
+class Ranks:
+    """The 64-bit ranks of the windows by group and decision, which is all that is held of them."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._ranks: dict[str, dict[str, array[int]]] = {}
+
+    def add(self, group: str, decision: str, sample_id: str) -> None:
+        self._ranks.setdefault(group, {}).setdefault(decision, array("Q")).append(_rank(sample_id, self._seed))
+
+    @property
+    def groups(self) -> list[str]:
+        return list(self._ranks)
+
+    def cut(self, groups: Iterable[str], ratio: float) -> Cut:
+        """Find the cut that leaves of each decision at most `ratio` times an equal share, and one window at least.
+
+        An equal share is the windows over the decisions that occur. The median or the least of the counts would be no measure: a few
+        stray decisions of one or two windows bring them down, and nearly all of the others with them.
+
+        Args:
+            groups: those of the training split, one at least.
+            ratio: > 0.
+        """
+        ranks: dict[str, array[int]] = defaultdict(lambda: array("Q"))
+        for group in groups:
+            for decision, found in self._ranks[group].items():
+                ranks[decision].extend(found)
+        windows = {decision: len(found) for decision, found in sorted(ranks.items())}
+        most = max(1, math.floor(ratio * sum(windows.values()) / len(windows)))
+        last_rank = {decision: sorted(found)[most - 1] for decision, found in ranks.items() if len(found) > most}
+        return Cut(self._seed, ratio, most, windows, last_rank)
+
+
+# --- what it cost -----------------------------------------------------------------------------------------------------
+
+
+class BeforeAfter(BaseModel):
+    """A number of the training split before and after the cut."""
+
+    model_config = ConfigDict(frozen=True)
+
+    before: float
+    after: float
+
+
+class DecisionCost(BaseModel):
+    """What the cut did to one decision; shares are of all windows of the split."""
+
+    model_config = ConfigDict(frozen=True)
+
+    windows: int
+    windows_left_out: int
+    samples_left_out: int
+    share: BeforeAfter
+
+
+class Cost(BaseModel):
+    """What balance cost the training split: `balance` of the manifest."""
+
+    model_config = ConfigDict(frozen=True)
+
+    ratio: float
+    most_windows: int
+    windows: int
+    windows_left_out: int
+    samples_left_out: int
+    effective_decisions: BeforeAfter  # as many equally frequent decisions have the same entropy
+    decisions: dict[str, DecisionCost]  # those that occur
+    absent: list[str]  # decisions that no window of the split has
+
+    def __str__(self) -> str:
+        cuts = [
+            f"{decision} {cost.windows} -> {cost.windows - cost.windows_left_out}"
+            f" ({cost.share.before:.1%} -> {cost.share.after:.1%})"
+            for decision, cost in self.decisions.items()
+            if cost.windows_left_out
+        ]
+        whole = [f"{decision} {cost.windows}" for decision, cost in self.decisions.items() if not cost.windows_left_out]
+        return (
+            f"balance left {self.windows_left_out} of {self.windows} training windows out ({self.samples_left_out} samples),"
+            f" at most {self.most_windows} a decision: {', '.join(cuts) or 'none was above'}; whole: {', '.join(whole) or 'none'};"
+            f" absent: {', '.join(self.absent) or 'none'}; effective decisions"
+            f" {self.effective_decisions.before:.1f} -> {self.effective_decisions.after:.1f}"
+        )
+
+
+def cost_of(cut: Cut, samples_left_out: Mapping[str, int]) -> Cost:
+    """Say what a cut cost; `samples_left_out` counts the samples of the windows that it left out, by decision."""
+    before = cut.windows
+    after = {decision: min(count, cut.most_windows) for decision, count in before.items()}
+    num_before, num_after = sum(before.values()), sum(after.values())
+    return Cost(
+        ratio=cut.ratio,
+        most_windows=cut.most_windows,
+        windows=num_before,
+        windows_left_out=num_before - num_after,
+        samples_left_out=sum(samples_left_out.values()),
+        effective_decisions=BeforeAfter(before=_effective(before), after=_effective(after)),
+        decisions={
+            decision: DecisionCost(
+                windows=count,
+                windows_left_out=count - after[decision],
+                samples_left_out=samples_left_out.get(decision, 0),
+                share=BeforeAfter(before=round(count / num_before, 4), after=round(after[decision] / num_after, 4)),
+            )
+            for decision, count in before.items()
+        },
+        absent=[action for action in ACTIONS if action not in before],
+    )
+
+
+def _effective(counts: Mapping[str, int]) -> float:
+    """Give the effective number of kinds, the exponential of Shannon's entropy (Hill 1973, order 1)."""
+    total = sum(counts.values())
+    nats = -sum(count / total * math.log(count / total) for count in counts.values())
+    return round(math.exp(nats), 2)

@@ -1,0 +1,81 @@
+"""distill/balance.py: which training windows stay."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly.products.captions import ACTIONS
+from distill.balance import Ranks, cost_of
+
+
+def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
+    """Name as many windows of each decision: (decision, sample_id)."""
+    return [(decision, f"{decision}_{i}") for decision, count in counts.items() for i in range(count)]
+
+
+def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tuple[str, str]]:
+    ranks = Ranks(seed)
+    for i, (decision, name) in enumerate(windows):
+        ranks.add(f"group_{i % 3}", decision, name)
+    cut = ranks.cut(ranks.groups, ratio)
+    return [(decision, name) for decision, name in windows if cut.keeps(decision, name)]
+
+
+@given(
+    counts=st.dictionaries(st.sampled_from(ACTIONS), st.integers(1, 60), min_size=1),
+    ratio=st.sampled_from([0.01, 0.3, 1.0, 1.7, 20.0]),
+    seed=st.integers(0, 3),
+)
+def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, ratio, seed):
+    windows = windows_of(counts)
+    found = kept(windows, ratio, seed)
+    most = max(1, int(ratio * len(windows) / len(counts)))
+    assert Counter(decision for decision, _ in found) == {name: min(count, most) for name, count in counts.items()}
+    assert set(kept(windows[::-1], ratio, seed)) == set(found)
+
+
+def test_what_goes_is_drawn_by_seed_and_not_by_place():
+    windows = windows_of({"track_straight": 100, "hover": 20})
+    first, second = kept(windows, 1.0), kept(windows, 1.0, seed=1)
+    assert first == kept(windows, 1.0)
+    assert set(first) != set(second)
+    assert first != windows[:60] + windows[100:]
+
+
+def test_who_stays_at_a_low_bound_stays_at_a_higher_one():
+    windows = windows_of({"track_straight": 100, "hover": 20})
+    assert set(kept(windows, 0.2)) < set(kept(windows, 0.9))
+
+
+def test_stray_decisions_do_not_take_the_others_with_them():
+    counts = {"track_straight": 600, "yaw_left_to_follow": 390, "hover": 4, "slow_down": 3, "ascend": 2, "descend": 1}
+    assert len(kept(windows_of(counts), 1.0)) == 166 + 166 + 10
+
+
+def test_only_the_groups_that_are_asked_for_count():
+    ranks = Ranks(0)
+    for decision, name in windows_of({"track_straight": 4, "hover": 4}):
+        ranks.add("train_1" if decision == "hover" else "val_1", decision, name)
+    assert ranks.cut(["train_1"], 1.0).windows == {"hover": 4}
+
+
+def test_the_cost_by_hand():
+    ranks = Ranks(0)
+    for decision, name in windows_of({"track_straight": 8, "hover": 2, "slow_down": 2}):
+        ranks.add("group", decision, name)
+    cost = cost_of(ranks.cut(["group"], 0.5), {"track_straight": 12})
+    assert (cost.most_windows, cost.windows, cost.windows_left_out, cost.samples_left_out) == (2, 12, 6, 12)
+    assert cost.effective_decisions.before == pytest.approx(2.38, abs=0.01)  # 1.5 ** (2 / 3) * 6 ** (1 / 3)
+    assert cost.effective_decisions.after == 3.0  # three of one size
+    straight, hover = cost.decisions["track_straight"], cost.decisions["hover"]
+    assert (straight.windows, straight.windows_left_out, straight.samples_left_out) == (8, 6, 12)
+    assert (straight.share.before, straight.share.after) == (0.6667, 0.3333)
+    assert (hover.windows_left_out, hover.samples_left_out, hover.share.before) == (0, 0, 0.1667)
+    assert set(cost.absent) == set(ACTIONS) - {"track_straight", "hover", "slow_down"}
+    assert "track_straight 8 -> 2 (66.7% -> 33.3%); whole: hover 2, slow_down 2; absent: yaw_left_to_follow" in str(
+        cost
+    )
