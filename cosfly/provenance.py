@@ -133,17 +133,25 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         inputs: name -> file or folder; of several runs with a number in front, as `2.data`.
         audited: names of inputs whose files the stage itself compares with their records, one by one.
     Raises:
-        InputError: an input is missing.
+        InputError: an input is missing, or its name is not UTF-8 text.
         VerifyError: one was changed since its stage finished it, its stage is not finished, or it was made of another one than
             that which is given with it.
     """
     for name, path in inputs.items():
+        _check_name(path)
         if name not in audited:
             _check_finished(path)
     found = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
     for name, path in inputs.items():
         _check_belongs(name, path, inputs, found)
     return found
+
+
+def _check_name(path: Path) -> None:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError("a name that is not UTF-8 text cannot be put on record", where=path, fix="rename it") from None
 
 
 def _stage_folder(path: Path) -> Path | None:
@@ -255,7 +263,8 @@ def was_made_of(product: Path, name: str) -> str | None:
 def _lineage(path: Path, digest: str) -> set[str]:
     """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
     begun = _record_of(path)
-    return {digest} if begun is None or begun.stage != CONVERSION else {digest, begun.inputs[CONVERTED].sha256}
+    older = begun.inputs.get(CONVERTED) if begun is not None and begun.stage == CONVERSION else None
+    return {digest} if older is None else {digest, older.sha256}
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------

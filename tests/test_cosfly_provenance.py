@@ -1,13 +1,15 @@
 """Products against the records of who made them: what is noticed when a stage begins, and what when all is read."""
 
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 
 from cosfly import provenance
 from cosfly.config import Config
-from cosfly.errors import VerifyError
+from cosfly.errors import InputError, VerifyError
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.stage_folder import StageFolder, Tally
@@ -142,6 +144,21 @@ def test_a_stage_without_its_records_is_not_finished(run, name):
     alone.parent.mkdir()
     shutil.copy(run / "caption/captions.jsonl", alone)
     provenance.checked_inputs(inputs_of(run) | {"captions": alone})
+
+
+def test_a_forged_record_of_a_conversion_of_nothing(run):
+    record = read_json(run / "render/stage.json")
+    write_json(run / "render/stage.json", record | {"stage": "convert-tree", "inputs": {}})
+    provenance.checked_inputs({"data": run / "render", "captions": run / "caption/captions.jsonl"})
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other file systems have no such names")
+def test_a_name_that_no_record_can_hold(tmp_path):
+    path = tmp_path / os.fsdecode(b"bad\xff.json")
+    write_json(path, [])
+    with pytest.raises(InputError, match=r"bad\\udcff.json: a name that is not UTF-8 text"):
+        begin(tmp_path / "out", "simplify", map=path)
+    assert not (tmp_path / "out").exists()
 
 
 def test_records_of_others_are_not_ours(tmp_path, caplog):
