@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
+from caption.teachers.teacher import EMBEDDED
 from cosfly.bench.faults import Faults, planted
 from cosfly.bench.picture import draw_events
 from cosfly.errors import ConfigError, EnvironmentMissing, ResumeError
@@ -85,12 +86,20 @@ def run(
     Args:
         faults: kind of SIGNALS -> how often.
     Raises:
-        ConfigError: the stage has no items. ResumeError: `out` holds something.
+        ConfigError: the stage has no items, or a server does them. ResumeError: `out` holds something.
     """
     if stage not in STAGES:
         raise ConfigError("not a stage that can be measured", where="--stage", got=stage, expected=", ".join(STAGES))
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the folder is not empty", where=out, fix="choose another --out")
+    if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url is not None):
+        raise ConfigError(
+            "captions that a server writes are no work of workers",
+            where="caption.teacher",
+            got=cfg.caption.teacher,
+            expected="an embedded teacher, and no judge",
+            fix="--set caption.teacher=rules",
+        )
     counts = sorted(set(workers))
     bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=[])
     digests: dict[str, str] = {}
