@@ -12,6 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from shapely.geometry import Polygon
 
@@ -281,6 +283,17 @@ def test_a_gzip_bomb_is_refused_while_it_unpacks(tmp_path, limited):
     limited(unpack_factor=1_000, file_mb=60)
     with pytest.raises(InputError, match=r"reading\.file_mb"):
         files.read_unpacked(path)
+
+
+def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, limited):
+    path = tmp_path / "shard.parquet"
+    pq.write_table(pa.table({"name": ["x"] * 10_000}), path)
+    assert path.stat().st_size < 10_000
+    limited(file_mb=9)
+    with pytest.raises(InputError, match=r"row group 0: .*reading\.file_mb; got 10 MB"):
+        next(tables.rows_of(path))
+    limited(file_mb=10)
+    assert len(list(tables.rows_of(path))) == 10_000
 
 
 # --- pictures and arrays ----------------------------------------------------------------------------------------------

@@ -16,6 +16,8 @@ from cosfly.reading.limits import MB, limits, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
 
+LEAST_ROW_BYTES = 1_000  # of a row in memory, as values of Python: packed, a million equal ones are a few kB
+
 
 @contextlib.contextmanager
 def arrow_errors(path: Path) -> Iterator[None]:
@@ -54,7 +56,8 @@ def row_groups(path: Path, columns: list[str] | None = None, *, tree: Path | Non
     """Yield the row groups of a parquet file, in memory one at a time; raises as `open_table`, and for one over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
-            size = table.metadata.row_group(k).total_byte_size
+            about = table.metadata.row_group(k)
+            size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
             if size > limits().file_mb * MB:
                 raise over_limit("file_mb", f"{path}: row group {k}", f"{size / MB:,.0f} MB", " MB")
             with arrow_errors(path):
