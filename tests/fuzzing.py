@@ -199,7 +199,7 @@ def _change(group: Any, key: Any, rng: Random, places: list, plain: Callable[[An
         group[key] = json.loads(json.dumps(other[k]))
     elif way == 3 and isinstance(old, list):
         group[key] = old * rng.choice((0, 2, 300)) if len(old) < 1000 else old[: rng.randrange(len(old))]
-    elif way == 4 and isinstance(old, int | float):
+    elif way == 4 and isinstance(old, int | float) and abs(old) < 1e300:
         group[key] = rng.choice((-old, old + 1, old - 1, old * 1e6, old * 1e-6, old * 1e300, str(old), [old], not old))
     elif way == 5 and isinstance(old, str):
         group[key] = (
