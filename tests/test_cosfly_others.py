@@ -12,7 +12,8 @@ from cosfly.chance import rng_for
 from cosfly.config import build
 from cosfly.errors import ConfigError, InputError
 from cosfly.pedestrians.lanes import lanes_of
-from cosfly.pedestrians.others import CAR_FORWARD_MPS2, braked, company_of
+from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Course, and_back, braked, company_of
+from cosfly.pedestrians.paces import PACES, speeds_at, take_pace
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
@@ -47,6 +48,23 @@ def going(kind: str, start, end, n: int = 2) -> Other:
     start, end = np.array([*start, 0.0]), np.array([*end, 0.0])
     places = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
     return Other(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
+
+
+@pytest.mark.parametrize("name", PACES)
+@pytest.mark.parametrize("num_waypoints", [2, 3, 6, 120])
+def test_who_walks_there_and_back_gets_on_between_any_two_stops(name, num_waypoints):
+    """A stop of the pace may be the waypoint before the end, where one stands before walking back."""
+    line, cfg = np.column_stack([0.5 * np.arange(num_waypoints), np.zeros(num_waypoints)]), PedestriansConfig()
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        way = take_pace(line, PACES[name], rng)
+        course = Course(PERSON, way, speeds_at(way, PACES[name], cfg, rng))
+        for _ in range(3):
+            course = and_back(course)
+            along_m = course.along_m(np.linspace(0.0, 3000.0, 50))
+            assert along_m[-1] == pytest.approx(course.way.along_m[-1])
+            end = len(course.way.stops_s) // 2
+            assert course.way.stops_s[end - 1 : end + 1].sum() >= 1.0  # seconds
 
 
 # --- the product ------------------------------------------------------------------------------------------------------

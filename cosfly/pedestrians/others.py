@@ -130,15 +130,17 @@ def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng:
     speeds_mps = speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED)
     course = Course("Pedestrians", way, speeds_mps)
     while course.along_m(walk.time_s[-1:])[0] >= course.way.along_m[-1]:
-        course = _and_back(course)
+        course = and_back(course)
     return course
 
 
-def _and_back(course: Course) -> Course:
-    """The same, and back to its start after a stop."""
+def and_back(course: Course) -> Course:
+    """The same, and back to its start after a stop: at its end, or where it stops just before."""
     way = course.way
     stops_s = np.concatenate([way.stops_s, way.stops_s[-2::-1]])
-    stops_s[len(way.stops_s) - 1] = TURN_S
+    end = len(way.stops_s) - 1
+    if not stops_s[max(0, end - STOP_GAP_MIN + 1) : end].any():  # between two stops side by side nobody gets on
+        stops_s[end] = TURN_S
     back = Way(np.concatenate([way.polyline_m, way.polyline_m[-2::-1]]), stops_s)
     return replace(course, way=back, limits_mps=np.concatenate([course.limits_mps, course.limits_mps[-2::-1]]))
 
