@@ -100,7 +100,8 @@ class RunConfig(Config):
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {
             "name": name, "seed": int(rng_for(self.seed, "run", name).integers(2**31)),
         }  # fmt: skip
-        return build(RunConfig, _merged(self, shared, changes) | {"maps": maps}, f"towns.{name}")
+        others = {setting: value for setting, value in changes.items() if setting != "maps"}
+        return build(RunConfig, _merged(self, shared, others) | {"maps": maps}, f"towns.{name}")
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:

@@ -439,7 +439,7 @@ def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
 
 @pytest.mark.parametrize(("muco_settings", "dropped"), [({}, None), ({"iterations_max": 2}, "not_converged")])
 def test_a_flight_whose_optimizer_was_stopped_is_dropped(inputs, tmp_path, muco_settings, dropped):
-    cfg = PlanConfig(muco=MucoConfig(**muco_settings))
+    cfg = PlanConfig(planner="muco", muco=MucoConfig(**muco_settings))
     with contextlib.suppress(NothingKept):
         planners.run(cfg, *inputs, tmp_path / "plan")
     traces = read_traces(tmp_path / "plan/drone_trace.json")

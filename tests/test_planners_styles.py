@@ -171,11 +171,13 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
     instead = plan_flight(STRAIGHT, OPEN, styled(REACQUIRE, styles_fallback="follow"), 0)
     assert (instead.drop_reason, instead.instead_of) == (None, "reacquire: no_hiding_place")
     np.testing.assert_array_equal(instead.positions_m, plan_flight(STRAIGHT, OPEN, PlanConfig(), 0).positions_m)
-    # Towers all along leave an orbit no room.
+    # Towers all along leave an orbit no room; a planner that searches may hold it from above them.
     towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
     walled = kernels.obstacle_index(town_of(*towers))
-    assert plan_flight(STRAIGHT, walled, styled("orbit_left"), 0).drop_reason in ("style_not_held", "low_visibility")
-    assert plan_flight(STRAIGHT, walled, styled("orbit_left", styles_fallback="follow"), 0).drop_reason is None
+    by_muco = plan_flight(STRAIGHT, walled, styled("orbit_left", planner="muco"), 0)
+    assert by_muco.drop_reason in ("style_not_held", "low_visibility")
+    fallback = styled("orbit_left", planner="muco", styles_fallback="follow")
+    assert plan_flight(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
 def test_the_manifest_counts_styles_and_what_was_not_held(tmp_path):

@@ -153,7 +153,7 @@ class PlanConfig(Config):
     """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walker."""
 
     formerly: ClassVar = {"visibility_min": "did you mean 'five_ray_mean_min'?"}
-    planner: str = Field("muco", description="which planner flies: a name in PLANNERS")
+    planner: str = Field("foresight", description="which planner flies: a name in PLANNERS")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(
         RELAXED_SAFETY_M, gt=0, description="distance that must be kept where the nominal one cannot, m"
