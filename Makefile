@@ -9,7 +9,7 @@ TOOLS := $(VENV)-tools
 PINNED := docs/container/requirements.txt
 RUN ?= runs/quickstart
 SLOW ?=
-FUZZ_INPUTS ?= 100000
+FUZZ_INPUTS ?= 150000
 FUZZ_SEED ?= 1
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 

@@ -14,7 +14,7 @@ from cosfly.products.town import TownMap
 from cosfly.reading.documents import read_model
 from cosfly.store import write_model
 
-RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "1.0"
+RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "2.0"
 
 Counts = dict[str, int]
 
