@@ -276,4 +276,18 @@ CASES = [
     Case("zh", FOLLOW, R, "速度 3.4 米/秒，较 t1 的 2.0 米/秒升了约 70%。", (("70%", "30%"),)),
     Case("zh", FOLLOW, R, "行人偏到右边（离中心 52 像素）。", (("右", "左"),)),
     Case("zh", FOLLOW, R, "机头逐帧右转 2.0、2.5、2.5、2.6 度。", (("右", "左"),)),
+    # What only looks like another's number, side, sight or plea.
+    Case("en", FOLLOW, R, "Own speed 3.4 m/s, roughly 2.4 times the tango's.", (("2.4", "5.4"),)),
+    Case("en", FOLLOW, R, "He is 19.7 m away on the ground, 27.7 m in a straight line.", (("19.7", "24.1"), ("27.7", "33.7"))),
+    Case("en", FOLLOW, R, "Closing from 20.8 m at t2 to 19.7 m now took a second, i.e. 1.1 m/s.", (("19.7", "24.1"),), (("1.1", "1.3"),)),
+    Case("en", ORBIT, "circle_right", "The box sits in the middle of the picture from left to right.", ()),
+    Case("en", FOLLOW, R, "The drone is the faster of the two, the walker keeps up a steady 1.4 m/s.", (("faster", "slower"),)),
+    Case("en", FOLLOW, R, "The box is wider than at the start (20 px then, 23 px now).", (("23", "91"),)),
+    Case("en", FOLLOW, R, "Hence waiting here is the wrong answer, the drone should yaw right.", (("yaw right", "yaw left"),)),
+    Case("en", FOLLOW, "ascend", "Hence a climb would be reasonable, and descending is not.", (("a climb would be reasonable, and descending is not", "the drone should descend"),)),
+    Case("en", FOLLOW, "ascend", "Hence climb. Turning left while the body slides right is what a circle looks like.", (("Hence climb", "Hence descend"),)),
+    Case("zh", ORBIT, "circle_right", "人在中间，看不到障碍。", (("看不到障碍", "当前帧行人被完全遮挡"),)),
+    Case("zh", FOLLOW, R, "斜距在最后半秒里增加了十分之一米。", (("增加", "减少"),)),
+    Case("zh", FOLLOW, R, "水平距离缩短到 19.7 米，所以他看着变大了。", (("19.7", "24.1"), ("缩短", "拉开"))),
+    Case("zh", FOLLOW, R, "框宽 23 像素，比 t0 的 20 像素宽了七分之一左右。", (("七分之一", "一半"),)),
 ]  # fmt: skip

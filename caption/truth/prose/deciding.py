@@ -23,7 +23,7 @@ _AGREE = {
 _REFUSED = {
     "en": re.compile(
         r"\bnot (?:be |yet |really |at all )?(?:needed|necessary|warranted|required|called|advisable|justified|worth|recommended|helpful|useful)"
-        r"|n't (?:be )?(?:needed|necessary|warranted|required|help)|not (?:a|an|the) (?:problem|concern|issue|priority|option|matter)|no (?:problem|concern|issue|need)|unnecessary|pointless|useless|superfluous|premature|no sense|little sense|uncalled|optional|merely|only unsettle|by itself|would (?:not|only|break|lose|cost|merely)|(?:brings?|gains?|adds?|buys?|solves?|achieves?|does|changes) (?:us )?(?:nothing|little)|no use|little use|plays? (?:little|no) part|can (?:wait|end|stop)|has (?:done|ended)|is over|isn't the (?:answer|issue|problem)|is not the (?:answer|cure)"
+        r"|n't (?:be )?(?:needed|necessary|warranted|required|help)|not (?:a|an|the) (?:problem|concern|issue|priority|option|matter)|no (?:problem|concern|issue|need)|unnecessary|pointless|useless|superfluous|premature|no sense|little sense|uncalled|optional|merely|only unsettle|by itself|would (?:not|only|break|lose|cost|merely)|(?:brings?|gains?|adds?|buys?|solves?|achieves?|does|changes) (?:us )?(?:nothing|little)|no use|little use|plays? (?:little|no) part|can (?:wait|end|stop)|has (?:done|ended)|is over|isn't the (?:answer|issue|problem)|is not the (?:answer|cure)|\bwrong (?:answer|move|choice|thing|idea)|\b(?:is|are|was|does|do) not\s*[.;]?\s*$"
     ),
     "zh": re.compile(
         r"(?:没有|并无|毫无)(?:必要|意义|需要)|不(?:是问题|成问题|构成问题|必要|需要|值得|合适|可取)|为时过早|多余|过头|可有可无|无济于事|本身|并不能|浪费|已有|照常|作用很小|作用不大|没用|无用|无益|没有用|用处|没有帮助|帮不上|可以结束|到此为止|制造误差|暂不"

@@ -85,7 +85,7 @@ _KEEPS = re.compile(rf"\s?(?:{_KEPT})")
 def _pattern(language: Language) -> re.Pattern[str]:
     lexicon = load_lexicon(language)
     word = (
-        rf"(?:百分之)?{CHINESE_NUMBER}半?|半"
+        rf"(?:{CHINESE_NUMBER}分之)?{CHINESE_NUMBER}半?|半"
         if language == "zh"
         else rf"(?<![a-z])(?:{ENGLISH_NUMBER}(?: and a half)?|half an?)(?![a-z])"
     )
@@ -199,13 +199,13 @@ _BRACKET = re.compile(r"[(\[]\s*(?:in |单位:?\s*)?([^()\[\]#]{1,12})\s*[)\]]")
 
 
 def _in_words(numeral: Numeral, words: str, language: Language) -> Numeral:
-    """Read "twenty-one and a half", 一点二, 一米半's 一, 百分之十."""
+    """Read "twenty-one and a half", 一点二, 一米半's 一, 百分之十, 十分之三."""
     if language == "en":
         whole, _, _ = words.partition(" and a half")
         value = 0.5 if whole.startswith("half a") and "dozen" not in whole else english_number(whole)
         return replace(numeral, value=value + (0.5 if words != whole else 0.0))
-    whole = words.removeprefix("百分之")
+    parts, _, whole = words.rpartition("分之")
     value = chinese_number(whole.removesuffix("半")) + (0.5 if whole.endswith("半") else 0.0)
-    return (
-        replace(numeral, value=value) if whole == words else replace(numeral, value=value, unit="percent", factor=1.0)
-    )
+    if parts == "百":
+        return replace(numeral, value=value, unit="percent", factor=1.0)
+    return replace(numeral, value=value / ((chinese_number(parts) if parts else 0.0) or 1.0))

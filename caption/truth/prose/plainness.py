@@ -56,6 +56,8 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
             )
             if found.names == ("altitude",) and not _is_of_drone(text[clause.start : token.start], clause):
                 return False
+            if not clause.has("quantity") and _LOOKS[language].search(part):
+                return False  # "he looks smaller": his image, not what was spoken of before
             return all(sentence.numerals[i].unit in allowed for i in clause.numerals)
         case "side":
             return _is_side(found, token, part, sentence, clause)
@@ -81,6 +83,7 @@ def _is_told(part: str, clause: Clause, language: str) -> bool:
     return (has_subject or re.search(r"\bit\b", part) is not None) and bool(_TURNS.search(part))
 
 
+_LOOKS = {"en": re.compile(r"\b(?:looks?|looking|appears?|appearing)\b"), "zh": re.compile(r"看着|看上去|看起来|显得")}
 _ADVERBS = re.compile(
     r"(?:[\s,]|and|it|is|has|been|still|now|steadily|slowly|again|then|正|在|仍|还|已|也|又|继续|不断|持续|缓缓|逐渐|一直|一路|略|稍|微|有所|随后|先|最后|末|步|半秒|\d|strong|steep|rapid|quick|slow|gentle|marked|slight|clear|sharp|the|a|却|并|且|但|急速|快速|强烈|缓慢|明显|大幅|迅速|稳步|平缓|轻微|[一二两三四五]|帧|秒|里|内|都|间)*"
 )

@@ -66,15 +66,18 @@ def _is_plan(masked: str, clause: Clause, is_reasoning: bool, any_plan: bool) ->
     if clause.has("modality", "plan"):
         return True
     if clause.has("modality", "thus") and (clause.has("action") or not has_owner):
-        return not _UNDER_WAY.search(masked, clause.start, clause.end)
+        is_told = not is_reasoning and _SO_DOING.search(masked, clause.start, clause.end)
+        return not (is_told or _UNDER_WAY.search(masked, clause.start, clause.end))
     if any_plan and not has_owner and not clause.numerals:
         return True
     return is_reasoning and not clause.numerals and _opens_with_action(masked, clause, has_owner)
 
 
 _UNDER_WAY = re.compile(
-    r"\b(?:is|are) (?:\w+ )?(?!being)\w+ing\b|正在?[^,]{0,4}(?:转|摆)"
+    r"\b(?:is|are) (?:(?:\w+ )?(?!being)\w+ing\b|(?:well|already) )|正在?[^,]{0,4}(?:转|摆)"
 )  # "so the nose is coming back"
+_SO_DOING = re.compile(r"\b(?:so|thus|hence) \w+ing\b")  # among the components: "4.0 m/s, 5.0 m/s at t1, so slowing"
+_IS_WHAT = re.compile(r"\b(?:is|was) (?:what|how|why)\b")  # "turning while sliding is what a circle looks like"
 _BEFORE_ACTION = re.compile(
     r"(?:so|then|hence|now|and|just|simply|[-:.])*\s*(?:an?|another|some|more)?\s*(?:(?:gentle|slight|further|small|moderate|continued|continuing"
     r"|left|right|leftward|rightward|clockwise|counterclockwise|anticlockwise|short|slow|quick|gradual|mild|soft|careful|little|bit|modest|firm|brief|tight|wide|level|steady|smooth) ?)*"
@@ -85,7 +88,9 @@ _BEFORE_ACTION = re.compile(
 def _opens_with_action(masked: str, clause: Clause, has_owner: bool) -> bool:
     """Tell whether a clause opens with what to do: "yaw right", "a gentle left turn", "rotating the nose left"."""
     token = next((t for t in clause.tokens if t.kind == "action"), None)
-    if token is None or masked[token.start : token.end] in ("nose", "机头", "rotation"):
+    if token is None or masked[token.start : token.end] in ("nose", "机头", "rotation", "heading change"):
+        return False
+    if _IS_WHAT.search(masked, token.end):
         return False
     if re.match(r"\s+(?:is|are|was|has|had|rate|of|works|helps|continues)\b", masked[token.end :]):
         return False

@@ -140,11 +140,30 @@ class _Multiple:
         return bool(is_more or self.trends or _LOSS.search(self.part))
 
 
-_LESS = frozenset(["slower", "less", "smaller", "below", "lower", "under", "down", "慢", "低", "少", "小", "短"])
-_MORE = frozenset(
-    ["faster", "quicker", "more", "bigger", "larger", "above", "higher", "over", "up", "快", "高", "多", "大", "长"]
+_LESS = frozenset(
+    ["slower", "less", "smaller", "below", "lower", "under", "down", "慢", "低", "少", "小", "短", "矮", "窄", "近"]
 )
-_ZH_MORE_BY = re.compile(r"(?:快|慢|高|低|多|少|大|小|长|短)(?:了|出)?(?:约|大约|近|将近|差不多)?\s*$")
+_MORE = frozenset(
+    [
+        "faster",
+        "quicker",
+        "more",
+        "bigger",
+        "larger",
+        "above",
+        "higher",
+        "over",
+        "up",
+        "快",
+        "高",
+        "多",
+        "大",
+        "长",
+        "宽",
+        "远",
+    ]
+)
+_ZH_MORE_BY = re.compile(r"(?:快|慢|高|低|多|少|大|小|长|短|矮|宽|窄|远|近)(?:了|出)?(?:约|大约|近|将近|差不多)?\s*$")
 _LOSS = re.compile(r"\b(?:drop|loss|gain|growth|rise|increase|decrease|reduction|deficit|cut|down|up)\b|幅")
 # Between a number and the multiple that is told of it: "2.4 m/s 的三倍", "from 1.19 to 0.49 m/s (59 % less)".
 _DIVISOR = re.compile(r"\s*\)?的\s*(?:约|大约|近)?\s*")

@@ -86,7 +86,7 @@ class Sureness:
         """Give the series of which a number surely is. told: those of the word for its change."""
         if self.is_in_group(numeral) or (numeral.unit == "mps" and self._may_differ(numeral)):
             return ()
-        if _MISSING.search(self.text, self.clause.start, self.clause.end):
+        if _MISSING.search(self.text, self.clause.start, self.clause.end) or self._is_apart(numeral):
             return ()
         if numeral.unit == "px" and self.language == "en" and (beside := _OFF_TO.match(self.text, numeral.end)):
             return ("offset_x",) if beside["x"] else ("offset_y",)
@@ -103,6 +103,11 @@ class Sureness:
         if len(found) > 1 and numeral.unit == "px":
             found.discard(("box_width", "box_height"))  # "box height", "框子高"
         return found.pop() if len(found) == 1 else () if cues else told
+
+    def _is_apart(self, numeral: Numeral) -> bool:
+        """Tell whether a number is of something else than the clauses before: worked out from them, or along another line."""
+        derived = _DERIVED[self.language].search(self.text, max(0, self.clause.start - 6), numeral.start)
+        return derived is not None or (numeral.unit == "m" and _ALONG.match(self.text, numeral.end) is not None)
 
     def _speeds(self, numeral: Numeral) -> tuple[str, ...]:
         if self._closes():
@@ -298,6 +303,8 @@ class Sureness:
         return self._follows_trend(numeral)
 
 
+_DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|\bthat is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
+_ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")
 _REACHED = re.compile(r"[到至]了[约近]?\s*$")
 _CHANGES_BY = {
     "en": re.compile(r"\s*(?:by|of|another|a further|about|roughly|some|almost|nearly|just|only|exactly|a mere|\s)*"),
