@@ -303,7 +303,7 @@ class Sureness:
         return self._follows_trend(numeral)
 
 
-_DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|\bthat is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
+_DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|[,;(]\s*that is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
 _ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")
 _REACHED = re.compile(r"[到至]了[约近]?\s*$")
 _CHANGES_BY = {
