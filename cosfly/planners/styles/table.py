@@ -42,10 +42,10 @@ class Style:
 # Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would have to fly faster
 # round a bend than it can.
 TABLE: dict[str, Style] = {
-    "orbit_left": Style(("circle_left",), (8.0, 26.0), (8.0, 40.0), round_mps=(-6.0, -4.0)),
-    "orbit_right": Style(("circle_right",), (8.0, 26.0), (8.0, 40.0), round_mps=(4.0, 6.0)),
-    "side": Style(("strafe_left", "strafe_right"), (8.0, 24.0), (8.0, 18.0), (75.0, 105.0), either_side=True),
-    "lead": Style(("move_backward",), (12.0, 35.0), (8.0, 25.0), (-25.0, 25.0)),
+    "orbit_left": Style(("circle_left",), (8.0, 20.0), (8.0, 24.0), round_mps=(-6.0, -4.0)),
+    "orbit_right": Style(("circle_right",), (8.0, 20.0), (8.0, 24.0), round_mps=(4.0, 6.0)),
+    "side": Style(("strafe_left", "strafe_right"), (8.0, 14.0), (8.0, 11.0), (75.0, 105.0), either_side=True),
+    "lead": Style(("move_backward",), (30.0, 48.0), (10.0, 32.0), (-25.0, 25.0)),
     "approach": Style(
         ("move_forward",), (40.0, 52.0), (15.0, 28.0), (150.0, 210.0),
         ground_distance_end_m=(8.0, 12.0), altitude_end_m=(8.0, 12.0),
@@ -54,13 +54,13 @@ TABLE: dict[str, Style] = {
         ("move_backward",), (8.0, 12.0), (8.0, 12.0), (-50.0, 50.0),
         ground_distance_end_m=(40.0, 52.0), altitude_end_m=(15.0, 28.0),
     ),
-    "rise": Style(("ascend",), (10.0, 22.0), (8.0, 14.0), (135.0, 225.0), altitude_end_m=(46.0, 55.0)),
-    "sink": Style(("descend",), (10.0, 22.0), (46.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
+    "rise": Style(("ascend",), (10.0, 22.0), (8.0, 14.0), (135.0, 225.0), altitude_end_m=(50.0, 55.0)),
+    "sink": Style(("descend",), (10.0, 22.0), (50.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
     "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
     "stop_and_go": Style(
-        ("speed_up", "slow_down", "hover"), (12.0, 24.0), (8.0, 16.0), (178.0, 182.0), hop_s=(5.0, 6.5), pace_mps=(2.5, 3.5)
+        ("speed_up", "slow_down", "hover"), (12.0, 24.0), (8.0, 13.0), (178.0, 182.0), hop_s=(5.0, 6.5), pace_mps=(2.5, 3.5)
     ),
-    "top": Style(("track_straight",), (4.0, 8.0), (22.0, 58.0), (150.0, 210.0)),
+    "top": Style(("track_straight",), (4.0, 8.0), (44.0, 59.0), (150.0, 210.0)),
 }  # fmt: skip
 
 # Places from which a walker is lost behind a house or a tree; what the drone does then stands in reacquire.py.
