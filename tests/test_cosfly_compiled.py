@@ -69,7 +69,7 @@ def test_what_is_compiled_ahead_is_found_by_the_planner(tmp_path, monkeypatch):
     with ahead.compiled_ahead("muco") as wait:
         wait()
     assert (tmp_path / ahead._mark("muco")).exists()
-    code = "import cosfly.planners.stage as s\ns.warm_up(s.PlanConfig())\nfrom cosfly.planners.muco.step import descend as d\nprint(len(d.stats.cache_hits), len(d.stats.cache_misses))"
+    code = "import cosfly.planners.stage as s\ns.warm_up(s.PlanConfig(planner='muco'))\nfrom cosfly.planners.muco.step import descend as d\nprint(len(d.stats.cache_hits), len(d.stats.cache_misses))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1", "0"]
     monkeypatch.setattr(ahead.subprocess, "Popen", None)

@@ -387,9 +387,8 @@ def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace)
 
 def test_a_mended_clean_flight_mends_the_record_of_its_perturbed_one(workplace):
     whole = (trajectory := first_flight(workplace) / "trajectory.json").read_bytes()
-    write_json(
-        workplace / "tree/manifest.json", {"outputs": []}
-    )  # as a stage of ours leaves it, so that a mended file is no other input
+    # As a stage of ours leaves it, so that a mended file is no other input.
+    write_json(workplace / "tree/manifest.json", {"schema": "cosfly.manifest", "schema_version": "1.0", "outputs": []})
     expected = inspect(workplace, out="never broken")
     trajectory.write_bytes(whole[: len(whole) // 2])
     assert [f.result for f in inspect(workplace).flights].count("rejected") == 2

@@ -171,10 +171,10 @@ def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkey
 def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeypatch):
     real = compare.plan_flight
 
-    def lame(walk, obstacles, cfg, seed):
+    def lame(walk, obstacles, cfg, *rest):
         if walk.path_id == "b" and cfg.planner == "muco":
             raise NoPathError("lame", where="b")
-        return real(walk, obstacles, cfg, seed)
+        return real(walk, obstacles, cfg, *rest)
 
     monkeypatch.setattr(compare, "plan_flight", lame)
     record = json.loads(compare.run(CFG, *inputs, tmp_path / "out").read_text())
