@@ -44,7 +44,7 @@ class Style:
 TABLE: dict[str, Style] = {
     "orbit_left": Style(("circle_left",), (8.0, 20.0), (8.0, 24.0), round_mps=(-6.0, -4.0)),
     "orbit_right": Style(("circle_right",), (8.0, 20.0), (8.0, 24.0), round_mps=(4.0, 6.0)),
-    "side": Style(("strafe_left", "strafe_right"), (8.0, 14.0), (8.0, 11.0), (75.0, 105.0), either_side=True),
+    "side": Style(("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 9.5), (75.0, 105.0), either_side=True),
     "lead": Style(("move_backward",), (30.0, 48.0), (10.0, 32.0), (-25.0, 25.0)),
     "approach": Style(
         ("move_forward",), (40.0, 52.0), (15.0, 28.0), (150.0, 210.0),
