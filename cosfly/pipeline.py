@@ -23,7 +23,7 @@ import cosfly.pedestrians.stage
 import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
-import release.package
+import release.package.stage
 from cosfly.errors import InputError
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
@@ -34,7 +34,7 @@ from cosfly.reading.limits import use_limits
 from cosfly.settings import RunConfig, manner_of_work
 from cosfly.stage_folder import Manifest, Resume, read_manifest
 from cosfly.store import refuse_link, write_bytes, write_json
-from release.sources import Source, choose_licence
+from release.package.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,9 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
 
 
 def _release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
-    work = partial(release.package.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg))
+    work = partial(
+        release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg)
+    )
     return Stage("release", out / "release/dataset", work)
 
 

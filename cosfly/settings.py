@@ -21,11 +21,11 @@ from cosfly.reading.limits import Limits
 from cosfly.render.stage import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worker_pool import Watch
-from distill.dataset import PrepareConfig
-from distill.evaluate import EvaluateConfig
-from distill.infer import InferConfig
-from distill.train import TrainConfig
-from release.package import ReleaseConfig
+from distill.evaluation.stage import EvaluateConfig
+from distill.inference.stage import InferConfig
+from distill.prepare.stage import PrepareConfig
+from distill.training.stage import TrainConfig
+from release.package.stage import ReleaseConfig
 
 TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 

@@ -69,13 +69,16 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.stage_events import EventLog, read_events
 from cosfly.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.store import CHECKSUMS, write_checksums, write_json
-from distill import checkpoint, dataset, evaluate, student
-from distill.infer import make_prediction
+from distill.evaluation import stage as evaluate
+from distill.inference.stage import make_prediction
+from distill.prepare import stage as dataset
 from distill.schema import read_split
-from release import package
+from distill.student import checkpoint
+from distill.student import model as student
+from release.package import stage as package
+from release.package.sources import Source
 from release.record import read_record
-from release.sources import Source
-from release.validate import verify
+from release.verify.verify import verify
 from specimens import make_playback_tree
 
 ANSWER = {

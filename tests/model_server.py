@@ -24,8 +24,8 @@ from llguidance.hf import from_tokenizer
 from PIL import Image
 from transformers import LogitsProcessor, LogitsProcessorList
 
-from distill.encoding import Encoded, prompt_batch
-from distill.student import IMAGE_TOKEN, Student, load_student
+from distill.student.encoding import Encoded, prompt_batch
+from distill.student.model import IMAGE_TOKEN, Student, load_student
 
 MODEL, CONTEXT = "random-qwen3.5", 16_384
 

@@ -107,11 +107,13 @@ def test_what_opengl_draws_with_stays_behind_its_renderer(name):
     assert name.startswith(own) or not [module for module in imports(name) if module.startswith(own)]
 
 
-@pytest.mark.parametrize("step", ["dataset", "train", "infer", "evaluate"])
+@pytest.mark.parametrize("step", ["prepare", "training", "inference", "evaluation"])
 def test_no_step_of_distill_imports_a_step(step):
-    """They meet in distill/schema.py."""
-    steps = {f"distill.{name}" for name in ("dataset", "train", "infer", "evaluate")}
-    assert not imports(f"distill.{step}") & steps
+    """They meet in distill/schema.py, and over a student in distill/student/."""
+    others = tuple(f"distill.{name}" for name in ("prepare", "training", "inference", "evaluation") if name != step)
+    modules = [name for name in SOURCES if name.startswith(f"distill.{step}")]
+    assert modules
+    assert not {found for name in modules for found in imports(name) if found.startswith(others)}
 
 
 def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
@@ -142,9 +144,9 @@ ALLOWED_TO_READ = {
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.chat.protocol", "open"),  # a picture that we made, for its size
     ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
-    ("distill.student", "loads"),  # what the tokenizer's own library gives
-    ("distill.checkpoint", "load"),  # tensors, whose checksums were compared
-    ("distill.checkpoint", "load_file"),
+    ("distill.student.model", "loads"),  # what the tokenizer's own library gives
+    ("distill.student.checkpoint", "load"),  # tensors, whose checksums were compared
+    ("distill.student.checkpoint", "load_file"),
 }
 
 
@@ -181,7 +183,7 @@ def test_the_exceptions_of_the_gate_are_needed():
 
 def test_the_rule_can_fail(monkeypatch, tmp_path):
     bad = tmp_path / "bad.py"
-    bad.write_text("import torch\nimport release.package\n")
+    bad.write_text("import torch\nimport release.package.stage\n")
     monkeypatch.setitem(SOURCES, "cosfly.store", bad)
     with pytest.raises(AssertionError, match=r"cosfly\.store imports"):
         test_imports_point_one_way("cosfly.store")

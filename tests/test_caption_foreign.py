@@ -19,15 +19,16 @@ from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
 from cosfly.products.predictions import Prediction
-from distill import dataset, infer
-from distill.dataset import PrepareConfig, make_sample
-from distill.infer import failed_prediction, make_prediction
+from distill.inference import stage as infer
+from distill.inference.stage import failed_prediction, make_prediction
+from distill.prepare import stage as dataset
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import read_split
-from release import package
-from release.captions import load_captions
+from release.package import stage as package
+from release.package.captions import load_captions
+from release.package.sources import Source
 from release.record import read_record
-from release.sources import Source
-from release.validate import verify
+from release.verify.verify import verify
 from specimens import make_playback_tree
 
 EN = {

@@ -24,9 +24,10 @@ from cosfly.chat.vllm_engine import VllmEngine, read_output
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 from cosfly.products.captions import read_captions
 from cosfly.products.predictions import read_predictions
-from distill import dataset, infer
+from distill.inference import stage as infer
+from distill.prepare import stage as dataset
 from distill.schema import read_split
-from distill.student import MODEL_TYPE
+from distill.student.model import MODEL_TYPE
 from specimens import make_playback_tree
 
 

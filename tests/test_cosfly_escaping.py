@@ -31,7 +31,7 @@ from cosfly.issues import Report
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.inspection import Inspection, read_inspection
 from cosfly.reading.documents import read_json
-from release.card import render_card
+from release.card.render import render_card
 from release.record import ReleaseRecord
 from specimens import make_playback_tree
 
@@ -232,8 +232,8 @@ def test_a_code_span_holds_a_text(text):
 
 
 def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
-    from release.package import ReleaseConfig, run
-    from release.sources import Source
+    from release.package.sources import Source
+    from release.package.stage import ReleaseConfig, run
 
     captions = caption(CaptionConfig(), tree, tmp_path / "caption")
     folder = run(ReleaseConfig(licence="mit"), [Source.of_files(tree, captions, inspection)], tmp_path / "release")

@@ -22,10 +22,10 @@ from cosfly.frame_views import PEDESTRIAN_RGB, VIEW_FILES, Pictures, depth_color
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight
-from distill.dataset import PrepareConfig, make_sample
-from distill.encoding import load_pictures
-from distill.infer import InferConfig, make_request
+from distill.inference.stage import InferConfig, make_request
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
+from distill.student.encoding import load_pictures
 from specimens import PERSON_ID, make_playback_tree
 
 

@@ -34,14 +34,14 @@ from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees
 from cosfly.stage_folder import read_failures
 from cosfly.store import read_checksums, write_checksums, write_json
-from distill import dataset
-from distill.dataset import PrepareConfig
+from distill.prepare import stage as dataset
+from distill.prepare.stage import PrepareConfig
 from distill.schema import SPLITS, read_split
-from release import package
-from release.package import ReleaseConfig
+from release.package import stage as package
+from release.package.sources import Source
+from release.package.stage import ReleaseConfig
 from release.record import read_record
-from release.sources import Source
-from release.validate import verify
+from release.verify.verify import verify
 from specimens import make_playback_tree
 
 # --- the strictest public reader --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""distill/balance.py: which training windows stay."""
+"""distill/prepare/balance.py: which training windows stay."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.products.captions import ACTIONS
-from distill.balance import Ranks, cost_of
+from distill.prepare.balance import Ranks, cost_of
 
 
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:

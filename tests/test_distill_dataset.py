@@ -1,4 +1,4 @@
-"""distill/dataset.py: captions to leak-free splits."""
+"""distill/prepare/stage.py: captions to leak-free splits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from specimens_distill import make_caption, make_captions
 
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
-from distill.dataset import PrepareConfig, assign_splits, check_no_leak, make_sample, run
+from distill.prepare.stage import PrepareConfig, assign_splits, check_no_leak, make_sample, run
 from distill.schema import SPLITS, Sample, read_split, split_path
 from specimens import make_playback_tree
 
@@ -349,6 +349,6 @@ def test_settings_that_leave_nothing_are_refused():
 def test_imports_without_torch():
     code = (
         "import sys; sys.modules['torch'] = sys.modules['transformers'] = sys.modules['peft'] = None\n"
-        "import distill.dataset, distill.train, distill.infer, distill.evaluate"
+        "import distill.prepare.stage, distill.training.stage, distill.inference.stage, distill.evaluation.stage"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

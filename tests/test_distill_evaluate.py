@@ -1,4 +1,4 @@
-"""distill/evaluate.py: numbers that can be checked by hand, and BERTScore on a tiny local encoder."""
+"""distill/evaluation/stage.py: numbers that can be checked by hand, and BERTScore on a tiny local encoder."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from specimens_distill import make_caption
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.predictions import Prediction
 from cosfly.store import dump_json
-from distill.bertscore import others_of, score_texts
-from distill.dataset import PrepareConfig, make_sample
-from distill.evaluate import (
+from distill.evaluation.bertscore import others_of, score_texts
+from distill.evaluation.stage import (
     NOT_COMPUTED,
     UNPARSED,
     EvaluateConfig,
@@ -26,7 +25,8 @@ from distill.evaluate import (
     run,
     wilson_interval,
 )
-from distill.infer import make_prediction
+from distill.inference.stage import make_prediction
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 
 

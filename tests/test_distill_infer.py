@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.predictions import read_predictions
-from distill import dataset, infer
-from distill.encoding import load_pictures
+from distill.inference import stage as infer
+from distill.prepare import stage as dataset
 from distill.schema import read_split
+from distill.student.encoding import load_pictures
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 1, "timeout_s": 5.0, "concurrency": 3}

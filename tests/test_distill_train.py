@@ -25,8 +25,11 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
-from distill import dataset, infer, student, train  # noqa: E402
-from distill.encoding import IGNORED, count_tokens, encode, load_pictures, training_batch  # noqa: E402
+from distill.inference import stage as infer  # noqa: E402
+from distill.prepare import stage as dataset  # noqa: E402
+from distill.student import model as student  # noqa: E402
+from distill.student.encoding import IGNORED, count_tokens, encode, load_pictures, training_batch  # noqa: E402
+from distill.training import stage as train  # noqa: E402
 
 MAX_PIXELS = 64 * 64
 FAST = {"max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "schedule": "constant", "device": "cpu"}
@@ -312,7 +315,7 @@ def test_killed_and_continued_is_the_same(place, trained, tmp_path):
     out, log = tmp_path / "out", tmp_path / "out" / "log.jsonl"
     settings = {**FAST, "accumulate": 2, "batch_size": 2, "epochs": 6, "max_steps": 12, "save_every_steps": 5}
     code = (
-        "import json, sys, pathlib; from distill import train\n"
+        "import json, sys, pathlib; from distill.training import stage as train\n"
         "settings, *paths = json.loads(sys.argv[1])\n"
         "train.run(train.TrainConfig(**settings), *map(pathlib.Path, paths))"
     )

@@ -29,10 +29,10 @@ from cosfly.reading.files import sha256_file
 from cosfly.settings import RunConfig
 from cosfly.stage_folder import read_failures
 from cosfly.store import read_checksums, write_checksums, write_json
-from distill import dataset
-from release import package
-from release.sources import Source
-from release.validate import verify
+from distill.prepare import stage as dataset
+from release.package import stage as package
+from release.package.sources import Source
+from release.verify.verify import verify
 
 TINY = [
     "pedestrians.num_paths=2",

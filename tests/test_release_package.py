@@ -36,12 +36,12 @@ from cosfly.products.town import write_town_map
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.store import write_json
-from release.card import render_card, size_category
+from release.card.render import render_card, size_category
 from release.columns import SCALARS
-from release.package import ReleaseConfig, plan_shards, run
+from release.package.sources import Source
+from release.package.stage import ReleaseConfig, plan_shards, run
 from release.record import read_record
-from release.sources import Source
-from release.validate import picture_problem, verify
+from release.verify.verify import picture_problem, verify
 from specimens import make_flight, make_playback_tree
 
 NUM_POINTS = 12
@@ -679,7 +679,7 @@ def test_pictures_of_the_wrong_size_are_named(inputs):
 
 def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
     """Parts that fill a shard are linked; the rows and their order are those of the copied shards."""
-    import release.package as package
+    from release.package import stage as package
 
     monkeypatch.setattr(package, "MB", 1000)  # so that the specimen's small flights pass shard_mb
     folder = build(inputs, tmp_path / "r")
@@ -690,7 +690,7 @@ def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
 
 
 def test_a_disk_without_links_gets_copies(inputs, built, tmp_path, monkeypatch):
-    import release.package as package
+    from release.package import stage as package
 
     def refuse(*args):
         raise OSError("no links here")

@@ -19,7 +19,7 @@ ModelOption = Annotated[Path, typer.Option(help="Folder of the student's base mo
 @app.command("tiny-student")
 def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
     """Make a tiny, randomly initialised student, to try the way without weights."""
-    from distill.student import make_tiny_student
+    from distill.student.model import make_tiny_student
 
     typer.echo(make_tiny_student(out, seed))
 
@@ -36,7 +36,7 @@ def distill_prepare(
     resume: options.Resume = "if-same",
 ) -> None:
     """Captions to a training set with splits that share no trajectory."""
-    from distill import dataset
+    from distill.prepare import stage as dataset
 
     cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
     options.verify_first(verify, captions, tree, out)
@@ -56,7 +56,7 @@ def distill_train(
     resume: options.Resume = "if-same",
 ) -> None:
     """Train LoRA adapters; continues from its last checkpoint."""
-    from distill import train
+    from distill.training import stage as train
 
     cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
     options.verify_first(verify, dataset, tree, out)
@@ -80,7 +80,7 @@ def distill_infer(
     repair: options.Repair = False,
 ) -> None:
     """Let the student answer a split; continues where it stopped."""
-    from distill import infer
+    from distill.inference import stage as infer
 
     cfg, tree = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folder(data)
     options.set_aside(out, repair)
@@ -103,7 +103,7 @@ def distill_evaluate(
     resume: options.Resume = "if-same",
 ) -> None:
     """JSON parse rate, decision accuracy beside the majority floor, BERTScore beside a shuffled floor."""
-    from distill import evaluate
+    from distill.evaluation import stage as evaluate
 
     cfg = options.resolve(config, overrides, {"seed": seed})
     options.verify_first(verify, predictions, dataset, out)

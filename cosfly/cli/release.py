@@ -34,8 +34,8 @@ def release_build(
     repair: options.Repair = False,
 ) -> None:
     """Select frames of one run or several, join captions, write parquet, data-set card and checksums."""
-    from release import package
-    from release.sources import Source
+    from release.package import stage as package
+    from release.package.sources import Source
 
     sources = [Source.of_run(folder) for folder in runs or []]
     if captions or inspected or data or not sources:
@@ -57,7 +57,7 @@ def release_verify(
     overrides: options.Overrides = None,
 ) -> None:
     """Check structure, checksums, every number of the card, and re-projection. Exit 1 if anything is wrong."""
-    from release.validate import verify
+    from release.verify.verify import verify
 
     options.resolve(config, overrides)
     report = verify(folder)
@@ -72,6 +72,6 @@ def release_stats(
     out: Annotated[Path, typer.Option(help="Folder for stats.html and stats.json.")],
 ) -> None:
     """Draw what a release covers (heights, distances, azimuths, sizes, styles, paces, labels) beside the plain run that ships."""
-    from release import stats
+    from release.stats import stats
 
     typer.echo(stats.run(folder, out))

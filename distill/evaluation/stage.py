@@ -25,9 +25,17 @@ from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.reading.documents import parse_document, validation_errors
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_json
-from distill.bertscore import BertScoreConfig, Scorer, bert_scorer, check_encoder, means_of, others_of, score_texts
+from distill.evaluation.bertscore import (
+    BertScoreConfig,
+    Scorer,
+    bert_scorer,
+    check_encoder,
+    means_of,
+    others_of,
+    score_texts,
+)
 from distill.schema import Sample, read_split
-from distill.student import require
+from distill.student.model import require
 
 STAGE = "distill.evaluate"
 UNPARSED = "(unparsed)"  # column of the confusion table beside the decisions

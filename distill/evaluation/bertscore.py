@@ -17,7 +17,7 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
 from cosfly.reading.documents import read_json, read_object
-from distill.student import Device, pick_device, quiet_transformers, require
+from distill.student.model import Device, pick_device, quiet_transformers, require
 
 Scorer = Callable[[Sequence[str], Sequence[str]], np.ndarray]  # candidates, references -> (n, 3) precision, recall, F1
 

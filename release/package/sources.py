@@ -14,8 +14,8 @@ from cosfly.products.places import Place, flight_ids, folder_name, stand, town_f
 from cosfly.products.town import read_town_map
 from cosfly.provenance import fingerprint, warn_unbound, was_made_of
 from cosfly.reading.files import check_stays_below
-from release.captions import ByFlight, load_captions
 from release.columns import ReleasedCaption
+from release.package.captions import ByFlight, load_captions
 from release.record import ReleasedMap
 
 Track = Literal["clean", "perturbed"]

@@ -30,8 +30,9 @@ from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_ite
 from cosfly.stage_folder import Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes, write_checksums
 from release import columns
-from release.card import render_card
-from release.card_numbers import compute_numbers
+from release.card.numbers import compute_numbers
+from release.card.render import render_card
+from release.package.sources import Chosen, Material, Source, Track, choose_licence, gather
 from release.record import (
     CaptionHistory,
     FlightHistory,
@@ -43,7 +44,6 @@ from release.record import (
     Shard,
     write_record,
 )
-from release.sources import Chosen, Material, Source, Track, choose_licence, gather
 from release.subsample import RULE, select_frames
 
 MB = 1024 * 1024

@@ -24,8 +24,8 @@ from cosfly.reading.tables import open_table
 from cosfly.stage_folder import flattened
 from cosfly.store import CHECKSUMS, inside, read_checksums
 from release import columns
-from release.card import render_card
-from release.card_numbers import compute_numbers, read_rows
+from release.card.numbers import compute_numbers, read_rows
+from release.card.render import render_card
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_LISTS, CAPTION_SHARES, PICTURES, PLACE, POINT
 from release.record import ReleaseRecord, read_record
 from release.subsample import select_frames

@@ -20,7 +20,7 @@ from cosfly.products.frames import tree_of
 from cosfly.reading.arrays import array_header, picture_size
 from cosfly.store import inside
 from distill.schema import Sample
-from distill.student import IMAGE_TOKEN, Student
+from distill.student.model import IMAGE_TOKEN, Student
 
 IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy
 

@@ -29,7 +29,7 @@ FILE_TEXT: dict[FrameFile, str] = {
 
 def render_card(record: ReleaseRecord) -> str:
     """Give README.md for a release.json."""
-    template = read_text(Path(__file__).with_name("card_template.md"))
+    template = read_text(Path(__file__).with_name("template.md"))
     values = _values(record)
     names = set(re.findall(r"\{\{(\w+)\}\}", template))
     assert names == set(values), f"template and values differ: {sorted(names ^ set(values))}"

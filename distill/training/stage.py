@@ -25,7 +25,8 @@ from cosfly.reading.documents import parse_json
 from cosfly.reading.files import read_lines
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, dump_json, inside, storage_errors, write_json
-from distill.checkpoint import (
+from distill.schema import Sample, read_split, split_path
+from distill.student.checkpoint import (
     ADAPTER_FACTS,
     adapter_facts,
     cut_log,
@@ -34,9 +35,8 @@ from distill.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.encoding import IGNORED, Encoded, count_tokens, encode, image_size, most_pixels, training_batch
-from distill.schema import Sample, read_split, split_path
-from distill.student import Device, Student, load_student, require, weight_files
+from distill.student.encoding import IGNORED, Encoded, count_tokens, encode, image_size, most_pixels, training_batch
+from distill.student.model import Device, Student, load_student, require, weight_files
 
 log = logging.getLogger(__name__)
 

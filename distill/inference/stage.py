@@ -25,10 +25,10 @@ from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
 from cosfly.store import dump_json, sha256_bytes, write_bytes
-from distill.checkpoint import read_adapter_facts
-from distill.encoding import encode, load_pictures, messages_of, most_pixels, prompt_batch
 from distill.schema import Sample, read_split, split_path
-from distill.student import Device, Student, load_student, require, weight_files
+from distill.student.checkpoint import read_adapter_facts
+from distill.student.encoding import encode, load_pictures, messages_of, most_pixels, prompt_batch
+from distill.student.model import Device, Student, load_student, require, weight_files
 
 STAGE = "distill.infer"
 

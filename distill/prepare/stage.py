@@ -26,7 +26,7 @@ from cosfly.products.places import stand
 from cosfly.provenance import warn_unbound
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_file, dump_json
-from distill.balance import Cut, Ranks, cost_of
+from distill.prepare.balance import Cut, Ranks, cost_of
 from distill.schema import SPLITS, Sample, Split, read_split, split_path
 
 log = logging.getLogger(__name__)

@@ -1,0 +1,1 @@
+"""Accepted flights and captions to a release."""
