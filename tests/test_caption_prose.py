@@ -21,8 +21,8 @@ from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
 from caption.truth.gold import read_gold_prose
 from caption.truth.prose.judging import check_evidence, judge_sentences
-from caption.truth.sentences import sentences_of
 from cosfly.products.captions import Coc, Language
+from cosfly.products.sentences import sentences_of
 
 FOREIGN = Path(__file__).resolve().parents[2] / "shared" / "data" / "free-prose" / "captions.jsonl"
 OWN = Path(__file__).with_name("prose_true.yaml")

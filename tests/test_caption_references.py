@@ -12,9 +12,9 @@ from caption.truth.claims import judge_claim
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.holding import word_holds
 from caption.truth.references import Fact, look_up, parse_reference
-from caption.truth.sentences import sentences_of
 from caption.windows import cut_windows
 from cosfly.products.captions import Claim, Coc
+from cosfly.products.sentences import sentences_of
 from specimens import make_flight
 
 FACTS = Facts(

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from caption.run.ledger import CaptionReport, Histogram
-from caption.truth.sentences import sentences_of
 from cosfly.chat.budget import BudgetConfig
 from cosfly.escaping import for_html, html_page
 from cosfly.frame_views import thumbnail
 from cosfly.products.captions import ACTIONS, Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import flight_of
+from cosfly.products.sentences import sentences_of
 from cosfly.reading.files import read_text
 from cosfly.store import write_bytes
 

@@ -27,10 +27,11 @@ from caption.truth.references import (
     parse_reference,
 )
 from caption.truth.said import SCENE, Said
-from caption.truth.sentences import Judged, sentences_of
+from caption.truth.sentences import Judged
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import Stated, read_stated
 from cosfly.products.captions import Claim, Coc, Language, SentenceState, normalize_action
+from cosfly.products.sentences import sentences_of
 
 
 def judge_claims(

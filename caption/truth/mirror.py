@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from caption.truth.facts import Facts
 from caption.truth.glossary import Number, load_glossary
 from caption.truth.references import Series
-from caption.truth.sentences import cut_sentences
 from cosfly.products.captions import Coc, Language, is_in_script
+from cosfly.products.sentences import cut_sentences
 
 TEXTS = ("critical_components", "reasoning_trace")
 

@@ -18,9 +18,10 @@ from caption.truth.facts import Facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.lexicon import load_lexicon
 from caption.truth.references import QUANTITIES
-from caption.truth.sentences import Judged, sentences_of
+from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from cosfly.products.captions import Claim, Language, Modality, Parsed
+from cosfly.products.sentences import sentences_of
 
 MAX_CLAIMS = 60
 MAX_TEXT = 48  # characters of a claim's texts

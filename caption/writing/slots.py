@@ -14,11 +14,12 @@ from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import TEXTS, lacking
 from caption.truth.references import QUANTITIES
-from caption.truth.sentences import Judged, cut_sentences
+from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler, facts_of
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.products.captions import Coc, Language, Parsed, Template
+from cosfly.products.sentences import cut_sentences
 
 MAX_COMPLAINTS = 6  # named at once
 

@@ -14,8 +14,9 @@ from caption.truth.prose.numerals import masked
 from caption.truth.prose.pool import Pool
 from caption.truth.prose.reading import read_form
 from caption.truth.prose.statements import Form
-from caption.truth.sentences import Judged, sentences_of
+from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
+from cosfly.products.sentences import sentences_of
 
 _NUMBERS = ("number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds")
 _PROBLEM = {
