@@ -117,6 +117,11 @@ class Flight:
         return np.where(last >= 0, np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))[last], np.nan)
 
     @property
+    def walked_m(self) -> np.ndarray:
+        """Where the person walked, (n, 3), without what a perturbation added; NaN where nobody knows."""
+        return self.targets_m - self.target_offsets_m
+
+    @property
     def pace(self) -> str:
         """The pace of the walk that it follows."""
         return pace_of(self.source, str(self.folder))

@@ -1,0 +1,201 @@
+"""cosfly/splits.py: what one walk is, and splits that share none."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosfly.errors import InputError
+from cosfly.products.playback import Flight, read_flight, write_flight
+from cosfly.splits import SPLITS, Course, assign_splits, town_family, walks_of
+from specimens import make_flight
+
+STEP_S = 0.5
+
+
+def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0), heading_deg: float = 0.0, speed_mps: float = 1.4):
+    """A straight walk: times and places of its points."""
+    time_s = np.arange(num_points) * STEP_S
+    way_m = speed_mps * time_s[:, None] * [np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))]
+    return time_s, np.column_stack([way_m + begin, np.full(num_points, 0.9)])
+
+
+def course(name: str, points, town: str = "Town01", part: slice = slice(None)) -> Course:
+    return Course(name, town, points[0][part], points[1][part])
+
+
+def course_of(flight: Flight, name: str = "") -> Course:
+    return Course(name or flight.trajectory, flight.town, flight.time_s, flight.walked_m)
+
+
+def groups(*courses: Course) -> list[set[str]]:
+    found: dict[str, set[str]] = {}
+    for name, walk_id in walks_of(courses).items():
+        found.setdefault(walk_id, set()).add(name)
+    return sorted(found.values(), key=sorted)
+
+
+# --- one walk ---------------------------------------------------------------------------------------------------------
+
+
+def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
+    """The person of the perturbed flight was shifted by up to a metre and a half in every frame."""
+    clean, _ = make_flight(40, seed=3)
+    noisy, _ = make_flight(40, seed=3, variant="aug_001")
+    offsets_m = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3))
+    shifted = replace(noisy, targets_m=noisy.targets_m + offsets_m, target_offsets_m=offsets_m)
+    for flight in (clean, shifted):
+        write_flight(tmp_path / "Town01" / flight.trajectory / flight.variant, flight)
+    read = [read_flight(tmp_path / "Town01" / clean.trajectory / variant) for variant in ("ORI", "aug_001")]
+    one, other = (course_of(flight, flight.variant) for flight in read)
+    assert groups(one, other) == [{"ORI", "aug_001"}]
+    assert groups(one, replace(other, target_m=read[1].targets_m)) == [{"ORI"}, {"aug_001"}]  # the shift was real
+
+
+def test_another_timestamp_planner_or_run_is_the_same_walk():
+    points = walk(60)
+    noise = np.random.default_rng(1).normal(0, 0.01, points[1].shape)
+    assert groups(
+        course("a/Town01/trajectory_1", points),
+        course("a/Town01/trajectory_2", points),
+        course("b/Town01/trajectory_1", (points[0], points[1] + noise)),
+    ) == [{"a/Town01/trajectory_1", "a/Town01/trajectory_2", "b/Town01/trajectory_1"}]
+
+
+def test_builds_of_a_town_are_one_and_other_towns_are_not():
+    points = walk(60)
+    lower = (points[0], points[1] - [0, 0, 3.0])  # the other build's ground
+    found = groups(course("a", points, "Town03"), course("b", lower, "Town03_Opt"), course("c", points, "Town04"))
+    assert found == [{"a", "b"}, {"c"}]
+    assert [town_family(town) for town in ("Town03", "Town03_Opt", "Town03_Opt_Opt", "Town_Option")] == [
+        "Town03", "Town03", "Town03", "Town_Option",
+    ]  # fmt: skip
+
+
+def test_walks_that_cross_at_the_same_moment_are_two():
+    along = walk(80)
+    across = walk(80, begin=(1.4 * 20, -1.4 * 20), heading_deg=90.0)  # both at (28, 0) after 20 s
+    assert np.abs(along[1][40] - across[1][40]).max() < 1e-9
+    assert groups(course("along", along), course("across", across)) == [{"across"}, {"along"}]
+
+
+def test_walks_on_one_route_at_other_times_are_two():
+    points = walk(80)
+    later = (points[0], points[1] - [1.4 * 10, 0, 0])  # ten seconds behind on the same way
+    faster = walk(80, speed_mps=2.0)
+    assert groups(course("a", points), course("b", later), course("c", faster)) == [{"a"}, {"b"}, {"c"}]
+
+
+def test_flights_that_begin_later_or_are_shorter_are_of_the_walk():
+    points = walk(80)
+    late, short = course("late", points, part=slice(31, None)), course("short", points, part=slice(0, 9))
+    assert groups(course("whole", points), late, short) == [{"late", "short", "whole"}]
+    assert groups(late, short) == [{"late"}, {"short"}]  # nothing shared: only the whole one joins them
+
+
+def test_points_between_full_seconds_and_gaps_do_not_matter():
+    points = walk(80)
+    between = (points[0][:-1] + 0.2, points[1][:-1] + [0.28, 0, 0])  # the same walk, sampled elsewhere
+    torn = np.r_[0:10, 40:80]
+    assert groups(course("a", points), course("b", between), course("c", points, part=torn)) == [{"a", "b", "c"}]
+    other_middle = walk(80)[1].copy()
+    other_middle[10:40] += [0, 40.0, 0]
+    assert len(groups(course("c", points, part=torn), course("d", (points[0], other_middle)))) == 1
+
+
+def test_one_name_is_one_walk_whatever_is_known_of_it():
+    points = walk(20)
+    unknown = (points[0], np.full_like(points[1], np.nan))
+    away = walk(20, begin=(500.0, 0.0))
+    found = groups(
+        course("a", points), course("a", unknown), course("b", unknown), course("c", away), course("a", away)
+    )
+    assert found == [{"a", "c"}, {"b"}]
+
+
+def test_times_far_apart_cost_nothing():
+    points = np.array([0.0, 0.5, 1e12]), np.zeros((3, 3))
+    assert groups(course("a", points), course("b", walk(4, speed_mps=0.0))) == [{"a", "b"}]
+
+
+@given(st.randoms(use_true_random=False), st.integers(0, 3))
+def test_walks_do_not_depend_on_the_order_and_bear_a_name_of_theirs(random, seed):
+    rng = np.random.default_rng(seed)
+    courses = []
+    for number in range(6):
+        points = walk(30, begin=tuple(rng.uniform(0, 3, 2)), heading_deg=float(rng.uniform(0, 360)))
+        courses += [course(f"{kind}{number}", points, part=slice(number, 30 - k)) for k, kind in enumerate("xyz")]
+    expected = walks_of(courses)
+    random.shuffle(courses)
+    assert walks_of(iter(courses)) == expected
+    assert all(walk_id == min(name for name, of in expected.items() if of == walk_id) for walk_id in expected.values())
+    assert all(len({expected[f"{kind}{number}"] for kind in "xyz"}) == 1 for number in range(6))
+
+
+def test_walks_agree_with_a_slow_plain_comparison():
+    rng = np.random.default_rng(5)
+    courses = [
+        course(f"{i:02d}", walk(20 + i % 7, begin=tuple(rng.integers(0, 3, 2) * 0.4), heading_deg=30.0 * (i % 3)))
+        for i in range(30)
+    ]
+
+    def are_near(one: Course, other: Course) -> bool:
+        places = [{t: p[:2] for t, p in zip(c.time_s, c.target_m, strict=True) if t % 1 == 0} for c in (one, other)]
+        shared = places[0].keys() & places[1].keys()
+        near = [t for t in shared if np.linalg.norm(places[0][t] - places[1][t]) <= 0.5]
+        return bool(near) and len(near) >= 0.5 * len(shared)
+
+    walk_id = {c.name: c.name for c in courses}
+    for one in courses:
+        for other in courses:
+            if are_near(one, other):
+                names = walk_id[one.name], walk_id[other.name]
+                walk_id = {name: min(names) if of in names else of for name, of in walk_id.items()}
+    assert walks_of(courses) == walk_id
+    assert 1 < len(set(walk_id.values())) < 30
+
+
+def test_nothing_has_no_walks():
+    assert walks_of([]) == {}
+
+
+# --- splits -----------------------------------------------------------------------------------------------------------
+
+
+@given(
+    num_groups=st.integers(3, 60),
+    val=st.sampled_from([0.0, 0.01, 0.1, 0.45]),
+    test=st.sampled_from([0.0, 0.01, 0.2, 0.45]),
+    seed=st.integers(0, 5),
+)
+def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
+    shares = {"val": val, "test": test}
+    names = [f"walk_{i}" for i in range(num_groups)]
+    split_of = assign_splits(names, shares, seed, too_few="refuse")
+    assert set(split_of) == set(names)
+    counts = Counter(split_of.values())
+    assert set(counts) == {split for split in SPLITS if split == "train" or shares[split] > 0}
+    assert abs(counts["val"] - val * num_groups) <= 1
+    assert split_of == assign_splits(list(reversed(names)) * 2, shares, seed, too_few="refuse")  # order, repeats
+
+
+def test_another_seed_gives_other_splits():
+    names = [f"walk_{i}" for i in range(30)]
+    one, other = (assign_splits(names, {"val": 0.1, "test": 0.1}, seed, too_few="refuse") for seed in (0, 1))
+    assert one != other
+
+
+def test_too_few_groups_are_refused_unless_told():
+    shares = {"val": 0.1, "test": 0.1}
+    with pytest.raises(InputError, match=r"too few towns.*got 2.*expected 3.*fewer splits"):
+        assign_splits(["a", "b"], shares, 0, too_few="refuse", what="towns", fix="ask for fewer splits")
+    assert sorted(assign_splits(["a", "b"], shares, 0, too_few="fill").values()) == ["train", "val"]
+    assert assign_splits(["a"], shares, 0, too_few="fill") == {"a": "train"}
+    assert assign_splits(["a"], {}, 0, too_few="refuse") == {"a": "train"}
+    with pytest.raises(InputError):
+        assign_splits([], shares, 0, too_few="fill")
