@@ -1,24 +1,41 @@
-"""Every number of the card and of `release.json`, computed from the parquet shards; none is typed."""
+"""Every number of the card and of `release.json`, computed from the parquet shards; none is typed.
+
+Memory holds a row group and a few numbers a flight, however many frames there are. Sums are of whole millionths, so they are exact and the same
+in any order: shards can be counted by several processes and added up.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from cosfly.products.coverage import NAMED, Coverage, axis_values
-from cosfly.reading.tables import open_table, rows_of
+from cosfly.errors import InputError
+from cosfly.products.coverage import AXES, NAMED, Coverage, axis_values
+from cosfly.reading.tables import arrow_errors, open_table, row_groups, rows_of
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, SCALAR_NAMES
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
+MILLION = 1_000_000
+LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "has_caption")
+COLUMNS = [
+    "sample_id", *PLACE, "track", "style", "pace", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "drone_offset", "target",
+    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_FIELDS,
+]  # fmt: skip
+NEVER_NULL = frozenset(
+    {"sample_id", *PLACE, "track", "time_s", "width_px", "height_px", "fov_deg", "pose", "has_caption"}
+)
+Place3 = tuple[float, float, float]  # m
 
 
 def read_rows(shards: Iterable[Path], columns: list[str] = SCALAR_NAMES) -> Iterator[dict[str, Any]]:
@@ -27,60 +44,207 @@ def read_rows(shards: Iterable[Path], columns: list[str] = SCALAR_NAMES) -> Iter
         yield from rows_of(shard, columns, tree=shard.parents[1])
 
 
-def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
+def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
     """Compute every number of the card.
 
     Args:
         shards: parquet files in their order.
-        num_frames: the release's frames per flight; flights with fewer are counted as short.
-    Returns:
-        sums are exact (fsum), so that the same rows give the same digits everywhere.
+        num_frames: the release's frames per flight, None for all; flights with fewer are counted as short.
+    Raises:
+        InputError: a shard cannot be read, or holds a number that is none.
     """
-    counted = _Rows()
-    for row in read_rows(shards):
-        counted.add(row)
+    counted = Counted()
+    for shard in shards:
+        counted.merge(count_shard(shard))
     return counted.numbers(shards, num_frames)
 
 
-class _Rows:
-    """Counts and values of rows that were read one after the other."""
+def count_shard(shard: Path) -> Counted:
+    """Count the rows of one shard; raises as `compute_numbers`."""
+    counted = Counted()
+    for rows in row_lists(shard, COLUMNS):
+        counted.add(rows)
+    return counted
 
-    def __init__(self) -> None:
-        self.counts = {name: Counter[str]() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
-        self.totals, self.characters = Counter[str](), Counter[str]()
-        self.flights: dict[tuple[str, ...], list[tuple[float, float, float, float]]] = {}
-        self.samples: dict[str, list[float]] = {
-            name: [] for name in ("height_m", "distance_m", "visibility", *CAPTION_SHARES)
-        }
-        self.fovs: dict[tuple[str, ...], str] = {}  # a trajectory keeps its field of view
-        self.example: dict[str, str] = {}
-        # For the coverage: person to drone (x, y, z), heading, height in px, visibility.
-        self.seen: list[tuple[float, ...]] = []
-        self.named: dict[str, list[str]] = {name: [] for name in NAMED}
 
-    def add(self, row: dict[str, Any]) -> None:
+def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]:
+    """Yield the rows of a shard, a row group at a time, in which every value that must be there is there.
+
+    Raises:
+        InputError: it cannot be read, or a column of NEVER_NULL, or a part of a pose, place or box, is null.
+    """
+    for group in row_groups(shard, columns, tree=shard.parents[1]):
+        for member in group.schema:
+            column = group.column(member.name)
+            wanted = 0 if member.name in NEVER_NULL else column.null_count
+            parts = (
+                [pc.struct_field(column, i) for i in range(member.type.num_fields)]
+                if pa.types.is_struct(member.type)
+                else []
+            )
+            is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
+            if any(part.null_count > wanted for part in (column, *(parts if is_plain else ()))):
+                raise InputError(
+                    "a value is missing", where=f"{shard}: {member.name}", got="null", expected="a value in every row"
+                )
+        with arrow_errors(shard):  # text that is no UTF-8 shows here
+            rows = group.to_pylist()
+        yield rows
+
+
+@dataclass
+class Sum:
+    """Count, exact sums in whole millionths, least and greatest of values."""
+
+    count: int = 0
+    total: int = 0
+    squares: int = 0
+    low: int | None = None
+    high: int | None = None
+
+    def add(self, value: float) -> None:
+        """Add a value.
+
+        Raises:
+            InputError: it is no finite number, or beyond LARGEST.
+        """
+        self.join(Sum(1, *((part := millionths(value)), part * part, part, part)))
+
+    def join(self, other: Sum) -> None:
+        """Add the values of another sum."""
+        self.count += other.count
+        self.total += other.total
+        self.squares += other.squares
+        if other.low is not None and other.high is not None:
+            self.low = other.low if self.low is None else min(self.low, other.low)
+            self.high = other.high if self.high is None else max(self.high, other.high)
+
+    def spread(self) -> Spread:
+        """Give the sums as the record has them."""
+        if not self.count or self.low is None or self.high is None:
+            return Spread(count=0, mean=None, std=None, min=None, max=None)
+        std = math.sqrt(self.count * self.squares - self.total * self.total) / self.count
+        values = (self.total / self.count, std, self.low, self.high)
+        mean, std, low, high = (round(value / MILLION, DIGITS) for value in values)
+        return Spread(count=self.count, mean=mean, std=std, min=low, max=high)
+
+
+def millionths(value: float) -> int:
+    """Give a value in whole millionths; raises as `Sum.add`."""
+    if not -LARGEST < value < LARGEST:  # NaN is not
+        raise InputError("not a number of a flight", where="data", got=str(value), expected=f"within {LARGEST:g}")
+    return round(value * MILLION)
+
+
+@dataclass
+class FlightCount:
+    """What is kept of a flight: frames, its first and last time and place without perturbation (None: not known), the way between.
+
+    A place is not known where a perturbed frame does not say how far it was shifted.
+    """
+
+    frames: int
+    times_s: tuple[float, float]
+    ends: tuple[Place3 | None, Place3 | None]
+    length: int = 0  # millionths of a metre
+    is_known: bool = True
+
+    def join(self, later: FlightCount) -> None:
+        """Go on with the frames that follow."""
+        before, after = self.ends[1], later.ends[0]
+        step = None if before is None or after is None else millionths(math.dist(before, after))
+        self.is_known = self.is_known and later.is_known and step is not None
+        self.length += later.length + (step or 0)
+        self.frames += later.frames
+        self.times_s, self.ends = (self.times_s[0], later.times_s[1]), (self.ends[0], later.ends[1])
+
+
+def clean_place(row: dict[str, Any]) -> Place3 | None:
+    """Give where the drone would be without the frame's perturbation, m; None where the row does not say."""
+    offset = row["drone_offset"]
+    if offset is None:
+        return None
+    x, y, z = (row["pose"][axis] - offset[axis] for axis in POINT)
+    return x, y, z
+
+
+SUMS = ("height_m", "distance_m", "visibility", *CAPTION_SHARES)
+
+
+@dataclass
+class Counted:
+    """Counts and sums of rows, in their order; what several counted can be merged."""
+
+    rows: int = 0
+    counts: dict[str, Counter[str]] = field(
+        default_factory=lambda: {name: Counter() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
+    )
+    totals: Counter[str] = field(default_factory=Counter)
+    characters: Counter[str] = field(default_factory=Counter)
+    sums: dict[str, Sum] = field(default_factory=lambda: {name: Sum() for name in SUMS})
+    flights: dict[tuple[str, ...], FlightCount] = field(default_factory=dict)  # by track and PLACE
+    fovs: dict[tuple[str, ...], str] = field(default_factory=dict)  # a trajectory keeps its field of view
+    coverage: Coverage = field(default_factory=Coverage)
+    example: dict[str, str] = field(default_factory=dict)
+
+    def add(self, rows: list[dict[str, Any]]) -> None:
+        """Count rows that follow those counted so far."""
+        seen, named = [], {name: list[str]() for name in NAMED}
+        for row in rows:
+            seen.append(self._add(row))
+            for kind, column in zip(NAMED, ("style", "pace", "label"), strict=True):
+                named[kind] += [row[column]] if row[column] is not None else []
+        if rows:
+            values = np.array(seen, dtype=np.float64)
+            part = Coverage.of(axis_values(values[:, :3], *values[:, 3:].T), *(named[kind] for kind in NAMED))
+            self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
+        self.rows += len(rows)
+
+    def merge(self, later: Counted) -> None:
+        """Add what was counted of the rows that follow."""
+        for name, counts in later.counts.items():
+            self.counts[name].update(counts)
+        self.totals.update(later.totals)
+        self.characters.update(later.characters)
+        for name, values in later.sums.items():
+            self.sums[name].join(values)
+        for key, flight in later.flights.items():
+            self._go_on(key, flight)
+        self.fovs.update(later.fovs)
+        if later.rows:
+            self.coverage = Coverage.total([self.coverage, later.coverage]) if self.rows else later.coverage
+        self.example = self.example or later.example
+        self.rows += later.rows
+
+    def _add(self, row: dict[str, Any]) -> tuple[float, ...]:
+        """Count a row; give what the coverage needs: person to drone (x, y, z), heading, height in px, visibility."""
         self.totals.update(name for name in FLAGS if row[name])
         fov = self.fovs[row["run"], row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
         size = f"{row['width_px']} x {row['height_px']}"
         for name, value in {"town": row["town"], "track": row["track"], "fov_deg": fov, "image_px": size}.items():
             self.counts[name][value] += 1
         pose, target, box = row["pose"], row["target"], row["target_mask_bbox"]
-        flight = self.flights.setdefault((row["track"], *(row[name] for name in PLACE)), [])
-        flight.append((row["time_s"], pose["x_m"], pose["y_m"], pose["z_m"]))
+        place = clean_place(row)
+        here = FlightCount(1, (row["time_s"], row["time_s"]), (place, place), is_known=place is not None)
+        self._go_on((row["track"], *(row[name] for name in PLACE)), here)
         offset = [math.nan] * 3 if target is None else [pose[axis] - target[axis] for axis in POINT]
         if target is not None:
-            self.samples["height_m"].append(offset[2])
-            self.samples["distance_m"].append(math.hypot(*offset))
+            self.sums["height_m"].add(offset[2])
+            self.sums["distance_m"].add(math.hypot(*offset))
         for name in ("visibility", *CAPTION_SHARES):
             if row[name] is not None:
-                self.samples[name].append(row[name])
-        height_px = None if box is None else box["ymax_px"] - box["ymin_px"]
-        known = (row["target_heading_deg"], height_px, row["visibility"])
-        self.seen.append((*offset, *(math.nan if value is None else value for value in known)))
-        for kind, column in zip(NAMED, ("style", "pace", "label"), strict=True):
-            self.named[kind] += [row[column]] if row[column] is not None else []
+                self.sums[name].add(row[name])
         if row["has_caption"]:
             self._add_caption(row)
+        height_px = None if box is None else box["ymax_px"] - box["ymin_px"]
+        known = (row["target_heading_deg"], height_px, row["visibility"])
+        return (*offset, *(math.nan if value is None else value for value in known))
+
+    def _go_on(self, key: tuple[str, ...], later: FlightCount) -> None:
+        if key in self.flights:
+            self.flights[key].join(later)
+        else:
+            self.flights[key] = later
 
     def _add_caption(self, row: dict[str, Any]) -> None:
         for name in CAPTION_FACTS:
@@ -91,26 +255,28 @@ class _Rows:
         self.example = self.example or {"sample_id": row["sample_id"], **texts}
         self.characters.update({name: len(text or "") for name, text in texts.items()})
 
-    def numbers(self, shards: list[Path], num_frames: int) -> Numbers:
-        flights, samples, totals = self.flights.values(), self.samples, self.totals
+    def numbers(self, shards: list[Path], num_frames: int | None) -> Numbers:
+        """Give the numbers of the rows of these shards."""
+        flights, sums, totals = self.flights.values(), self.sums, self.totals
+        spread = {name: values.spread() for name, values in sums.items()}
         return Numbers(
-            frames=len(self.seen),
+            frames=self.rows,
             flights=len(flights),
             trajectories=len(self.fovs),
             frames_by=FramesBy(**{name: _sorted(self.counts[name]) for name in FramesBy.model_fields}),
             trajectories_by_fov_deg=_sorted(Counter(self.fovs.values())),
             flights_by_track=_sorted(Counter(track for track, *_ in self.flights)),
-            frames_per_flight=_spread([float(len(points)) for points in flights]),
-            flights_shorter_than_num_frames=sum(len(points) < num_frames for points in flights),
-            flight_duration_s=_spread([points[-1][0] - points[0][0] for points in flights]),
-            flight_length_m=_spread([_length(points) for points in flights]),
-            height_over_target_m=_spread(samples["height_m"]),
-            distance_to_target_m=_spread(samples["distance_m"]),
-            visibility=_spread(samples["visibility"]),
+            frames_per_flight=spread_of(float(flight.frames) for flight in flights),
+            flights_shorter_than_num_frames=sum(flight.frames < (num_frames or 0) for flight in flights),
+            flight_duration_s=spread_of(flight.times_s[1] - flight.times_s[0] for flight in flights),
+            flight_length_m=spread_of(flight.length / MILLION for flight in flights if flight.is_known),
+            height_over_target_m=spread["height_m"],
+            distance_to_target_m=spread["distance_m"],
+            visibility=spread["visibility"],
             frames_perturbed=totals["is_perturbed"],
             frames_target_in_view=totals["target_in_view"],
             frames_target_visible=totals["target_visible"],
-            coverage=self._coverage(),
+            coverage=self.coverage if self.rows else Coverage.of({name: np.empty(0) for name in AXES}, (), ()),
             captions=self._captions(),
             files=FileNumbers(
                 shards=len(shards),
@@ -119,25 +285,29 @@ class _Rows:
             ),
         )
 
-    def _coverage(self) -> Coverage:
-        seen = np.array(self.seen, dtype=np.float64).reshape(-1, 6)
-        return Coverage.of(axis_values(seen[:, :3], *seen[:, 3:].T), *(self.named[kind] for kind in NAMED))
-
     def _captions(self) -> CaptionNumbers:
         num_captions, characters = self.totals["has_caption"], self.characters
         facts: dict[str, Any] = {name: _sorted(self.counts[name]) for name in CAPTION_FACTS}
         return CaptionNumbers(
             frames_with=num_captions,
-            frames_without=len(self.seen) - num_captions,
+            frames_without=self.rows - num_captions,
             with_label=self.totals["with_label"],
             decision_equals_label=self.totals["decision_equals_label"],
             **facts,
-            mean_proved={name: _spread(self.samples[name]).mean for name in CAPTION_SHARES},
+            mean_proved={name: self.sums[name].spread().mean for name in CAPTION_SHARES},
             mean_characters={
                 name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS
             },
             example=self.example,
         )
+
+
+def spread_of(values: Iterable[float]) -> Spread:
+    """Give the spread of some values."""
+    added = Sum()
+    for value in values:
+        added.add(value)
+    return added.spread()
 
 
 def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
@@ -151,19 +321,6 @@ def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
                     chunk = table.metadata.row_group(group).column(column)
                     sizes[owner.get(chunk.path_in_schema.split(".")[0], "annotations")] += chunk.total_compressed_size
     return dict(sorted(sizes.items()))
-
-
-def _length(points: list[tuple[float, float, float, float]]) -> float:
-    return math.fsum(math.dist(a[1:], b[1:]) for a, b in itertools.pairwise(points))
-
-
-def _spread(values: list[float]) -> Spread:
-    if not values:
-        return Spread(count=0, mean=None, std=None, min=None, max=None)
-    mean = math.fsum(values) / len(values)
-    std = math.sqrt(math.fsum((value - mean) ** 2 for value in values) / len(values))
-    mean, std, low, high = (round(value, DIGITS) for value in (mean, std, min(values), max(values)))
-    return Spread(count=len(values), mean=mean, std=std, min=low, max=high)
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:

@@ -144,7 +144,7 @@ def _spreads(numbers: Numbers) -> str:
     titles = (
         ("frames per flight", numbers.frames_per_flight),
         ("duration of a flight, s", numbers.flight_duration_s),
-        ("length of a flight over its released frames, m", numbers.flight_length_m),
+        ("length of a flight without its perturbation, through its released frames, m", numbers.flight_length_m),
         ("height over the target's hip, m", numbers.height_over_target_m),
         ("distance to the target, m", numbers.distance_to_target_m),
         ("rendered visibility of the target", numbers.visibility),
