@@ -20,6 +20,7 @@ SHARED = (
     "flight_metrics",
     "topview",
     "frame_views",
+    "student_chat",
     "coverage_page",
 )  # what several stages use; knows products
 # What may know all stages and siblings.

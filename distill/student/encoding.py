@@ -15,10 +15,10 @@ import numpy as np
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.frame_views import frame_label
 from cosfly.products.frames import tree_of
 from cosfly.reading.arrays import array_header, picture_size
 from cosfly.store import inside
+from cosfly.student_chat import IMAGE_PART, chat_messages
 from distill.schema import Sample
 from distill.student.model import IMAGE_TOKEN, Student
 
@@ -42,12 +42,8 @@ class Encoded:
 
 
 def messages_of(sample: Sample) -> list[dict[str, Any]]:
-    """Give the chat of a sample: the system text, then each frame under its name, and the question, as teachers are asked."""
-    content: list[dict[str, Any]] = []
-    for number in range(len(sample.frames)):
-        content += [{"type": "text", "text": frame_label(number)}, *({"type": "image"} for _ in sample.views)]
-    content.append({"type": "text", "text": sample.prompt.user})
-    return [{"role": "system", "content": sample.prompt.system}, {"role": "user", "content": content}]
+    """Give the chat of a sample, with a mark for every picture."""
+    return chat_messages(sample.prompt, [[IMAGE_PART] * len(sample.views) for _ in sample.frames])
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

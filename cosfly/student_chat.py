@@ -1,0 +1,91 @@
+"""A student's chat: the one renderer for those who train it, run it, serve it and ask it.
+
+A student answers well only what it was taught, so its prompt, the order of its pictures and their pixels come from here alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from pydantic import Field
+
+from cosfly.chat.client import EndpointConfig
+from cosfly.chat.contract import Request
+from cosfly.frame_views import encode_picture, frame_label
+from cosfly.products.captions import Prompt
+from cosfly.store import sha256_bytes
+
+IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it
+MAX_ANSWER_TOKENS = 512  # unless told otherwise: an answer as long as is taught, and a half more
+
+
+class StudentEndpointConfig(EndpointConfig):
+    """How a student is asked: greedily and without thinking, as it was taught."""
+
+    temperature: float = Field(0.0, ge=0, le=2, description="sampling temperature; 0 is greedy")
+    top_p: float = Field(1.0, gt=0, le=1, description="nucleus sampling")
+    max_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
+    extra_body: dict[str, Any] = Field(
+        {"chat_template_kwargs": {"enable_thinking": False}}, description="further fields of the request"
+    )
+
+
+def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Give the chat of a sample: the system text, then each frame's pictures under its name, and the question.
+
+    Args:
+        frames: the parts that stand for the pictures of each frame, oldest first; a frame without any is not named.
+    """
+    content: list[dict[str, Any]] = []
+    for number, pictures in enumerate(frames):
+        if pictures:
+            content += [{"type": "text", "text": frame_label(number)}, *pictures]
+    content.append({"type": "text", "text": prompt.user})
+    return [{"role": "system", "content": prompt.system}, {"role": "user", "content": content}]
+
+
+@dataclass(frozen=True)
+class SentPicture:
+    """A picture as a part of a request, and the sha256 of its bytes."""
+
+    part: dict[str, Any]
+    digest: str
+
+
+def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
+    """Encode a picture, (h, w, 3) uint8 RGB, without loss; larger ones are made smaller.
+
+    Args:
+        max_pixels: most pixels that stay; 0: all.
+    """
+    data = encode_picture(_bounded(rgb, max_pixels), "png", 0)
+    url = f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
+    return SentPicture({"type": "image_url", "image_url": {"url": url}}, sha256_bytes(data))
+
+
+def student_request(
+    prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig
+) -> Request:
+    """Give what an engine is asked.
+
+    Args:
+        frames: the pictures of each frame, oldest first.
+        schema: of the answer; `answer_schema(language=...)` for a free one.
+    """
+    messages = chat_messages(prompt, [[picture.part for picture in pictures] for pictures in frames])
+    return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, 0)
+
+
+def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
+    height_px, width_px = picture.shape[:2]
+    scale = math.sqrt(max_pixels / (width_px * height_px))
+    if max_pixels == 0 or scale >= 1.0:
+        return picture
+    size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))

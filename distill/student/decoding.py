@@ -1,0 +1,243 @@
+"""Greedy decoding of a batch of prompts over state of a fixed size: what `generate` gives, without what it spends on the way.
+
+All tensors of a step stand at fixed places, sizes change only when rows leave: a step can be compiled or recorded. The positions,
+the mask and the caches are handed to the language model as they are, so it derives nothing of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from distill.student.encoding import Encoded, prompt_batch
+from distill.student.model import Student
+
+# Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that stay.
+LEAVING_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """An answer. num_tokens: its end token is not counted. is_finished: it ended by itself."""
+
+    text: str
+    num_tokens: int
+    is_finished: bool
+
+
+class Constraint(Protocol):
+    """Says which tokens may come next; rows are counted as they were given to `decode`."""
+
+    def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
+        """Give (len(rows), num_tokens) bool; every row allows one at least."""
+
+    def consume(self, row: int, token: int) -> None:
+        """Note the token that a row was continued with."""
+
+
+def decode(
+    student: Student,
+    rows: Sequence[Encoded],
+    *,
+    max_tokens: int,
+    constraint: Constraint | None = None,
+    features: Any = None,
+) -> list[Decoded]:
+    """Answer a batch of prompts greedily; their answers in `rows` are not looked at.
+
+    Args:
+        max_tokens: longest answer, the end token included.
+        features: (image tokens of all rows, width), where the vision tower has seen the pictures before; else it looks now.
+    Returns:
+        One for each row, in their order.
+    """
+    import torch
+
+    with _evaluating(student), torch.inference_mode():
+        batch = _Batch(student, rows, max_tokens, features)
+        ended: dict[int, list[int]] = {}
+        for count in range(1, max_tokens + 1):
+            chosen = _choose(batch, constraint)
+            done = [
+                place for place, token in enumerate(chosen) if token == student.end_token_id and batch.is_live(place)
+            ]
+            for place in done:
+                ended[batch.rows[place]] = batch.tokens_of(place)[: count - 1]
+                batch.end(place)
+            if batch.num_live == 0 or count == max_tokens:
+                break
+            batch.drop_ended()
+            batch.step()
+        cut = {batch.rows[place]: batch.tokens_of(place) for place in range(len(batch.rows)) if batch.is_live(place)}
+    texts = ended | cut
+    return [
+        Decoded(student.tokenizer.decode(texts[row], skip_special_tokens=False), len(texts[row]), row in ended)
+        for row in range(len(rows))
+    ]
+
+
+def image_features(student: Student, rows: Sequence[Encoded]) -> Any:
+    """Have the vision tower look at the pictures of all rows: (their tokens, width of the language model), None without any."""
+    inputs = prompt_batch(student, rows)
+    return _features(_core(student), inputs["pixel_values"], inputs["image_grid_thw"])
+
+
+def _features(core: Any, pixel_values: Any, grids: Any) -> Any:
+    import torch
+
+    if not len(grids):
+        return None
+    return torch.cat(core.get_image_features(pixel_values, grids).pooler_output)
+
+
+def _core(student: Student) -> Any:
+    """Give the model below the head, with the adapter's layers in it where there is one."""
+    return _head(student).model
+
+
+def _head(student: Student) -> Any:
+    model = student.model
+    return model.get_base_model() if hasattr(model, "get_base_model") else model
+
+
+@contextlib.contextmanager
+def _evaluating(student: Student) -> Iterator[None]:
+    """Switch dropout off, and on again where it was."""
+    was_training = student.model.training
+    student.model.eval()
+    try:
+        yield
+    finally:
+        student.model.train(was_training)
+
+
+def _choose(batch: _Batch, constraint: Constraint | None) -> list[int]:
+    """Choose the next token of every place, keep it, and give all of them."""
+    import torch
+
+    logits = batch.logits
+    if constraint is not None:
+        live = [place for place in range(len(batch.rows)) if batch.is_live(place)]
+        allowed = np.ones((len(batch.rows), logits.shape[1]), dtype=bool)
+        allowed[live] = constraint.allowed([batch.rows[place] for place in live], logits.shape[1])
+        logits = logits.masked_fill(~torch.from_numpy(allowed).to(logits.device), float("-inf"))
+    chosen = batch.take(logits.argmax(dim=-1))
+    if constraint is not None:
+        for place in live:
+            constraint.consume(batch.rows[place], chosen[place])
+    return chosen
+
+
+class _Batch:
+    """The state of rows that are being answered: b places, prompts padded on the left to n tokens, room for n + max_tokens.
+
+    rows: which row each place works on. logits: (b, vocabulary) float32 of the next token. All other tensors keep their place while
+    no row leaves: tokens (b, 1), positions (3, b, 1), mask (b, 1, 1, n + max_tokens) bool, caches.
+    """
+
+    def __init__(self, student: Student, rows: Sequence[Encoded], max_tokens: int, features: Any) -> None:
+        import torch
+        from transformers import StaticCache
+
+        self._head, self._core = _head(student), _core(student)
+        self.rows = list(range(len(rows)))
+        self._is_live = [True] * len(rows)
+        inputs = prompt_batch(student, rows)
+        ids, mask, grids = inputs["input_ids"], inputs["attention_mask"], inputs["image_grid_thw"]
+        self._num_prompt, self._room = ids.shape[1], ids.shape[1] + max_tokens
+        if features is None:
+            features = _features(self._core, inputs["pixel_values"], grids)
+        embedded = self._core.get_input_embeddings()(ids)
+        if features is not None:
+            is_image = (ids == student.image_token_id)[..., None]
+            embedded = embedded.masked_scatter(is_image, features.to(embedded.dtype))
+        positions, deltas = self._core.get_rope_index(ids, inputs["mm_token_type_ids"], grids, attention_mask=mask)
+        self._cache = StaticCache(config=self._core.config, max_cache_len=self._room)
+        hidden = self._run(embedded, positions, _prompt_mask(mask, self._room), mask)
+        self.logits = self._logits(hidden)
+
+        # What a step reads and moves on.
+        device = ids.device
+        self._tokens = torch.zeros((len(rows), 1), dtype=torch.int64, device=device)
+        self._positions = (
+            (mask.sum(dim=1, keepdim=True) + deltas).expand(3, -1, 1).clone(memory_format=torch.contiguous_format)
+        )
+        self._mask = torch.zeros((len(rows), 1, 1, self._room), dtype=torch.bool, device=device)
+        self._mask[:, 0, 0, : self._num_prompt] = mask.bool()
+        self._place = torch.tensor([self._num_prompt], device=device)  # where the next token goes
+        self._chosen = torch.zeros((len(rows), max_tokens), dtype=torch.int64, device=device)
+
+    # --- rows ---
+
+    @property
+    def num_live(self) -> int:
+        return sum(self._is_live)
+
+    def is_live(self, place: int) -> bool:
+        return self._is_live[place]
+
+    def end(self, place: int) -> None:
+        self._is_live[place] = False
+
+    def tokens_of(self, place: int) -> list[int]:
+        """Give the tokens chosen so far."""
+        return self._chosen[place, : int(self._place) - self._num_prompt + 1].tolist()
+
+    def drop_ended(self) -> None:
+        """Take ended rows out, once there are enough of them."""
+        import torch
+
+        if len(self.rows) - self.num_live < LEAVING_SHARE * len(self.rows):
+            return
+        stay = [place for place in range(len(self.rows)) if self._is_live[place]]
+        index = torch.tensor(stay, device=self._tokens.device)
+        self._tokens, self._mask, self._chosen = self._tokens[index], self._mask[index], self._chosen[index]
+        self._positions = self._positions[:, index]
+        self._cache.reorder_cache(index)  # type: ignore[arg-type]  # the library says LongTensor of any tensor of int64
+        self.rows, self._is_live = [self.rows[place] for place in stay], [True] * len(stay)
+
+    # --- computing ---
+
+    def take(self, chosen: Any) -> list[int]:
+        """Keep what was chosen, (b,) int64, as the tokens to go on with."""
+        self._tokens.copy_(chosen[:, None])
+        self._chosen.index_copy_(1, self._place - self._num_prompt, self._tokens)
+        return chosen.tolist()
+
+    def step(self) -> None:
+        """Read the tokens taken last and compute the logits of the next."""
+        self._mask.index_fill_(3, self._place, True)
+        embedded = self._core.get_input_embeddings()(self._tokens)
+        self.logits = self._logits(self._run(embedded, self._positions, self._mask, None))
+        self._place.add_(1)
+        self._positions.add_(1)
+
+    def _run(self, embedded: Any, positions: Any, mask: Any, linear_mask: Any) -> Any:
+        return self._core.language_model(
+            inputs_embeds=embedded,
+            position_ids=positions,
+            attention_mask={"full_attention": mask, "linear_attention": linear_mask},
+            past_key_values=self._cache,
+            use_cache=True,
+        ).last_hidden_state
+
+    def _logits(self, hidden: Any) -> Any:
+        return self._head.lm_head(hidden[:, -1]).float()
+
+
+def _prompt_mask(mask: Any, room: int) -> Any:
+    """Give what each token of the prompts may look at, (b, 1, n, room) bool, from the mask of their tokens, (b, n).
+
+    A token of the padding looks at itself, since attention to nothing at all is not a number.
+    """
+    import torch
+
+    length = mask.shape[1]
+    causal = torch.ones((length, length), dtype=torch.bool, device=mask.device).tril()
+    itself = torch.eye(length, dtype=torch.bool, device=mask.device)
+    seen = (causal & mask[:, None, :].bool()) | itself
+    return torch.nn.functional.pad(seen, (0, room - length))[:, None]

@@ -1,0 +1,218 @@
+"""distill: greedy decoding against the library's own `generate`, token by token, on a random student in float32."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("peft", reason="needs the extra distill")
+
+from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
+
+from distill.student import decoding  # noqa: E402
+from distill.student.decoding import Decoded, decode, image_features  # noqa: E402
+from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
+from distill.student.model import IMAGE_TOKEN, Student, load_student, make_tiny_student  # noqa: E402
+
+MOST = 40  # tokens of an answer
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def student(tmp_path_factory) -> Student:
+    folder = make_tiny_student(tmp_path_factory.mktemp("student") / "tiny", seed=3)
+    return load_student(folder, device="cpu", max_pixels=64 * 64)
+
+
+@pytest.fixture(scope="module")
+def rows(student) -> list[Encoded]:
+    """Prompts of 1 to 140 tokens with 0 to 5 pictures of two sizes."""
+    rng = np.random.default_rng(4)
+    return [make_row(student, rng, *size) for size in [(5, 2), (40, 1), (120, 5), (17, 3), (1, 0), (60, 0), (2, 1)]]
+
+
+def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pictures: int) -> Encoded:
+    start, image, end = student.tokenizer.convert_tokens_to_ids(["<|vision_start|>", IMAGE_TOKEN, "<|vision_end|>"])
+    patches, grids = np.zeros((0, 1536), np.float32), np.zeros((0, 3), np.int64)
+    if num_pictures:
+        sizes = [(64, 64) if i % 2 else (64, 32) for i in range(num_pictures)]
+        pictures = [Image.fromarray(rng.integers(0, 255, (*size, 3), dtype=np.uint8)) for size in sizes]
+        seen = student.image_processor(pictures, return_tensors="np")
+        patches, grids = np.asarray(seen["pixel_values"], np.float32), np.asarray(seen["image_grid_thw"], np.int64)
+    ids: list[int] = []
+    for count in (grids.prod(axis=1) // 4).tolist():
+        ids += [int(rng.integers(20, 200)), start, *[image] * count, end]
+    ids += rng.integers(20, 200, num_words).tolist()
+    return Encoded("row", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
+
+
+def generated(student: Student, rows: Sequence[Encoded], most: int = MOST, **more) -> list[Decoded]:
+    """The same by the library."""
+    inputs = prompt_batch(student, rows)
+    if not len(inputs["image_grid_thw"]):
+        del inputs["pixel_values"], inputs["image_grid_thw"]
+    with torch.inference_mode():
+        output = student.model.generate(
+            **inputs, max_new_tokens=most, do_sample=False, eos_token_id=student.end_token_id,
+            pad_token_id=student.pad_token_id, **more,
+        )  # fmt: skip
+    found = []
+    for ids in output[:, inputs["input_ids"].shape[1] :].tolist():
+        is_finished = student.end_token_id in ids
+        kept = ids[: ids.index(student.end_token_id)] if is_finished else ids
+        found.append(Decoded(student.tokenizer.decode(kept), len(kept), is_finished))
+    return found
+
+
+def ending_at(student: Student, rows: Sequence[Encoded], most: int = MOST) -> Student:
+    """The same student with another end token, such that its answers to `rows` end here and there."""
+    inputs = prompt_batch(student, rows)
+    with torch.inference_mode():
+        output = student.model.generate(
+            **inputs, max_new_tokens=most, do_sample=False, eos_token_id=-1, pad_token_id=student.pad_token_id
+        )
+    answers = output[:, inputs["input_ids"].shape[1] :].tolist()
+    lengths = {
+        token: [answer.index(token) if token in answer else most for answer in answers]
+        for token in {token for answer in answers for token in answer}
+    }
+    best = max(lengths, key=lambda token: (len(set(lengths[token])), sum(lengths[token])))
+    assert len(set(lengths[best])) >= 3
+    other = replace(student)
+    other.__dict__["end_token_id"] = best
+    return other
+
+
+def test_a_batch_of_different_lengths_has_the_tokens_of_generate(student, rows):
+    assert len({len(row.prompt_ids) for row in rows}) == len(rows)
+    found = decode(student, rows, max_tokens=MOST)
+    assert found == generated(student, rows)
+    assert {answer.num_tokens for answer in found} == {MOST}
+
+
+def test_a_row_has_the_same_answer_alone_and_among_others(student, rows):
+    together = decode(student, rows, max_tokens=MOST)
+    assert [decode(student, [row], max_tokens=MOST)[0] for row in rows] == together
+    assert [generated(student, [row])[0] for row in rows] == together
+    assert decode(student, rows[::-1], max_tokens=MOST)[::-1] == together
+
+
+def test_answers_end_at_the_end_token(student, rows):
+    ending = ending_at(student, rows)
+    found = decode(ending, rows, max_tokens=MOST)
+    assert found == generated(ending, rows)
+    assert len({answer.num_tokens for answer in found}) >= 3
+    assert decode(ending, rows, max_tokens=1) == generated(ending, rows, 1)
+
+
+def test_rows_that_ended_leave_the_batch(student, rows, monkeypatch):
+    ending = ending_at(student, rows)
+    expected, sizes = generated(ending, rows), []
+    with ending.model.lm_head.register_forward_hook(lambda module, inputs, output: sizes.append(len(output))):
+        assert decode(ending, rows, max_tokens=MOST) == expected
+        work, sizes[:] = sum(sizes), []
+        monkeypatch.setattr(decoding, "LEAVING_SHARE", 1e-9)  # each at once
+        assert decode(ending, rows, max_tokens=MOST) == expected
+    needed = sum(min(answer.num_tokens + 1, MOST) for answer in expected)
+    assert sum(sizes) == needed
+    assert needed <= work <= needed / (1 - 0.25)
+    assert sizes[0] == len(rows) > sizes[-1]
+
+
+def test_rows_without_pictures_only(student, rows):
+    blind = [row for row in rows if not len(row.image_grids)]
+    assert len(blind) == 2
+    assert decode(student, blind, max_tokens=MOST) == generated(student, blind)
+    assert image_features(student, blind) is None
+
+
+def test_features_seen_before_give_the_same(student, rows):
+    features = [image_features(student, [row]) for row in rows]
+    joined = torch.cat([each for each in features if each is not None])
+    with student.model.model.visual.register_forward_hook(lambda *_: pytest.fail("the tower looked again")):
+        found = decode(student, rows, max_tokens=MOST, features=joined)
+    assert found == generated(student, rows)
+
+
+def test_an_adapter_and_dropout(student, rows, tmp_path):
+    from peft import LoraConfig, get_peft_model
+
+    make_tiny_student(tmp_path / "tiny", seed=3)
+    own = load_student(tmp_path / "tiny", device="cpu", max_pixels=64 * 64)
+    plain = decode(own, rows, max_tokens=MOST)
+    own.model = get_peft_model(
+        own.model,
+        LoraConfig(r=4, lora_dropout=0.5, init_lora_weights=False, target_modules=r".*layers\.\d+\.mlp\.up_proj"),
+    )
+    own.model.train()
+    found = decode(own, rows, max_tokens=MOST)
+    assert own.model.training  # as it was
+    own.model.eval()
+    assert found == generated(own, rows) != plain
+
+
+class EvenTokens:
+    """Allows even tokens only, and the end after five of them."""
+
+    def __init__(self, end: int, num_rows: int) -> None:
+        self.end, self.counts = end, [0] * num_rows
+
+    def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
+        allowed = np.tile(np.arange(num_tokens) % 2 == 0, (len(rows), 1))
+        allowed[:, self.end] = [self.counts[row] > row for row in rows]
+        return allowed
+
+    def consume(self, row: int, token: int) -> None:
+        self.counts[row] += 1
+
+
+class Even(LogitsProcessor):
+    """The same for `generate`."""
+
+    def __init__(self, end: int, num_prompt: int) -> None:
+        self.end, self.num_prompt = end, num_prompt
+
+    def __call__(self, input_ids, scores):
+        scores = scores.clone()
+        scores[:, 1::2] = float("-inf")
+        count = input_ids.shape[1] - self.num_prompt
+        for row in range(len(scores)):
+            scores[row, self.end] = scores[row, self.end] if count > row else float("-inf")
+        return scores
+
+
+def test_a_constraint_decides_what_may_come(student, rows):
+    own = replace(student)
+    own.__dict__["end_token_id"] = 44  # even, so that it comes now and then
+    end, num_prompt = own.end_token_id, max(len(row.prompt_ids) for row in rows)
+    even = LogitsProcessorList([Even(end, num_prompt)])
+    found = decode(own, rows, max_tokens=MOST, constraint=EvenTokens(end, len(rows)))
+    assert found == generated(own, rows, logits_processor=even) != decode(own, rows, max_tokens=MOST)
+
+
+def test_a_step_can_be_recorded(student, rows):
+    """Nothing in a step asks the host: a compiler takes it whole, and what it made moves the same state on."""
+    with torch.inference_mode():
+        one, two = (decoding._Batch(student, rows, MOST, None) for _ in range(2))
+        for batch in (one, two):
+            batch.take(batch.logits.argmax(dim=-1))
+        places = [tensor.data_ptr() for tensor in (two._tokens, two._positions, two._mask, two._place)]
+        compiled = torch.compile(two.step, backend="eager", fullgraph=True)
+        for _ in range(3):
+            one.step()
+            compiled()
+            torch.testing.assert_close(two.logits, one.logits)
+            assert one.take(one.logits.argmax(dim=-1)) == two.take(two.logits.argmax(dim=-1))
+        assert places == [tensor.data_ptr() for tensor in (two._tokens, two._positions, two._mask, two._place)]
