@@ -5,6 +5,8 @@ Names of folders, contents of files and words of servers may hold escape sequenc
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import re
 
@@ -50,16 +52,30 @@ def markdown_code(text: str, longest: int = LONGEST) -> str:
     return f"{fence}{space}{line}{space}{fence}"
 
 
-def html_page(title: str, style: str, body: str) -> str:
+def html_page(title: str, style: str, body: str, script: str = "") -> str:
     """Give a self-contained page, of a body whose foreign texts went through `for_html`.
 
-    The content security policy lets it do nothing but show itself: no script, no request, no form, even where an escape was forgotten.
+    The content security policy lets it do nothing but show itself and run the one script of ours that it names by its hash: no other script, no
+    request, no form, even where an escape was forgotten.
     """
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+    allowed = (
+        f"script-src 'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'; " if script else ""
+    )
+    policy = (
+        f"default-src 'none'; {allowed}img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+    )
+    run = f"<script>{script}</script>\n" if script else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width">
 <title>{for_html(title)}</title><style>{style}</style></head><body>
 {body}
-</body></html>
+{run}</body></html>
 """
+
+
+def json_block(name: str, text: str) -> str:
+    """Give JSON text as an element that a script reads and nothing runs; no text in it can end the element."""
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return f'<script type="application/json" id="{name}">{text}</script>'

@@ -194,6 +194,11 @@ def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
         rgb = read_rgb(frame)
     except InputError:
         return None
+    return small_jpeg(rgb, width_px, jpeg_quality)
+
+
+def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:
+    """Give a picture, (h, w, 3) uint8 RGB, as a JPEG of a width in base64, for a page."""
     height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
     small = cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA)
     return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")

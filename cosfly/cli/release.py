@@ -75,3 +75,32 @@ def release_stats(
     from release.stats import stats
 
     typer.echo(stats.run(folder, out))
+
+
+@app.command("viewer")
+def release_viewer(
+    folder: Annotated[Path, typer.Argument(help="Release folder, run folder or playback tree.")],
+    out: Annotated[Path, typer.Option(help="The page.")],
+    captions: Annotated[
+        Path | None, typer.Option(help="captions.jsonl of a playback tree; a run and a release have their own.")
+    ] = None,
+    flights: Annotated[int, typer.Option(help="Most flights on the page; of more, spread evenly.")] = 100,
+    frames: Annotated[int, typer.Option(help="Most frames of a flight.")] = 16,
+    picture_px: Annotated[
+        int, typer.Option(help="Width of a colour picture, px; depth and mask have half of it.")
+    ] = 320,
+    max_mb: Annotated[
+        int, typer.Option(help="Size of the page, MB: what would make it larger loses its pictures.")
+    ] = 64,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
+    """Make one page that works offline: flights, frames (colour, depth, mask), tracks from above, captions with verdict and evidence, filters."""
+    from cosfly.config import build
+    from release.viewer import page
+    from release.viewer.schema import ViewerConfig
+
+    options.resolve(config, overrides)
+    chosen = {"flights": flights, "frames": frames, "picture_px": picture_px, "max_mb": max_mb}
+    written = page.run(folder, out, build(ViewerConfig, chosen, "the options"), captions)
+    typer.echo(f"{written}: {written.stat().st_size / 1e6:,.1f} MB")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +52,14 @@ def num_rows(path: Path) -> int:
         return table.metadata.num_rows
 
 
-def row_groups(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[pa.Table]:
-    """Yield the row groups of a parquet file, in memory one at a time; raises as `open_table`, and for one over the limit."""
+def row_groups(
+    path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
+) -> Iterator[pa.Table]:
+    """Yield the row groups of a parquet file, of these numbers or all, in memory one at a time; raises as `open_table`, and for one over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
+            if wanted is not None and k not in wanted:
+                continue
             about = table.metadata.row_group(k)
             size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
             if size > limits().file_mb * MB:

@@ -1,0 +1,1 @@
+"""One page that shows a release or a run: flights, frames, maps, captions."""

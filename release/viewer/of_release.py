@@ -1,0 +1,203 @@
+"""What the viewer shows of a release: poses and captions of its rows, pictures of the chosen ones alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+from cosfly.console import progress_bar
+from cosfly.frame_views import View, depth_colors, segmentation_colors
+from cosfly.products.captions import Coc, Language
+from cosfly.products.frames import FrameFile
+from cosfly.reading.arrays import parse_array, parse_picture
+from cosfly.reading.tables import arrow_errors, row_groups
+from release.card.numbers import row_lists
+from release.columns import BOX, PLACE, POINT, SCALAR_NAMES
+from release.columns import PICTURES as COLUMNS
+from release.record import ReleaseRecord, read_record
+from release.viewer.choosing import choose_flights, choose_frames, path_of, shown_sentences
+from release.viewer.pictures import Pictures, box_of
+from release.viewer.schema import Shown, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
+
+Place = tuple[str, ...]  # PLACE
+VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
+LANGUAGES: tuple[Language, ...] = ("en", "zh")
+SCAN = [
+    *PLACE,
+    "sample_id",
+    "track",
+    "frame_index",
+    "time_s",
+    "width_px",
+    "height_px",
+    "fov_deg",
+    "pose",
+    "target",
+    "has_caption",
+    "verdict",
+    "decision",
+]
+
+
+class Scanned:
+    """What the first pass keeps of a flight that is shown: its places, the captions' kinds, and where its rows stand."""
+
+    def __init__(self, row: Mapping[str, Any]) -> None:
+        self.row = row
+        self.places: dict[int, tuple[list[float], list[float]]] = {}
+        self.kinds: dict[int, tuple] = {}
+        self.groups: dict[int, tuple[Path, int]] = {}
+        self.frames = list[ShownFrame]()
+
+    def add(self, row: Mapping[str, Any], shard: Path, group: int) -> None:
+        """Take a row of the flight."""
+        index, target = row["frame_index"], row["target"]
+        drone = [row["pose"][axis] for axis in POINT[:2]]
+        self.places[index] = (drone, [np.nan] * 2 if target is None else [target[axis] for axis in POINT[:2]])
+        self.groups[index] = (shard, group)
+        if row["has_caption"]:
+            self.kinds[index] = (row["verdict"], row["decision"])
+
+
+def show_release(dataset: Path, cfg: ViewerConfig) -> Shown:
+    """Reads a release folder, gives what the page shows of it.
+
+    Raises:
+        InputError: the record or a shard cannot be read.
+    """
+    record = read_record(dataset / "release.json")
+    names = [flight.flight for flight in record.flights]
+    chosen = set(choose_flights(names, [name.rpartition("/")[0] for name in names], cfg.flights))
+    notes = [] if len(chosen) == len(names) else [f"{len(chosen):,} of {len(names):,} flights are shown"]
+    notes.append("a release holds no map: the tracks are drawn without one")
+    scanned = _scan(dataset, record, chosen)
+    frames = {place: choose_frames(sorted(one.places), one.kinds, cfg.frames) for place, one in scanned.items()}
+    pictures = Pictures(cfg, len(scanned), sum(map(len, frames.values())))
+    with progress_bar("viewer: frames", pictures.num_frames) as advance:
+        for row in _rows(dataset, record, scanned, frames):
+            scanned[place_of(row)].frames.append(_frame(row, record, pictures))
+            advance(1)
+    flights = [_flight(one) for one in scanned.values()]
+    return Shown(title=record.name, kind="release", notes=[*notes, *pictures.notes()], maps={}, flights=flights)
+
+
+def place_of(row: Mapping[str, Any]) -> Place:
+    return tuple(row[name] for name in PLACE)
+
+
+def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place, Scanned]:
+    """Read the places of all rows, keep those of the chosen flights, in the rows' order."""
+    scanned: dict[Place, Scanned] = {}
+    with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
+        for shard in record.shards:
+            path = dataset / shard.path
+            for group, rows in enumerate(row_lists(path, [*SCAN, *_split()])):
+                for row in rows:
+                    if "/".join(place_of(row)) in chosen:
+                        scanned.setdefault(place_of(row), Scanned(row)).add(row, path, group)
+                advance(len(rows))
+    return scanned
+
+
+def _split() -> list[str]:
+    return [name for name in ("split",) if name in SCALAR_NAMES]
+
+
+def _rows(
+    dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, Scanned], frames: Mapping[Place, list[int]]
+) -> Iterator[dict[str, Any]]:
+    """Read the chosen rows with their pictures; of the row groups those alone that hold one."""
+    columns = [*SCALAR_NAMES, *(COLUMNS[file].name for file in record.settings.modalities)]
+    wanted: dict[Path, set[int]] = {}
+    for place, indices in frames.items():
+        for index in indices:
+            path, group = scanned[place].groups[index]
+            wanted.setdefault(path, set()).add(group)
+    for shard in record.shards:
+        path = dataset / shard.path
+        for table in row_groups(path, columns, tree=dataset, wanted=wanted.get(path, ())):
+            with arrow_errors(path):
+                places = table.select([*PLACE, "frame_index"]).to_pylist()
+                kept = [row["frame_index"] in frames.get(place_of(row), ()) for row in places]
+                rows = table.filter(pa.array(kept)).to_pylist()
+            yield from rows
+
+
+def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) -> ShownFrame:
+    views: Mapping[View, Callable[[], np.ndarray]] = {
+        VIEW_OF[file]: partial(picture, row, file) for file in record.settings.modalities
+    }
+    pose, target, seen, box = row["pose"], row["target"], row["visibility"], row["target_bbox"]
+    x, y, z, yaw = (round(float(pose[name]), 2) for name in (*POINT, "yaw_deg"))
+    return ShownFrame(
+        index=row["frame_index"],
+        time_s=round(row["time_s"], 3),
+        drone=(x, y, z, yaw),
+        target=None if target is None else (round(target["x_m"], 2), round(target["y_m"], 2), round(target["z_m"], 2)),
+        visibility=None if seen is None else round(seen, 3),
+        is_perturbed=bool(row["is_perturbed"]),
+        events=row["perturbation"],
+        style=row["style"],
+        box=None if box is None else box_of([box[name] for name in BOX], row["width_px"], row["height_px"]),
+        pictures=pictures.of_frame(views),
+        caption=_caption(row) if row["has_caption"] else None,
+    )
+
+
+def picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
+    """Give a picture of a row as colours, (h, w, 3) uint8 RGB.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
+    if file == "depth":
+        return depth_colors(parse_array(cell or b"", where, dtype=np.float32, ndim=2))
+    data = (cell or {}).get("bytes") or b""
+    if file == "rgb":
+        return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
+    coded = parse_picture(data, where)  # B the high, G the low byte of the id, R the kind
+    return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
+
+
+def _caption(row: Mapping[str, Any]) -> ShownCaption:
+    texts = {}
+    for language in LANGUAGES:
+        coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in Coc.model_fields})
+        texts[language] = shown_sentences(coc, row.get(f"sentence_states_{language}"))
+    return ShownCaption(
+        decision=row["decision"],
+        label=row["label"],
+        label_from=row["label_from"],
+        verdict=row["verdict"],
+        repair=row["repair_strategy"],
+        teacher=f"{row['teacher_kind']}: {row['teacher_model']}",
+        writing=row["writing"],
+        window=row["caption_window"] or [],
+        texts=texts,
+    )
+
+
+def _flight(scanned: Scanned) -> ShownFlight:
+    row, order = scanned.row, sorted(scanned.places)
+    return ShownFlight(
+        name="/".join(place_of(row)),
+        group="/".join(place_of(row)[:-1]),
+        map=f"{row['run']}/{row['town']}",
+        town=row["town"],
+        track=row["track"],
+        split=row.get("split"),
+        result=None,
+        fov_deg=round(row["fov_deg"], 1),
+        num_frames=len(order),
+        num_captions=len(scanned.kinds),
+        drone_path=path_of(np.array([scanned.places[index][0] for index in order])),
+        target_path=path_of(np.array([scanned.places[index][1] for index in order])),
+        frames=sorted(scanned.frames, key=lambda frame: frame.index),
+    )

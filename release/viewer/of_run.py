@@ -1,0 +1,212 @@
+"""What the viewer shows of a run folder or a playback tree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.console import progress_bar
+from cosfly.errors import InputError
+from cosfly.frame_views import VIEW_FILES, View, read_view
+from cosfly.products.boxes import read_boxes
+from cosfly.products.captions import Caption, Coc, Language, read_captions
+from cosfly.products.inspection import read_inspection
+from cosfly.products.places import folder_name, place_of, town_folder
+from cosfly.products.playback import Flight, find_flights, read_flight
+from release.viewer.choosing import boxes_of, choose_flights, choose_frames, path_of, shown_sentences
+from release.viewer.pictures import Pictures, box_of
+from release.viewer.schema import Shown, ShownBox, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
+
+Key = tuple[str, str, str]  # a town's folder, trajectory, variant
+VIEWS: tuple[View, ...] = ("rgb", "depth", "segmentation")
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A playback tree and what was made of it; None where that is not there. run: its name among several."""
+
+    run: str
+    data: Path
+    captions: Path | None = None
+    inspect: Path | None = None
+    boxes: Path | None = None
+
+
+def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
+    """Tell what a folder is: a run, a run of several towns, or a playback tree.
+
+    Args:
+        captions: of a tree; a run has its own.
+    """
+    if (folder / "render").is_dir():
+        return [_of_run(folder, captions)]
+    towns = sorted(path.parent for path in folder.glob("*/render") if path.is_dir())
+    return [_of_run(town, captions) for town in towns] or [Tree("", folder, captions)]
+
+
+def _of_run(folder: Path, captions: Path | None) -> Tree:
+    own = ("caption/captions.jsonl", "inspect/inspect.json", "simplify/step2_simplified.json")
+    own_captions, inspected, boxes = (folder / name if (folder / name).exists() else None for name in own)
+    return Tree(folder_name(folder.absolute().name), folder / "render", captions or own_captions, inspected, boxes)
+
+
+def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> Shown:
+    """Reads a run folder or a playback tree, gives what the page shows of it.
+
+    Raises:
+        InputError: there is no flight, or captions, inspection or map cannot be read.
+    """
+    trees = find_trees(folder, captions)
+    found = [(tree, place) for tree in trees for place in find_flights(tree.data)]
+    groups = [(tree.run, place_of(place).town, place_of(place).trajectory) for tree, place in found]
+    chosen = choose_flights(found, groups, cfg.flights)
+    notes = [] if len(chosen) == len(found) else [f"{len(chosen):,} of {len(found):,} flights are shown"]
+    wanted = {(tree.run, _key(place)) for tree, place in chosen}
+    kinds = _kinds(trees, wanted)
+    frames: dict[tuple[Tree, Path], list[int]] = {}  # the flights themselves are read again, one at a time
+    for tree, place in chosen:
+        try:
+            num_frames = len(read_flight(place, strict=False))
+        except InputError as error:
+            notes.append(f"not shown: {place.parent.name}/{place.name}: {error.what}")
+            continue
+        frames[tree, place] = choose_frames(range(num_frames), kinds.get((tree.run, _key(place)), {}), cfg.frames)
+    texts = _texts(trees, {(tree.run, _key(place)): set(indices) for (tree, place), indices in frames.items()})
+    results = _results(trees)
+    pictures = Pictures(cfg, len(frames), sum(map(len, frames.values())))
+    shown = list[ShownFlight]()
+    with progress_bar("viewer: frames", pictures.num_frames) as advance:
+        for (tree, place), indices in frames.items():
+            flight, key = read_flight(place, strict=False), (tree.run, _key(place))
+            one = _flight(tree, flight, results.get(key), len(kinds.get(key, {})))
+            for index in indices:
+                one.frames.append(_frame(flight, index, texts.get((*key, index)), pictures))
+                advance(1)
+            shown.append(one)
+    maps = _maps(trees, shown)
+    return Shown(title=folder.absolute().name, kind="run", notes=[*notes, *pictures.notes()], maps=maps, flights=shown)
+
+
+def _key(folder: Path) -> Key:
+    place = place_of(folder)
+    return town_folder(place.town), place.trajectory, place.variant
+
+
+def _kinds(trees: list[Tree], wanted: set[tuple[str, Key]]) -> dict[tuple[str, Key], dict[int, tuple]]:
+    """Read what the captions of the chosen flights say, by frame: verdict, decision, whether it was dropped."""
+    kinds: dict[tuple[str, Key], dict[int, tuple]] = {}
+    for run, caption in _read(trees):
+        place = (run, (town_folder(caption.town), caption.trajectory, caption.variant))
+        if place in wanted:
+            decision = caption.en.flight_decision if caption.en else None
+            kinds.setdefault(place, {})[caption.frame_index] = (caption.status, caption.verdict, decision)
+    return kinds
+
+
+def _texts(trees: list[Tree], wanted: dict[tuple[str, Key], set[int]]) -> dict[tuple[str, Key, int], ShownCaption]:
+    """Read the captions of the chosen frames."""
+    texts: dict[tuple[str, Key, int], ShownCaption] = {}
+    for run, caption in _read(trees):
+        key = (town_folder(caption.town), caption.trajectory, caption.variant)
+        if caption.frame_index in wanted.get((run, key), ()):
+            texts[run, key, caption.frame_index] = _caption(caption)
+    return texts
+
+
+def _read(trees: list[Tree]) -> Iterator[tuple[str, Caption]]:
+    for tree in trees:
+        if tree.captions is not None:
+            for caption in read_captions(tree.captions):
+                yield tree.run, caption
+
+
+def _results(trees: list[Tree]) -> dict[tuple[str, Key], str]:
+    """Read what the inspection made of each flight."""
+    return {
+        (tree.run, (town_folder(flight.town), flight.trajectory, flight.variant)): flight.result
+        for tree in trees
+        if tree.inspect is not None
+        for flight in read_inspection(tree.inspect).flights
+    }
+
+
+def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -> ShownFlight:
+    names = [name for name in (tree.run, flight.town, flight.trajectory) if name]
+    return ShownFlight(
+        name="/".join([*names, flight.variant]),
+        group="/".join(names),
+        map=f"{tree.run}/{flight.town}",
+        town=flight.town,
+        track="clean" if flight.is_original else "perturbed",
+        split=None,
+        result=result,
+        fov_deg=round(flight.camera.fov_deg, 1),
+        num_frames=len(flight),
+        num_captions=num_captions,
+        drone_path=path_of(flight.positions_m),
+        target_path=path_of(flight.targets_m),
+        frames=[],
+    )
+
+
+def _frame(flight: Flight, index: int, caption: ShownCaption | None, pictures: Pictures) -> ShownFrame:
+    folder = flight.frame_folder(index)
+    views: Mapping[View, Callable[[], np.ndarray]] = {
+        view: partial(read_view, folder, view) for view in VIEWS if (folder / VIEW_FILES[view]).exists()
+    }
+    target, seen = flight.targets_m[index], flight.visibility[index]
+    x, y, z, yaw = (round(float(v), 2) for v in (*flight.positions_m[index], flight.rotations_deg[index, 1]))
+    tx, ty, tz = (round(float(v), 2) for v in target)
+    return ShownFrame(
+        index=index,
+        time_s=round(float(flight.time_s[index]), 3),
+        drone=(x, y, z, yaw),
+        target=None if np.isnan(target).any() else (tx, ty, tz),
+        visibility=None if np.isnan(seen) else round(float(seen), 3),
+        is_perturbed=bool(flight.is_perturbed[index]),
+        events=dict(flight.events(index) or {}) or None,
+        style=flight.styles[index],
+        box=box_of(flight.target_bbox[index].tolist(), flight.camera.width_px, flight.camera.height_px),
+        pictures=pictures.of_frame(views),
+        caption=caption,
+    )
+
+
+def _caption(caption: Caption) -> ShownCaption:
+    states = caption.checks.sentences or {}
+    answers: dict[Language, Coc | None] = {"en": caption.en, "zh": caption.zh}
+    repair = caption.repair
+    rung = repair and f"{repair.rung or repair.outcome}, first {repair.first_decision} ({repair.first_verdict})"
+    return ShownCaption(
+        decision=caption.en.flight_decision if caption.en else None,
+        label=caption.label,
+        label_from=caption.label_from,
+        verdict=caption.verdict,
+        repair=rung,
+        teacher=f"{caption.teacher.kind}: {caption.teacher.model}",
+        writing=caption.writing,
+        window=caption.window,
+        texts={language: shown_sentences(coc, states.get(language)) for language, coc in answers.items() if coc},
+        problems=caption.checks.evidence if isinstance(caption.checks.evidence, list) else [],
+        dropped=caption.drop_reason if caption.status == "dropped" else None,
+    )
+
+
+def _maps(trees: list[Tree], flights: list[ShownFlight]) -> dict[str, list[ShownBox]]:
+    """Read the boxes round the flights of each town, where the run has them."""
+    maps: dict[str, list[ShownBox]] = {}
+    for tree in trees:
+        for name in sorted({flight.map for flight in flights if flight.map.startswith(f"{tree.run}/")}):
+            if tree.boxes is not None:
+                near = [
+                    place
+                    for flight in flights
+                    if flight.map == name
+                    for place in (*flight.drone_path, *flight.target_path)
+                ]
+                maps[name] = boxes_of(read_boxes(tree.boxes), near)
+    return maps

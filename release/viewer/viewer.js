@@ -1,0 +1,268 @@
+"use strict";
+// Everything foreign is written with textContent or as an attribute of a picture that we encoded; nothing here makes markup of text.
+(() => {
+const data = JSON.parse(document.getElementById("data").textContent);
+const FIELDS = { critical_components: ["critical components", "关键要素"], reasoning_trace: ["reasoning", "推理"] };
+const LANGUAGES = { en: "English", zh: "Chinese" };
+const VIEWS = [["rgb", "colour"], ["depth", "depth, bright is near"], ["segmentation", "instances, the person in red"]];
+const NONE = "none";
+const SVG = "http://www.w3.org/2000/svg";
+
+// --- small tools -----------------------------------------------------------------------------------------------------
+
+function fill(node, properties, children) {
+  for (const [name, value] of Object.entries(properties || {})) {
+    if (value === null || value === undefined || value === false) continue;
+    node.setAttribute(name, value === true ? "" : String(value));
+  }
+  for (const child of children) if (child !== null) node.append(child);
+  return node;
+}
+const make = (tag, properties, ...children) => fill(document.createElement(tag), properties, children);
+const draw = (tag, properties, ...children) => fill(document.createElementNS(SVG, tag), properties, children);
+const words = (token) => String(token).replaceAll("_", " ");
+const show = (id, ...children) => document.getElementById(id).replaceChildren(...children.filter((child) => child !== null));
+
+// --- what is filtered ------------------------------------------------------------------------------------------------
+
+const samples = [];  // {flight, frame: its number among the shown ones}
+data.flights.forEach((flight, number) => flight.frames.forEach((_, frame) => samples.push({ flight: number, frame })));
+const flightOf = (sample) => data.flights[sample.flight];
+const captionOf = (sample) => flightOf(sample).frames[sample.frame].caption;
+const ofCaption = (name) => (sample) => { const caption = captionOf(sample); return caption ? caption[name] || NONE : null; };
+const FACETS = [
+  ["town", "town", (sample) => flightOf(sample).town],
+  ["split", "split", (sample) => flightOf(sample).split || NONE],
+  ["track", "track", (sample) => flightOf(sample).track],
+  ["verdict", "verdict", ofCaption("verdict")],
+  ["decision", "decision", ofCaption("decision")],
+  ["evidence", "evidence", (sample) => evidenceOf(captionOf(sample))],
+  ["repair", "repaired", (sample) => { const caption = captionOf(sample); return caption ? (caption.repair ? "yes" : "no") : null; }],
+];
+function evidenceOf(caption) {
+  if (!caption) return null;
+  const states = Object.values(caption.texts).flat().map((sentence) => sentence.state);
+  if (states.includes("contradicted")) return "contradicted";
+  if (states.includes("unread")) return "partly unread";
+  return states.length && states.every((state) => state === "proved") ? "all proved" : "not judged";
+}
+const textOf = (sample) => {
+  const flight = flightOf(sample), frame = flight.frames[sample.frame], caption = frame.caption;
+  const texts = caption ? Object.values(caption.texts).flat().map((sentence) => sentence.text) : [];
+  return [flight.name, `frame ${frame.index}`, frame.style, ...texts, caption && caption.label, caption && caption.teacher].join(" ").toLowerCase();
+};
+
+const state = { flight: 0, index: null, q: "" };
+let matching = [];
+
+function readHash() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  for (const [name] of FACETS) state[name] = given.get(name) || "";
+  state.q = given.get("q") || "";
+  const found = data.flights.findIndex((flight) => flight.name === given.get("flight"));
+  state.flight = Math.max(0, found);
+  state.index = given.has("frame") ? Number(given.get("frame")) : null;
+}
+function writeHash() {
+  const given = new URLSearchParams();
+  for (const [name] of FACETS) if (state[name]) given.set(name, state[name]);
+  if (state.q) given.set("q", state.q);
+  const flight = data.flights[state.flight];
+  if (flight) given.set("flight", flight.name);
+  if (state.index !== null) given.set("frame", state.index);
+  history.replaceState(null, "", `#${given}`);
+}
+
+function filter() {
+  const q = state.q.toLowerCase();
+  matching = samples.filter((sample) => FACETS.every(([name, , value]) => !state[name] || value(sample) === state[name]) && (!q || textOf(sample).includes(q)));
+}
+const ofFlight = (number) => matching.filter((sample) => sample.flight === number);
+
+function settle() {  // the flight and frame that are shown are among those that match, where any does
+  if (!matching.length) { state.index = null; return; }
+  let mine = ofFlight(state.flight);
+  if (!mine.length) { state.flight = matching[0].flight; mine = ofFlight(state.flight); }
+  const indices = mine.map((sample) => flightOf(sample).frames[sample.frame].index);
+  if (!indices.includes(state.index)) {
+    const wanted = state.index === null ? indices[0] : state.index;
+    state.index = indices.reduce((best, one) => (Math.abs(one - wanted) < Math.abs(best - wanted) ? one : best), indices[0]);
+  }
+}
+const current = () => ofFlight(state.flight).find((sample) => flightOf(sample).frames[sample.frame].index === state.index) || null;
+
+// --- parts of the page -----------------------------------------------------------------------------------------------
+
+function drawFilters() {
+  const fields = FACETS.flatMap(([name, title, value]) => {
+    const counts = new Map();
+    for (const sample of samples) { const one = value(sample); if (one !== null) counts.set(one, (counts.get(one) || 0) + 1); }
+    if (!counts.size || (counts.size === 1 && counts.has(NONE))) return [];
+    const options = [...counts.keys()].sort().map((one) => make("option", { value: one, selected: state[name] === one }, `${words(one)} (${counts.get(one)})`));
+    const select = make("select", { name }, make("option", { value: "" }, "all"), ...options);
+    select.addEventListener("change", () => { state[name] = select.value; update(); });
+    return [make("label", {}, make("span", {}, title), select)];
+  });
+  const search = make("input", { type: "search", name: "q", value: state.q, placeholder: "words of a caption, a flight, a style" });
+  search.addEventListener("input", () => { state.q = search.value; update(); });
+  const clear = make("button", { type: "button" }, "clear");
+  clear.addEventListener("click", () => { for (const [name] of FACETS) state[name] = ""; state.q = ""; drawFilters(); update(); });
+  show("filters", ...fields, make("label", { class: "wide" }, make("span", {}, "free text"), search), clear, make("output", { id: "count" }));
+}
+
+function drawLead() {
+  const frames = data.flights.reduce((sum, flight) => sum + flight.num_frames, 0);
+  const captions = data.flights.reduce((sum, flight) => sum + flight.num_captions, 0);
+  document.getElementById("lead").textContent = `A ${data.kind}: ${data.flights.length} flights with ${frames.toLocaleString("en")} frames and ` +
+    `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 flight.`;
+}
+
+function drawFlights() {
+  const counts = new Map();
+  for (const sample of matching) counts.set(sample.flight, (counts.get(sample.flight) || 0) + 1);
+  const rows = data.flights.map((flight, number) => {
+    if (!counts.has(number)) return null;
+    const [head, tail] = [flight.name.split("/").slice(0, -2).join("/"), flight.name.split("/").slice(-2).join(" / ")];
+    const facts = [flight.track, flight.split, flight.result, `${flight.fov_deg}\u00b0`].filter(Boolean).join(" \u00b7 ");
+    const row = make("button", { type: "button", class: number === state.flight ? "here" : "", "aria-current": number === state.flight },
+      make("small", {}, head), make("b", {}, tail), make("small", {}, `${facts} \u00b7 ${counts.get(number)} of ${flight.frames.length} frames`));
+    row.addEventListener("click", () => { state.flight = number; state.index = null; update(); });
+    return row;
+  });
+  show("flights", ...(counts.size ? rows : [make("p", { class: "nothing" }, "Nothing matches the filters.")]));
+}
+
+function boxOf(box) {  // a frame round the person, with some air, for it may be a few pixels small
+  if (!box) return null;
+  const node = make("i", {}), percent = (share) => `${(100 * share).toFixed(2)}%`, air = 0.012;
+  node.style.left = percent(box[0] - air);
+  node.style.top = percent(box[1] - 1.8 * air);
+  node.style.width = percent(box[2] - box[0] + 2 * air);
+  node.style.height = percent(box[3] - box[1] + 3.6 * air);
+  return node;
+}
+
+function drawStage(sample) {
+  if (!sample) { show("stage", make("p", { class: "nothing" }, "No frame to show.")); return; }
+  const flight = flightOf(sample), frame = flight.frames[sample.frame], mine = ofFlight(state.flight), place = mine.indexOf(sample);
+  const pictures = VIEWS.map(([view, title]) => make("figure", { class: view },
+    frame.pictures[view] ? make("div", { class: "picture" }, make("img", { alt: `${title}, frame ${frame.index}`, src: `data:image/jpeg;base64,${frame.pictures[view]}` }), boxOf(frame.box))
+      : make("div", { class: "gone" }, "no picture"),
+    make("figcaption", {}, title)));
+  const slider = make("input", { type: "range", min: 0, max: Math.max(0, mine.length - 1), value: place, "aria-label": "frame", id: "time" });
+  slider.addEventListener("input", () => step(Number(slider.value) - mine.indexOf(current())));
+  const back = make("button", { type: "button", "aria-label": "frame before" }, "\u25c0"), on = make("button", { type: "button", "aria-label": "next frame" }, "\u25b6");
+  back.addEventListener("click", () => step(-1));
+  on.addEventListener("click", () => step(1));
+  const [x, y, z, yaw] = frame.drone;
+  const away = frame.target ? Math.hypot(x - frame.target[0], y - frame.target[1], z - frame.target[2]) : null;
+  const facts = [
+    `frame ${frame.index}`, `${frame.time_s.toFixed(1)} s`, frame.style && `style ${words(frame.style)}`,
+    away === null ? "no target" : `${away.toFixed(1)} m to the person, ${(z - frame.target[2]).toFixed(1)} m above the hip`,
+    frame.visibility === null ? null : `${Math.round(100 * frame.visibility)} % visible`, `yaw ${yaw.toFixed(0)}\u00b0`,
+    frame.is_perturbed ? `perturbed${frame.events ? ": " + Object.entries(frame.events).map(([name, what]) => `${name} ${what}`).join("; ") : ""}` : null,
+  ].filter(Boolean);
+  show("stage", make("h2", { id: "where" }, flight.name), make("div", { class: "pictures" }, ...pictures),
+    make("div", { class: "time" }, back, slider, on, make("span", {}, `${place + 1} / ${mine.length}`)),
+    make("ul", { class: "facts" }, ...facts.map((fact) => make("li", {}, fact))));
+}
+
+function drawMap(sample) {
+  const flight = data.flights[state.flight];
+  if (!flight) { show("map"); return; }
+  const both = data.flights.filter((one) => one.group === flight.group && one !== flight);
+  const points = [flight, ...both].flatMap((one) => [...one.drone_path, ...one.target_path]);
+  if (!points.length) { show("map", make("p", { class: "nothing" }, "No place is known.")); return; }
+  const xs = points.map((point) => point[0]), ys = points.map((point) => point[1]);
+  const margin = 12, low = [Math.min(...xs) - margin, Math.min(...ys) - margin], high = [Math.max(...xs) + margin, Math.max(...ys) + margin];
+  const side = Math.max(high[0] - low[0], high[1] - low[1]), west = (low[0] + high[0] - side) / 2, north = (low[1] + high[1] + side) / 2;
+  const at = (point) => `${(point[0] - west).toFixed(1)},${(north - point[1]).toFixed(1)}`;
+  const line = (path, name) => draw("polyline", { points: path.map(at).join(" "), class: name });
+  const boxes = (data.maps[flight.map] || []).map((box) => draw("polygon", { points: box.corners.map(at).join(" "), class: `box ${box.kind}` }, draw("title", {}, box.kind)));
+  const parts = [...boxes, ...both.map((one) => line(one.drone_path, `drone other ${one.track}`)), line(flight.target_path, "target"), line(flight.drone_path, `drone ${flight.track}`)];
+  if (sample) {
+    const frame = flight.frames[sample.frame], [x, y, , yaw] = frame.drone, open = (flight.fov_deg / 360) * Math.PI;
+    const away = frame.target ? Math.hypot(x - frame.target[0], y - frame.target[1]) : 0, reach = Math.max(side / 8, (1.25 * away) / Math.max(0.2, Math.cos(open)));
+    const ray = (turn) => { const angle = ((yaw + turn) * Math.PI) / 180; return at([x + reach * Math.cos(angle), y + reach * Math.sin(angle)]); };
+    parts.push(draw("polygon", { points: [at([x, y]), ray(-flight.fov_deg / 2), ray(flight.fov_deg / 2)].join(" "), class: "view" }));
+    const dot = (place, name) => { const [cx, cy] = at(place).split(","); return draw("circle", { cx, cy, r: side / 80, class: name }); };
+    if (frame.target) parts.push(dot(frame.target, "target dot"));
+    parts.push(dot([x, y], `drone dot ${flight.track}`));
+  }
+  const bar = 10 ** Math.floor(Math.log10(side / 2)), end = side - side / 40;
+  parts.push(draw("line", { x1: end - bar, x2: end, y1: end, y2: end, class: "bar" }), draw("text", { x: end, y: end - side / 60, "font-size": side / 28, "text-anchor": "end" }, `${bar} m`));
+  const key = [[`drone ${flight.track}`, `drone, ${flight.track}`], ...both.map((one) => [`drone other ${one.track}`, `drone, ${one.track}`]), ["target", "person"]];
+  show("map", draw("svg", { viewBox: `0 0 ${side.toFixed(1)} ${side.toFixed(1)}`, role: "img", "aria-label": "map from above, north up" }, ...parts),
+    make("p", { class: "key" }, ...key.map(([name, title]) => make("span", {}, draw("svg", { viewBox: "0 0 20 6", class: "swatch" }, draw("line", { x1: 0, x2: 20, y1: 3, y2: 3, class: name })), title)), make("span", {}, "north up")));
+}
+
+function drawCaption(sample) {
+  const caption = sample && captionOf(sample);
+  if (!caption) { show("caption", make("p", { class: "nothing" }, sample ? "This frame has no caption." : "")); return; }
+  const tags = [
+    caption.verdict && make("span", { class: `tag ${caption.verdict}` }, words(caption.verdict)),
+    make("span", { class: "tag plain" }, `decision: ${words(caption.decision || NONE)}`),
+    make("span", { class: "tag plain" }, `label: ${words(caption.label || NONE)}${caption.label_from ? ` (from the ${caption.label_from})` : ""}`),
+    caption.repair && make("span", { class: "tag plain" }, `repaired: ${words(caption.repair)}`),
+    caption.dropped && make("span", { class: "tag bad" }, `dropped: ${words(caption.dropped)}`),
+    make("span", { class: "tag plain" }, `${caption.teacher}${caption.writing ? `, ${caption.writing}` : ""}`),
+    make("span", { class: "tag plain" }, `window: ${caption.window.join(", ")}`),
+  ].filter(Boolean);
+  const columns = Object.entries(LANGUAGES).map(([language, title], number) => {
+    const sentences = caption.texts[language] || [];
+    const fields = Object.entries(FIELDS).flatMap(([field, names]) => {
+      const mine = sentences.filter((sentence) => sentence.field === field);
+      if (!mine.length) return [];
+      const parts = mine.flatMap((sentence) => [make("span", { class: `sentence ${sentence.state || "unjudged"}`, title: sentence.state || "not judged" }, sentence.text), " "]);
+      return [make("h4", {}, names[number]), make("p", {}, ...parts)];
+    });
+    return make("div", { lang: language === "zh" ? "zh-CN" : "en" }, make("h3", {}, title), ...(fields.length ? fields : [make("p", { class: "nothing" }, "no text")]));
+  });
+  const key = ["proved", "contradicted", "unread"].map((name) => make("span", { class: `sentence ${name}` }, name));
+  show("caption", make("div", { class: "tags" }, ...tags), make("div", { class: "texts" }, ...columns),
+    caption.problems.length ? make("ul", { class: "problems" }, ...caption.problems.map((problem) => make("li", {}, problem))) : null,
+    make("p", { class: "key" }, "Sentences against the geometry of the flight: ", ...key.flatMap((one) => [one, " "])));
+}
+
+// --- what happens ----------------------------------------------------------------------------------------------------
+
+function update() {
+  filter();
+  settle();
+  const sample = current();
+  drawFlights();
+  drawStage(sample);
+  drawMap(sample);
+  drawCaption(sample);
+  document.getElementById("count").textContent = `${matching.length.toLocaleString("en")} of ${samples.length.toLocaleString("en")} frames`;
+  writeHash();
+}
+function step(by) {
+  const mine = ofFlight(state.flight), sample = mine[Math.min(mine.length - 1, Math.max(0, mine.indexOf(current()) + by))];
+  if (!sample) return;
+  state.index = flightOf(sample).frames[sample.frame].index;
+  const held = document.activeElement && document.activeElement.id === "time";
+  update();
+  if (held) document.getElementById("time").focus();
+}
+function stepFlight(by) {
+  const numbers = [...new Set(matching.map((sample) => sample.flight))], place = numbers.indexOf(state.flight) + by;
+  if (place < 0 || place >= numbers.length) return;
+  state.flight = numbers[place];
+  state.index = null;
+  update();
+  document.querySelector("#flights .here").scrollIntoView({ block: "nearest" });
+}
+const KEYS = { ArrowLeft: () => step(-1), ArrowRight: () => step(1), ArrowUp: () => stepFlight(-1), ArrowDown: () => stepFlight(1) };
+document.addEventListener("keydown", (event) => {
+  const inField = ["INPUT", "SELECT"].includes(event.target.tagName);
+  if (!inField && KEYS[event.key] && !event.altKey && !event.ctrlKey && !event.metaKey) { event.preventDefault(); KEYS[event.key](); }
+});
+document.getElementById("filters").addEventListener("submit", (event) => event.preventDefault());
+window.addEventListener("hashchange", () => { readHash(); drawFilters(); update(); });
+readHash();
+drawLead();
+drawFilters();
+update();
+document.body.dataset.ready = "yes";
+})();

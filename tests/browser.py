@@ -1,0 +1,140 @@
+"""A headless Chromium over a pair of pipes, for pages that run a script: no driver, no port, no package."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+PATIENCE_S = 60.0
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--hide-scrollbars",
+    "--disable-dev-shm-usage", "--remote-debugging-pipe",
+)  # fmt: skip
+
+
+def chromium() -> str:
+    """Give the browser's path; skips the test where there is none."""
+    found = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip("no chromium on this machine (apt-get install chromium)")
+    return found
+
+
+class Page:
+    """One tab. requests: the addresses of all that was asked for; said: what the page wrote to its console, errors too."""
+
+    def __init__(self, to_browser: int, from_browser: int) -> None:
+        self.pipes = (to_browser, from_browser)
+        self.number, self.buffer, self.session = 0, b"", None
+        self.requests: list[str] = []
+        self.said: list[str] = []
+
+    def send(self, method: str, **params: Any) -> dict:
+        """Send a command of the devtools protocol and wait for its answer."""
+        self.number += 1
+        message = {"id": self.number, "method": method, "params": params} | (
+            {"sessionId": self.session} if self.session else {}
+        )
+        os.write(self.pipes[0], json.dumps(message).encode() + b"\0")
+        while True:
+            got = self._next()
+            if got.get("id") == self.number:
+                assert "error" not in got, got["error"]
+                return got["result"]
+            self._note(got)
+
+    def _note(self, event: dict) -> None:
+        params = event.get("params", {})
+        if event.get("method") == "Network.requestWillBeSent":
+            self.requests.append(params["request"]["url"])
+        if event.get("method") in (
+            "Runtime.exceptionThrown",
+            "Log.entryAdded",
+            "Runtime.consoleAPICalled",
+            "Page.javascriptDialogOpening",
+        ):
+            self.said.append(json.dumps(params)[:500])
+
+    def _next(self) -> dict:
+        end = time.monotonic() + PATIENCE_S
+        while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.pipes[1]], [], [], max(0.0, end - time.monotonic()))
+            data = os.read(self.pipes[1], 1 << 20) if ready else b""
+            assert data, "the browser does not answer"
+            self.buffer += data
+        line, self.buffer = self.buffer.split(b"\0", 1)
+        return json.loads(line)
+
+    def open(
+        self, path: Path, fragment: str = "", *, width: int = 1400, height: int = 1000, dark: bool = False
+    ) -> None:
+        """Load a file in a window of some size, anew."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
+        self.send(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
+        )
+        self.send("Page.navigate", url="about:blank")
+        self.send("Page.navigate", url=path.absolute().as_uri() + fragment)
+        end = time.monotonic() + PATIENCE_S
+        while self.run("document.readyState") != "complete":
+            assert time.monotonic() < end, "the page does not load"
+            time.sleep(0.02)
+
+    def run(self, script: str) -> Any:
+        """Evaluate an expression in the page."""
+        got = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in got, got["exceptionDetails"]
+        return got["result"].get("value")
+
+    def press(self, key: str) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+    def picture(self) -> bytes:
+        """Give the whole page as PNG."""
+        return base64.b64decode(self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"])
+
+
+@contextlib.contextmanager
+def browser(folder: Path) -> Iterator[Page]:
+    """Start a browser with a profile of its own; ends with the block."""
+    (ours_in, theirs_out), (theirs_in, ours_out) = os.pipe(), os.pipe()
+
+    def connect() -> None:  # the protocol's pipes are 3 and 4
+        spare = [os.dup(theirs_in), os.dup(theirs_out)]
+        os.dup2(os.dup(spare[0]), 3)
+        os.dup2(os.dup(spare[1]), 4)
+
+    command = [chromium(), *FLAGS, f"--user-data-dir={folder}", "about:blank"]
+    with open(folder.with_name("chromium.log"), "wb") as log:
+        process = subprocess.Popen(command, preexec_fn=connect, close_fds=False, stdout=log, stderr=log)
+    os.close(theirs_in)
+    os.close(theirs_out)
+    try:
+        page = Page(ours_out, ours_in)
+        targets = page.send("Target.getTargets")["targetInfos"]
+        target = next(one["targetId"] for one in targets if one["type"] == "page")
+        page.session = page.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            page.send(f"{domain}.enable")
+        yield page
+    finally:
+        process.kill()
+        process.wait()
+        os.close(ours_in)
+        os.close(ours_out)

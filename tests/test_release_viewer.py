@@ -1,0 +1,377 @@
+"""The viewer: what it chooses, how large it gets, that foreign text stays text, and, in a real browser, that it works."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browser import browser
+from hypothesis import given
+from hypothesis import strategies as st
+from specimens_distill import WINDOW, make_caption
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import InputError
+from cosfly.products.boxes import make_box_map, write_boxes
+from cosfly.products.captions import write_captions
+from cosfly.products.kinds import KINDS
+from cosfly.products.playback import find_flights, read_flight
+from release.viewer.choosing import PATH_POINTS, boxes_of, choose_flights, choose_frames, path_of, spread
+from release.viewer.page import page_html, run
+from release.viewer.schema import Shown, ViewerConfig
+from specimens import make_playback_tree
+
+NUM_POINTS = 24
+EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>\u202e\x1b]0;owned\x07 {\"a\":1} <!-- ${1}"
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    """A run of four flights in two towns with captions, among them a conflict, a repaired, a dropped and a hostile one, and a map."""
+    folder = tmp_path_factory.mktemp("runs") / "one"
+    tree = make_playback_tree(folder / "render", 2, NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02"))
+    captions = []
+    for place in find_flights(tree):
+        flight = read_flight(place)
+        for i in range(WINDOW - 1, NUM_POINTS - 1):
+            more: dict = (
+                {"checks": {"sentences": {"en": ["proved", "unread"], "zh": ["proved", "contradicted"]}}}
+                if i % 2
+                else {}
+            )
+            if i == 7:
+                more["verdict"] = "HARD_CONFLICT"
+            if i == 8:
+                more["repair"] = {
+                    "strategy": "cascade",
+                    "rung": "anchored",
+                    "outcome": "repaired",
+                    "asks": 2,
+                    "first_decision": "hover",
+                    "first_verdict": "HARD_CONFLICT",
+                }
+            if i == 9:
+                more |= {"status": "dropped", "drop_reason": "hard_conflict"}
+            caption = make_caption(flight.town, flight.trajectory, flight.variant, i, **more)
+            if i == 10:
+                caption = caption.model_copy(
+                    update={
+                        "en": caption.en.model_copy(update={"reasoning_trace": EVIL}),
+                        "label": EVIL,
+                        "verdict": "SOFT_CONFLICT",
+                    }
+                )
+            captions.append(caption)
+    (folder / "caption").mkdir()
+    write_captions(folder / "caption/captions.jsonl", captions)
+    (folder / "simplify").mkdir()
+    town = make_box_map(
+        [[0, 0, 5], [4, 9, 1], [900, 0, 5]],
+        [[5, 5, 5], [2, 1, 1], [5, 5, 5]],
+        np.zeros((3, 3)),
+        [KINDS["Buildings"], KINDS["Vegetation"], 3],
+    )
+    write_boxes(folder / "simplify/step2_simplified.json", town)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run_folder, tmp_path_factory) -> Path:
+    return run(run_folder, tmp_path_factory.mktemp("page") / "viewer.html", ViewerConfig(frames=12, picture_px=64))
+
+
+def data_of(text: str) -> dict:
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+# --- what goes in -----------------------------------------------------------------------------------------------------
+
+
+@given(count=st.integers(0, 300), most=st.integers(0, 40))
+def test_a_spread_holds_both_ends_and_no_more_than_asked(count, most):
+    chosen = spread(count, most)
+    assert len(chosen) == min(count, most)
+    assert chosen == sorted(set(chosen))
+    assert not chosen or chosen[0] == 0
+    assert len(chosen) < 2 or chosen[-1] == count - 1
+
+
+@given(groups=st.lists(st.integers(0, 9), max_size=30), most=st.integers(1, 30))
+def test_the_tracks_of_a_trajectory_are_chosen_together(groups, most):
+    flights = list(range(len(groups)))
+    chosen = choose_flights(flights, groups, most)
+    taken = {groups[one] for one in chosen}
+    assert sorted(chosen) == [one for one in flights if groups[one] in taken]
+    assert len(chosen) <= most or len(taken) == 1
+    assert bool(chosen) == bool(groups)
+
+
+@given(num=st.integers(1, 80), captioned=st.sets(st.integers(0, 79)), most=st.integers(1, 20))
+def test_each_verdict_is_among_the_frames_while_there_is_room(num, captioned, most):
+    frames = list(range(0, 2 * num, 2))
+    kinds = {frame: frame % 3 for frame in frames if frame in captioned}
+    chosen = choose_frames(frames, kinds, most)
+    assert chosen == sorted(set(chosen))
+    assert set(chosen) <= set(frames)
+    assert len(chosen) == min(most, len(kinds) or num)
+    if most >= 6:
+        assert {kinds[frame] for frame in chosen if frame in kinds} == set(kinds.values())
+
+
+def test_a_path_is_thinned_and_unknown_places_are_left_out():
+    points = np.arange(3_000.0).reshape(-1, 3)
+    points[5] = np.nan
+    path = path_of(points)
+    assert len(path) == PATH_POINTS
+    assert (path[0], path[-1]) == ((0.0, 1.0), (2997.0, 2998.0))
+    assert path_of(np.full((4, 2), np.nan)) == []
+
+
+def test_boxes_near_the_flights_are_drawn_ground_first():
+    rows = [[0, 0, 9], [0, 0, 0], [500, 0, 1], [20, 0, 1]]
+    town = make_box_map(
+        rows,
+        [[1, 2, 1]] * 4,
+        [[0, 90, 0]] + [[0, 0, 0]] * 3,
+        [KINDS["Buildings"], KINDS["Roads"], 3, KINDS["Vegetation"]],
+    )
+    shown = boxes_of(town, [(0.0, 0.0), (10.0, 0.0)])
+    assert [box.kind for box in shown] == ["Roads", "Vegetation", "Buildings"]
+    assert sorted(shown[2].corners) == [(-2.0, -1.0), (-2.0, 1.0), (2.0, -1.0), (2.0, 1.0)]  # turned by a quarter
+    assert boxes_of(town, []) == []
+
+
+def test_a_run_is_shown_as_it_is(page):
+    data = data_of(page.read_text(encoding="utf-8"))
+    assert len(data["flights"]) == 4
+    assert {flight["map"] for flight in data["flights"]} == {"one/Town01", "one/Town02"}
+    assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # the third is 900 m away
+    flight = data["flights"][1]
+    assert (flight["track"], flight["num_frames"], flight["num_captions"], flight["split"]) == (
+        "perturbed",
+        NUM_POINTS,
+        19,
+        None,
+    )
+    by_index = {frame["index"]: frame["caption"] for frame in flight["frames"]}
+    assert len(by_index) == 12
+    assert by_index[7]["verdict"] == "HARD_CONFLICT"
+    assert by_index[9]["dropped"] == "hard_conflict"
+    states = [sentence["state"] for sentence in by_index[7]["texts"]["zh"]]
+    assert states == ["proved", "contradicted"]
+    for frame in flight["frames"]:
+        assert set(frame["pictures"]) == {"rgb", "depth", "segmentation"}
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(frame["pictures"]["rgb"]), np.uint8), cv2.IMREAD_COLOR)
+        assert pixels.shape[:2] == (36, 64)
+
+
+def test_the_page_asks_for_nothing_and_names_its_script(page):
+    text = page.read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    script = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script[-1].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+    assert "unsafe-eval" not in policy
+    assert len(re.findall(r"<script", text)) == 2  # the data and ours: no text opened a third
+    assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
+    assert all(
+        f"{word}(" not in script[-1] for word in ("innerHTML", "insertAdjacentHTML", "document.write", "eval", "fetch")
+    )
+    assert "innerHTML" not in script[-1]
+
+
+def test_a_page_keeps_its_size(run_folder, tmp_path):
+    """Noise does not compress: with all pictures the page would have three times what it may."""
+    tree = make_playback_tree(tmp_path / "tree", 1, 24, width_px=320, height_px=180)
+    rng = np.random.default_rng(0)
+    for path in tree.rglob("rgb.png"):
+        cv2.imwrite(str(path), rng.integers(0, 256, (180, 320, 3), np.uint8))
+    whole = run(tree, tmp_path / "whole.html", ViewerConfig(frames=24, picture_px=640))
+    cut = run(tree, tmp_path / "cut.html", ViewerConfig(frames=24, picture_px=640, max_mb=1))
+    assert whole.stat().st_size > 2 * 2**20
+    assert cut.stat().st_size < 2**20
+    data = data_of(cut.read_text(encoding="utf-8"))
+    bare = sum(not frame["pictures"] for flight in data["flights"] for frame in flight["frames"])
+    assert 0 < bare < 48
+    assert any(f"{bare} of 48 shown frames have no pictures" in note for note in data["notes"])
+    assert [len(flight["frames"]) for flight in data["flights"]] == [24, 24]
+
+
+def test_what_cannot_be_read_is_said(run_folder, tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 2, 6)
+    first, *_, last = find_flights(tree)
+    (first / "trajectory.json").write_text("{", encoding="utf-8")
+    (last / "frames_playback/frame_00003/rgb.png").write_bytes(b"no picture")
+    (last / "frames_playback/frame_00004/depth.npy").unlink()
+    data = data_of(run(tree, tmp_path / "page.html", ViewerConfig()).read_text(encoding="utf-8"))
+    assert len(data["flights"]) == 3
+    assert any(note.startswith("not shown") for note in data["notes"])
+    assert "of 1 frames a picture cannot be read" in data["notes"]
+    frames = data["flights"][-1]["frames"]
+    assert set(frames[3]["pictures"]) == {"depth", "segmentation"}
+    assert set(frames[4]["pictures"]) == {"rgb", "segmentation"}
+
+
+def test_bad_folders_are_refused(tmp_path):
+    with pytest.raises(InputError):
+        run(tmp_path / "nothing", tmp_path / "page.html", ViewerConfig())
+    (tmp_path / "release.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(InputError):
+        run(tmp_path, tmp_path / "page.html", ViewerConfig())
+    assert not (tmp_path / "page.html").exists()
+    result = CliRunner().invoke(
+        app, ["release", "viewer", str(tmp_path), "--out", str(tmp_path / "p.html"), "--frames", "0"]
+    )
+    assert result.exit_code == 1
+    assert "frames" in str(result.exception or result.output)
+
+
+def test_the_command_tells_the_size(run_folder, tmp_path):
+    result = CliRunner().invoke(
+        app,
+        ["release", "viewer", str(run_folder), "--out", str(tmp_path / "p.html"), "--frames", "2", "--flights", "2"],
+    )
+    assert result.exit_code == 0, result.output
+    assert re.search(r"p\.html: 0\.\d MB", result.output)
+    assert len(data_of((tmp_path / "p.html").read_text(encoding="utf-8"))["flights"]) == 2
+
+
+@given(st.text(max_size=60))
+def test_no_text_ends_the_data(text):
+    shown = Shown(title=text, kind="run", notes=[text], maps={}, flights=[])
+    page = page_html(shown)
+    assert len(re.findall(r"<script", page)) == 2
+    assert data_of(page)["kind"] == "run"
+
+
+# --- in a browser -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("chromium") / "profile"
+    folder.mkdir()
+    with browser(folder) as opened:
+        yield opened
+
+
+COUNT = "document.getElementById('count').textContent"
+WHERE = "document.getElementById('where').textContent + ' ' + document.querySelector('.facts li').textContent"
+
+
+def values_of(tab, name: str) -> list[str]:
+    return tab.run(
+        f"[...document.querySelector('select[name={name}]').options].map((one) => one.value).filter(Boolean)"
+    )
+
+
+def set_filter(tab, name: str, value: str) -> None:
+    tab.run(
+        f"(() => {{ const one = document.querySelector('[name={name}]'); one.value = {json.dumps(value)};"
+        f" one.dispatchEvent(new Event(one.tagName === 'INPUT' ? 'input' : 'change')); }})()"
+    )
+
+
+@pytest.mark.slow
+def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
+    tab.requests.clear()
+    tab.said.clear()
+    tab.open(page)
+    assert tab.run("document.body.dataset.ready") == "yes"
+    assert tab.run(COUNT) == "48 of 48 frames"
+    assert tab.run("[...document.images].length") == 3
+    assert tab.run("Promise.all([...document.images].map((one) => one.decode().then(() => one.naturalWidth)))") == [
+        64,
+        32,
+        32,
+    ]
+    assert tab.run("document.querySelectorAll('#map polygon.box').length") == 2
+    assert (
+        tab.run("document.querySelectorAll('#map svg:not(.swatch) polyline').length") == 3
+    )  # both tracks and the person
+    assert [url for url in tab.requests if not url.startswith(("data:", "about:"))] == [page.absolute().as_uri()]
+    assert tab.said == []
+
+
+@pytest.mark.slow
+def test_filters_and_the_address_agree(tab, page):
+    tab.open(page)
+    assert set(values_of(tab, "verdict")) == {"CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT"}
+    assert set(values_of(tab, "town")) == {"Town01", "Town02"}
+    assert set(values_of(tab, "evidence")) == {"contradicted", "not judged"}
+    set_filter(tab, "verdict", "HARD_CONFLICT")
+    assert tab.run(COUNT) == "4 of 48 frames"
+    assert tab.run("document.querySelector('.tag').textContent") == "HARD CONFLICT"
+    assert tab.run("document.querySelectorAll('.sentence.contradicted').length") == 2  # the Chinese one, and the key
+    set_filter(tab, "town", "Town02")
+    assert tab.run(COUNT) == "2 of 48 frames"
+    address = tab.run("location.hash")
+    tab.open(page, address)
+    assert tab.run(COUNT) == "2 of 48 frames"
+    assert tab.run("document.querySelector('select[name=town]').value") == "Town02"
+    set_filter(tab, "q", "frame 7")
+    assert tab.run(COUNT) == "2 of 48 frames"
+    set_filter(tab, "q", "nobody says this")
+    assert tab.run(COUNT) == "0 of 48 frames"
+    assert "Nothing matches" in tab.run("document.getElementById('flights').textContent")
+    tab.run("document.querySelector('#filters button').click()")
+    assert tab.run(COUNT) == "48 of 48 frames"
+    tab.open(page, "#repair=yes")
+    assert "repaired: anchored, first hover" in tab.run("document.querySelector('.tags').textContent")
+
+
+@pytest.mark.slow
+def test_keys_and_the_slider_move_in_time(tab, page):
+    tab.open(page)
+    first = tab.run(WHERE)
+    tab.press("ArrowRight")
+    second = tab.run(WHERE)
+    assert second != first
+    tab.press("ArrowLeft")
+    assert tab.run(WHERE) == first
+    tab.press("ArrowLeft")  # the first frame stays
+    assert tab.run(WHERE) == first
+    tab.press("ArrowDown")
+    assert "aug_001" in tab.run(WHERE)
+    tab.press("ArrowUp")
+    tab.run(
+        "(() => { const one = document.getElementById('time'); one.value = one.max; one.dispatchEvent(new Event('input')); })()"
+    )
+    assert f"frame {NUM_POINTS - 2}" in tab.run(WHERE)
+    assert f"frame={NUM_POINTS - 2}" in tab.run("location.hash")
+
+
+@pytest.mark.slow
+def test_hostile_text_is_text(tab, page):
+    tab.said.clear()
+    tab.open(page, "#q=window.hacked")
+    assert tab.run(COUNT) == "4 of 48 frames"
+    assert tab.run("typeof window.hacked") == "undefined"
+    shown = tab.run("document.getElementById('caption').textContent")
+    assert "<script>window.hacked=1</script>" in shown
+    assert "\\u202e" in shown
+    assert "\u202e" not in shown
+    assert tab.run("document.querySelectorAll('#caption img, #caption script').length") == 0
+    tab.open(page, "#town=%3Cimg%20src%3Dx%3E&flight=%22&frame=NaN&q=%00%3C")
+    assert tab.run("document.body.dataset.ready") == "yes"
+    assert tab.said == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "dark"), [(1400, False), (1400, True), (390, False), (390, True)])
+def test_nothing_leaves_the_window(tab, page, width, dark):
+    tab.open(page, width=width, height=900, dark=dark)
+    assert tab.run("document.documentElement.scrollWidth") <= width
+    ink, paper = tab.run(
+        "(() => { const one = getComputedStyle(document.body); return [one.color, one.backgroundColor]; })()"
+    )
+    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) for color in (ink, paper)]
+    assert (brightness[0] > brightness[1]) is dark
