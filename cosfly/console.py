@@ -69,8 +69,8 @@ def set_levels(level: int) -> None:
 
 
 @contextlib.contextmanager
-def progress_bar(label: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
-    """Show progress: a bar on a terminal, a log line every few seconds elsewhere. Yields advance(count)."""
+def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Callable[[int], None]]:
+    """Show progress: a bar on a terminal, a log line every few seconds elsewhere; `total` None is not known. Yields advance(count)."""
     if console.is_terminal:
         columns = (
             TextColumn("{task.description}", markup=False),
@@ -90,6 +90,6 @@ def progress_bar(label: str, total: int, done: int = 0) -> Iterator[Callable[[in
         position += count
         if time.monotonic() - last_s >= SECONDS_BETWEEN_LINES:
             last_s = time.monotonic()
-            log.info("%s: %d of %d", label, position, total)
+            log.info("%s: %d%s", label, position, "" if total is None else f" of {total}")
 
     yield advance

@@ -101,6 +101,11 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest()
 
 
+def fingerprints(path: Path) -> set[str]:
+    """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
+    return _lineage(path, fingerprint(path))
+
+
 def folder_digests(folder: Path) -> dict[str, str]:
     """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, of what that leaves out its own."""
     listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}

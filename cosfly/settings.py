@@ -23,7 +23,7 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worker_pool import Watch
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.stage import InferConfig
-from distill.prepare.stage import PrepareConfig
+from distill.prepare.samples import PrepareConfig
 from distill.training.stage import TrainConfig
 from release.package.stage import ReleaseConfig
 

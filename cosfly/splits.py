@@ -23,6 +23,7 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarc
 OTHER_BUILD = "_Opt"  # what the name of a town's other build ends with
 NEAR_M = 0.5  # a third of a second of walking: steps that differ, rounded numbers, and other ground stay within
 NEAR_SHARE = 0.5  # of the seconds that two flights share; people who cross are near for one or two
+FEW_S = 5  # below so many near seconds all must be: two who begin at one place are near for some
 MOST_GAP_S = 2.0  # between the points that a place is interpolated from
 ON_TIME_S = 1e-3  # a point so near to a full second stands on it
 SAME_M = 1e-3  # flights that differ by less are compared with others once
@@ -70,8 +71,8 @@ class _Track:
 def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     """Tell which courses are of one walk: name -> walk.
 
-    Those are that are of one family of towns and, in NEAR_SHARE of the full seconds that both know and one at least, within NEAR_M of
-    each other on the map, and all that are so joined one by one. A walk is called by the first of its names in the alphabet, so neither
+    Those are that are of one family of towns and within NEAR_M of each other on the map, in NEAR_SHARE of the full seconds that both
+    know and FEW_S at least, or in all of them; and all that are so joined one by one. A walk is called by the first of its names in the alphabet, so neither
     the order of the courses nor their number of flights matters.
     """
     tracks = sorted((_at_seconds(course) for course in courses), key=lambda track: (track.name, track.key))
@@ -135,11 +136,12 @@ def _near_pairs(tracks: list[_Track]) -> list[tuple[str, str]]:
             near = cKDTree(places_m[at_once]).query_pairs(NEAR_M, output_type="ndarray")
             for one, other in np.sort(owners[at_once][near]).tolist():
                 num_near[one, other] += 1
-    return [
-        (tracks[one].name, tracks[other].name)
-        for (one, other), count in num_near.items()
-        if count >= NEAR_SHARE * len(np.intersect1d(tracks[one].seconds, tracks[other].seconds, assume_unique=True))
-    ]
+    found = []
+    for (one, other), count in num_near.items():
+        shared = np.intersect1d(tracks[one].seconds, tracks[other].seconds, assume_unique=True)
+        if count >= min(len(shared), max(FEW_S, NEAR_SHARE * len(shared))):
+            found.append((tracks[one].name, tracks[other].name))
+    return found
 
 
 # --- splits -----------------------------------------------------------------------------------------------------------

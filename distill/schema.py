@@ -1,37 +1,52 @@
-"""What the steps of `distill` hand on: training samples, with their one reader.
+"""What the steps of `distill` hand on: a training set, with its one reader and its one writer. Needs no torch.
 
-Needs no torch.
+training_set.json                          whence it came, its splits, and the system prompts, each once
+train.parquet  val.parquet  test.parquet   a sample a row; a split without samples has no file
+README.md                                  for `datasets.load_dataset`
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, overload
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
+from cosfly.errors import InputError
 from cosfly.frame_views import VIEW_FILES, Pictures, View
 from cosfly.products.captions import Language, Prompt
-from cosfly.products.playback import flight_of
-from cosfly.products.predictions import Split
-from cosfly.reading.documents import model_lines
+from cosfly.products.frames import frame_name
+from cosfly.provenance import fingerprint, fingerprints
+from cosfly.reading.documents import read_model, validation_errors
+from cosfly.reading.tables import TableRows
+from cosfly.splits import SPLITS, Split
+from cosfly.store import atomic_file, write_bytes, write_model
 
-SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarce trajectories are handed out
+RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
+PAGE = "README.md"
+OLDER = "{split}.jsonl"  # what a split was before 3.0
+ROWS_AT_ONCE = 1000  # rows of a row group: what one look at a sample decodes
+PREPARE = "run cosfly distill prepare"
 
 
 class Sample(BaseModel):
-    """One line of a split file: what the student sees, and what it should answer."""
+    """One sample: what the student sees, and what it should answer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    schema_version: Literal["2.0"] = "2.0"
     sample_id: str
     language: Language
+    run: str  # the tree that its flight stands in
     town: str
     trajectory: str
     variant: str
-    frames: list[str]  # folders of the playback tree, oldest first
+    walk: str  # whom it follows: samples of one walk are in one split
+    window: tuple[int, ...]  # indices of the frames, oldest first
     views: tuple[View, ...]  # the pictures of each frame, in this order
     picture_px: tuple[int, int]  # (width, height) of each, which pixel values of prompt and answer refer to
     depth_range_m: float  # dark end of depth pictures
@@ -49,6 +64,16 @@ class Sample(BaseModel):
         return f"{self.sample_id}/{self.language}"
 
     @property
+    def folder(self) -> str:
+        """Where its flight stands in the tree of its run."""
+        return f"{self.town}/{self.trajectory}/{self.variant}"
+
+    @property
+    def frames(self) -> list[str]:
+        """Folders of the playback tree, oldest first."""
+        return [f"{self.folder}/{frame_name(index)}" for index in self.window]
+
+    @property
     def pictures(self) -> Pictures:
         return Pictures(self.views, self.picture_px, "separate", self.depth_range_m)
 
@@ -57,25 +82,206 @@ class Sample(BaseModel):
         """Files of the playback tree in the order of the pictures made of them: frame by frame, its views together."""
         return [f"{frame}/{VIEW_FILES[view]}" for frame in self.frames for view in self.views]
 
-    def group(self, split_by: Literal["trajectory", "town"]) -> str:
-        """Name what may not be shared by two splits. `Town03` and `Town03_Opt` are one town: the same map in two builds.
 
-        A trajectory goes by its samples' id, which has the town in front where several towns have one of its name.
-        """
-        if split_by == "town":
-            return self.town.removesuffix("_Opt")
-        return flight_of(self.sample_id).removesuffix(f"_{self.variant}")
+# --- the record -------------------------------------------------------------------------------------------------------
+
+
+class SourceTree(BaseModel):
+    """A playback tree that samples name frames of: the name of its run, and its fingerprint (cosfly/provenance.py)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    run: str
+    sha256: str
+
+
+class TrainingSet(BaseModel):
+    """`training_set.json`. samples: of each split; systems: the system prompts, which samples name by their place."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    split_by: Literal["walk", "town"]
+    trees: list[SourceTree]
+    samples: dict[Split, int]
+    systems: list[str]
+
+
+def read_training_set(dataset: Path) -> TrainingSet:
+    """Read a training set's record.
+
+    Raises:
+        InputError: it is missing, of an earlier version, or malformed.
+    """
+    path = dataset / RECORD
+    if not path.exists():
+        older = next((split for split in SPLITS if (dataset / OLDER.format(split=split)).exists()), None)
+        what = "no training set" if older is None else "a training set of another version"
+        got = f"no {RECORD}" if older is None else OLDER.format(split=older)
+        raise InputError(what, where=dataset, got=got, expected=f"{RECORD} of version {VERSION}", fix=PREPARE)
+    return read_model(path, TrainingSet, schema=RECORD_SCHEMA, version=VERSION, what="training set", tree=dataset)
+
+
+def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
+    """Tell which of the given playback trees belongs to which run of a training set: run -> tree.
+
+    Raises:
+        InputError: a tree is none of those that the training set was made of, or one of those is not given.
+    """
+    record = read_training_set(dataset)
+    run_of = {tree.sha256: tree.run for tree in record.trees}
+    trees: dict[str, Path] = {}
+    for path in data:
+        run = next((run_of[digest] for digest in fingerprints(path) if digest in run_of), None)
+        if run is None:
+            raise InputError(
+                "the training set was not made of this playback tree", where=path, got=f"fingerprint {fingerprint(path)}",
+                expected=", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees),
+                fix="give the trees that it was made of as they were then, or prepare it anew from this one",
+            )  # fmt: skip
+        trees[run] = path
+    missing = [tree.run for tree in record.trees if tree.run not in trees]
+    if missing:
+        raise InputError(
+            "a playback tree of the training set is not given", where=dataset, got=", ".join(map(str, data)) or "none",
+            expected=f"also --data of the runs {', '.join(missing)}", fix="give --data once for each of its trees",
+        )  # fmt: skip
+    return {tree.run: trees[tree.run] for tree in record.trees}
+
+
+def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
+    """Name playback trees as inputs of a stage: `data`; of several with a number in front."""
+    return {f"{number}.data" if len(trees) > 1 else "data": tree for number, tree in enumerate(trees.values(), 1)}
+
+
+# --- splits -----------------------------------------------------------------------------------------------------------
+
+_STRINGS = ("sample_id", "language", "run", "town", "trajectory", "variant", "walk")
+COLUMNS = pa.schema([
+    *(pa.field(name, pa.string(), nullable=False) for name in _STRINGS),
+    pa.field("window", pa.list_(pa.field("element", pa.int32())), nullable=False),
+    pa.field("views", pa.list_(pa.field("element", pa.string())), nullable=False),
+    pa.field("picture_px", pa.list_(pa.field("element", pa.int32())), nullable=False),
+    pa.field("depth_range_m", pa.float64(), nullable=False),
+    pa.field("system", pa.int32(), nullable=False),  # of the record's system prompts
+    *(pa.field(name, pa.string(), nullable=False) for name in ("prompt", "answer", "decision")),
+    pa.field("label", pa.string()),
+    pa.field("proved", pa.float64()),
+    pa.field("repair", pa.string()),
+    pa.field("weight", pa.float64(), nullable=False),
+])  # fmt: skip
 
 
 def split_path(dataset: Path, split: str) -> Path:
-    return dataset / f"{split}.jsonl"
+    return dataset / f"{split}.parquet"
 
 
-def read_split(dataset: Path, split: str) -> Iterator[Sample]:
-    """Yield the samples of a split.
+class Samples(Sequence[Sample]):
+    """The samples of a split: any by its number, all in a stream. Holds a few row groups; a process that it is sent to opens its own."""
+
+    def __init__(self, dataset: Path, split: Split) -> None:
+        record = read_training_set(dataset)
+        self.path, self._systems = split_path(dataset, split), record.systems
+        self._rows = TableRows(self.path, COLUMNS.names) if record.samples.get(split) else None
+
+    def __len__(self) -> int:
+        return 0 if self._rows is None else len(self._rows)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self._sample(number, row) for number, row in enumerate(self._rows or ()))
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Sample]: ...
+    def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if self._rows is None or not -len(self) <= index < len(self):
+            raise IndexError(index)
+        number = index % len(self)
+        return self._sample(number, self._rows[number])
+
+    def _sample(self, number: int, row: dict[str, Any]) -> Sample:
+        where = f"{self.path}: row {number}"
+        system, user = row.pop("system"), row.pop("prompt")
+        if not isinstance(system, int) or not 0 <= system < len(self._systems) or not isinstance(user, str):
+            raise InputError("no prompt", where=where, got=repr((system, user))[:80], expected=f"as {RECORD} has them")
+        with validation_errors(where):
+            return Sample.model_validate({**row, "prompt": Prompt(system=self._systems[system], user=user)})
+
+
+def open_split(dataset: Path, split: Split) -> Samples:
+    """Open a split.
 
     Raises:
-        InputError: names the file, the line and the field.
+        InputError: there is no training set, or it is of an earlier version. Reading a sample: names the file, the row and the field.
     """
-    lines = model_lines(split_path(dataset, split), Sample, what="training set", fix="run cosfly distill prepare first")
-    return (sample for _, sample in lines)
+    return Samples(dataset, split)
+
+
+@contextlib.contextmanager
+def write_training_set(out: Path) -> Iterator[TrainingSetWriter]:
+    """Write the splits of a training set; their files appear when the block ends without an error."""
+    with contextlib.ExitStack() as stack:
+        writer = TrainingSetWriter(out, stack)
+        yield writer
+        writer.flush()
+
+
+class TrainingSetWriter:
+    """Takes the samples one by one; of each split at most a row group waits in memory. files: what was written."""
+
+    def __init__(self, out: Path, stack: contextlib.ExitStack) -> None:
+        self._out, self._stack = out, stack
+        self.files: list[Path] = []
+        self.samples: dict[Split, int] = dict.fromkeys(SPLITS, 0)
+        self._systems: dict[str, int] = {}
+        self._rows: dict[Split, list[dict[str, Any]]] = {}
+        self._writers: dict[Split, pq.ParquetWriter] = {}
+
+    def add(self, split: Split, sample: Sample) -> None:
+        row = sample.model_dump(mode="json")
+        row["system"] = self._systems.setdefault(sample.prompt.system, len(self._systems))
+        row["prompt"] = sample.prompt.user
+        self.samples[split] += 1
+        waiting = self._rows.setdefault(split, [])
+        waiting.append(row)
+        if len(waiting) == ROWS_AT_ONCE:
+            self._write(split)
+
+    def flush(self) -> None:
+        for split, waiting in self._rows.items():
+            if waiting:
+                self._write(split)
+
+    def _write(self, split: Split) -> None:
+        if split not in self._writers:
+            path = split_path(self._out, split)
+            file = self._stack.enter_context(atomic_file(path))
+            self._writers[split] = self._stack.enter_context(pq.ParquetWriter(file, COLUMNS, compression="zstd"))
+            self.files.append(path)
+        self._writers[split].write_table(pa.Table.from_pylist(self._rows[split], schema=COLUMNS))
+        self._rows[split] = []
+
+    def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
+        """Write the record and the page, after the block ended and the splits stand."""
+        record = TrainingSet(split_by=split_by, trees=list(trees), samples=self.samples, systems=list(self._systems))
+        write_model(self._out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
+        write_bytes(self._out / PAGE, _page(record).encode())
+        self.files += [self._out / RECORD, self._out / PAGE]
+        return record
+
+
+_SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}  # as `datasets` calls them
+
+
+def _page(record: TrainingSet) -> str:
+    found = [split for split in SPLITS if record.samples[split]]
+    files = "".join(f"  - split: {_SPLIT_NAMES[split]}\n    path: {split}.parquet\n" for split in found)
+    counts = "".join(f"- {_SPLIT_NAMES[split]}: {record.samples[split]} samples\n" for split in found)
+    return (
+        f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n# Training set\n\n{counts}\n"
+        f"No two splits share a {record.split_by}. `system` is the place of a sample's system prompt in `systems` of `{RECORD}`,\n"
+        f"`prompt` its question, `answer` what it should say; its pictures are frames `window` of the playback trees of\n"
+        f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n"
+    )

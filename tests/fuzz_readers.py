@@ -71,8 +71,10 @@ from cosfly.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.store import CHECKSUMS, write_checksums, write_json
 from distill.evaluation import stage as evaluate
 from distill.inference.stage import make_prediction
-from distill.prepare import stage as dataset
-from distill.schema import read_split
+from distill.prepare import stage as prepare
+from distill.prepare.samples import PrepareConfig
+from distill.prepare.sources import Source as Prepared
+from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
 from release.package import stage as package
@@ -229,9 +231,13 @@ def _node(name: str, x: float, y: float, yaw: float = 0.0) -> dict[str, Any]:
     return {"id": f"GEN_{name}", "instance_name": name, "properties": place}
 
 
+def _prepare(captions: Path, tree: Path, out: Path) -> Path:
+    return prepare.run(PrepareConfig(unbound="accept"), [Prepared.of_files(tree, captions)], out)
+
+
 def _students(root: Path, captions: Path, tree: Path) -> None:
-    dataset.run(dataset.PrepareConfig(), captions, tree, root / "train")
-    samples = list(read_split(root / "train", "val"))
+    _prepare(captions, tree, root / "train")
+    samples = list(open_split(root / "train", "val"))
     lines = [make_prediction(sample, "val", sample.answer, 20, True).model_dump_json() for sample in samples]
     (root / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     step = root / "checkpoints/step_000002"
@@ -476,8 +482,8 @@ READERS: dict[str, Reader] = {
         (f"answers/{journal_name('flight')}", f"answers/{journal_name('closed')}"),
         lambda root, _: AnswerBook(root / "answers").latency_s("flight", "s"),
     ),
-    "samples": _one("train/train.jsonl", lambda path: list(read_split(path.parent, "train"))),
-    "prepare": Reader(("captions.jsonl",), lambda root, scratch: dataset.run(dataset.PrepareConfig(), root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
+    "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
+    "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
     "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),

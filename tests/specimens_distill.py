@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.provenance import fingerprint
+from cosfly.splits import Split
+from distill.prepare import stage as prepare
+from distill.prepare.samples import PrepareConfig
+from distill.prepare.sources import Source
+from distill.schema import Sample, SourceTree, write_training_set
 
 WINDOW = 5
 DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")
@@ -60,6 +68,23 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
         "status": "accepted",
     }
     return Caption.model_validate({**fields, **changes})
+
+
+def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings: Any) -> Path:
+    """Make a training set of captions that no record binds to their tree."""
+    cfg = PrepareConfig.model_validate({"unbound": "accept", **settings})
+    return prepare.run(cfg, [Source.of_files(tree, captions)], out, seed=seed)
+
+
+def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:
+    """Write a training set of given samples; the trees are of the run that each stands in."""
+    out.mkdir(parents=True, exist_ok=True)
+    with write_training_set(out) as writer:
+        for split, samples in splits.items():
+            for sample in samples:
+                writer.add(split, sample)
+    writer.finish("walk", [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees])
+    return out
 
 
 def make_captions(path: Path, tree: Path) -> list[Caption]:

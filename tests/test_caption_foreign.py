@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from specimens_distill import prepared
 from teacher_server import MODEL, TeacherServer
 from typer.testing import CliRunner
 
@@ -21,9 +22,8 @@ from cosfly.products.captions import Caption, Language, read_captions, write_cap
 from cosfly.products.predictions import Prediction
 from distill.inference import stage as infer
 from distill.inference.stage import failed_prediction, make_prediction
-from distill.prepare import stage as dataset
-from distill.prepare.stage import PrepareConfig, make_sample
-from distill.schema import read_split
+from distill.prepare.samples import PrepareConfig, make_sample
+from distill.schema import open_split
 from release.package import stage as package
 from release.package.captions import load_captions
 from release.package.sources import Source
@@ -266,13 +266,12 @@ def test_predictions_of_before_and_of_nothing(tmp_path, rules):
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
     write_captions(tmp_path / "captions.jsonl", rules)
-    alone = PrepareConfig(val_fraction=0, test_fraction=0)
-    taught = dataset.run(alone, tmp_path / "captions.jsonl", tree, tmp_path / "set")
-    answers = {sample.prompt.user: sample.answer for sample in read_split(taught, "train")}
+    taught = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set", val_fraction=0, test_fraction=0)
+    answers = {sample.prompt.user: sample.answer for sample in open_split(taught, "train")}
     with TeacherServer() as server:
         server.text = lambda body: answers[body["messages"][1]["content"][-1]["text"]]
         cfg = infer.InferConfig(split="train", engine="endpoint")
-        infer.run(cfg, taught, tree, server.url, tmp_path / "infer")
+        infer.run(cfg, taught, [tree], server.url, tmp_path / "infer")
     words = [
         "caption",
         "--teacher",

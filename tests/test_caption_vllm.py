@@ -13,7 +13,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from specimens_distill import make_captions
+from specimens_distill import make_captions, prepared
 from teacher_server import CHINESE, ENGLISH, is_mirror
 
 from caption.run.stage import run
@@ -25,8 +25,7 @@ from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherEr
 from cosfly.products.captions import read_captions
 from cosfly.products.predictions import read_predictions
 from distill.inference import stage as infer
-from distill.prepare import stage as dataset
-from distill.schema import read_split
+from distill.schema import open_split
 from distill.student.model import MODEL_TYPE
 from specimens import make_playback_tree
 
@@ -242,13 +241,13 @@ def test_an_answer_that_the_engine_gave_up_is_none(stand_in, model, tmp_path):
 def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 3, 8, with_augmented=False)
     make_captions(tmp_path / "captions.jsonl", tree)
-    training_set = dataset.run(dataset.PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+    training_set = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
     student = tmp_path / "student"
     student.mkdir()
     (student / "config.json").write_text(json.dumps({"model_type": MODEL_TYPE}))
     (student / "model.safetensors").touch()
     cfg = infer.InferConfig(split="train", engine="vllm")
-    predictions = read_predictions(infer.run(cfg, training_set, tree, student, tmp_path / "out"))
-    assert len(predictions) == len(stand_in.asked) == len(list(read_split(training_set, "train")))
+    predictions = read_predictions(infer.run(cfg, training_set, [tree], student, tmp_path / "out"))
+    assert len(predictions) == len(stand_in.asked) == len(list(open_split(training_set, "train")))
     assert all(prediction.coc is not None for prediction in predictions)
     assert stand_in.templates == [{"enable_thinking": False}] * len(predictions)

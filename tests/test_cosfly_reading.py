@@ -37,7 +37,7 @@ from cosfly.reading import arrays, documents, files, tables
 from cosfly.reading.limits import Limits, use_limits
 from cosfly.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
 from cosfly.store import CHECKSUMS, inside, read_checksums
-from distill.schema import read_split
+from distill.schema import RECORD, read_training_set
 from release.record import read_record
 
 
@@ -69,7 +69,7 @@ READERS = {
     "failures": ("failures.jsonl", read_failures),
     "captions": ("captions.jsonl", lambda path: list(read_captions(path))),
     "predictions": ("predictions.jsonl", read_predictions),
-    "samples": ("train.jsonl", lambda path: list(read_split(path.parent, "train"))),
+    "training set": (RECORD, lambda path: read_training_set(path.parent)),
     "foreign captions": ("foreign.jsonl", read_foreign),
     "city model": ("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "world": ("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path, sizes=[path]))),

@@ -34,9 +34,10 @@ from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees
 from cosfly.stage_folder import read_failures
 from cosfly.store import read_checksums, write_checksums, write_json
-from distill.prepare import stage as dataset
-from distill.prepare.stage import PrepareConfig
-from distill.schema import SPLITS, read_split
+from distill.prepare import stage as prepare
+from distill.prepare.samples import PrepareConfig
+from distill.prepare.sources import Source as Prepared
+from distill.schema import SPLITS, open_split
 from release.package import stage as package
 from release.package.sources import Source
 from release.package.stage import ReleaseConfig
@@ -394,11 +395,11 @@ def way(tmp_path_factory) -> Path:
     )
     inspected = inspection.run(InspectConfig(), None, None, tree, root / "inspect")
     captions = caption_stage.run(CaptionConfig(), tree, root / "caption")
-    for split_by in ("trajectory", "town"):
-        prepare = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by)
-        dataset.run(prepare, captions, tree, root / f"by_{split_by}")
-    cfg = ReleaseConfig(licence="cc-by-4.0", credits="Made by somebody else.")
-    package.run(cfg, [Source("theirs", tree, captions, inspected)], root / "release")
+    for split_by in ("walk", "town"):
+        cfg = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by)
+        prepare.run(cfg, [Prepared.of_files(tree, captions)], root / f"by_{split_by}")
+    theirs = ReleaseConfig(licence="cc-by-4.0", credits="Made by somebody else.")
+    package.run(theirs, [Source("theirs", tree, captions, inspected)], root / "release")
     return root
 
 
@@ -424,10 +425,10 @@ def test_a_foreign_tree_is_captioned_with_the_labels_of_its_clean_twins(way):
 
 
 def test_a_foreign_tree_gives_samples_and_a_release(way):
-    for split_by in ("trajectory", "town"):
-        splits = {split: {sample.town for sample in read_split(way / f"by_{split_by}", split)} for split in SPLITS}
+    for split_by in ("walk", "town"):
+        splits = {split: {sample.town for sample in open_split(way / f"by_{split_by}", split)} for split in SPLITS}
         assert sorted(map(len, splits.values())) == [0, 1, 1], "one trajectory a town, of the same name"
-        assert sum(len(list(read_split(way / f"by_{split_by}", split))) for split in SPLITS) == 2 * 4 * 4
+        assert sum(len(list(open_split(way / f"by_{split_by}", split))) for split in SPLITS) == 2 * 4 * 4
     assert verify(way / "release").is_ok
     record = read_record(way / "release/dataset/release.json")
     assert record.numbers.flights_by_track == {"clean": 2, "perturbed": 2}

@@ -9,15 +9,15 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pydantic import ValidationError
-from specimens_distill import make_caption, make_captions
+from specimens_distill import make_caption, make_captions, prepared
 
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
-from distill.prepare.stage import PrepareConfig, assign_splits, check_no_leak, make_sample, run
-from distill.schema import SPLITS, Sample, read_split, split_path
+from cosfly.splits import SPLITS
+from distill.prepare.leaks import check_no_leak
+from distill.prepare.samples import PrepareConfig, make_sample
+from distill.schema import Sample, open_split, split_path
 from specimens import make_playback_tree
 
 
@@ -35,48 +35,13 @@ def captions(tree, tmp_path_factory) -> Path:
 
 
 def sample_of(trajectory="trajectory_1", variant="ORI", frame=4, town="Town01", language="en") -> Sample:
-    sample = make_sample(make_caption(town, trajectory, variant, frame), language, PrepareConfig())
+    caption = make_caption(town, trajectory, variant, frame)
+    sample = make_sample(caption, language, PrepareConfig(), run="run", walk=f"{town}/{trajectory}")
     assert isinstance(sample, Sample)
     return sample
 
 
-# --- splits -----------------------------------------------------------------------------------------------------------
-
-
-@given(
-    num_groups=st.integers(3, 60),
-    val=st.sampled_from([0.0, 0.01, 0.1, 0.45]),
-    test=st.sampled_from([0.0, 0.01, 0.2, 0.45]),
-    seed=st.integers(0, 5),
-)
-def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
-    cfg = PrepareConfig(val_fraction=val, test_fraction=test)
-    groups = [f"trajectory_{i}" for i in range(num_groups)]
-    split_of = assign_splits(groups, cfg, seed)
-    assert set(split_of) == set(groups)
-    counts = Counter(split_of.values())
-    assert set(counts) == set(cfg.wanted_splits)
-    assert abs(counts["val"] - val * num_groups) <= 1
-    assert split_of == assign_splits(list(reversed(groups)) * 2, cfg, seed)  # order and repeats do not matter
-
-
-def test_another_seed_gives_other_splits():
-    groups = [f"trajectory_{i}" for i in range(30)]
-    assert assign_splits(groups, PrepareConfig(), 0) != assign_splits(groups, PrepareConfig(), 1)
-
-
-def test_too_few_groups_are_refused_unless_told():
-    with pytest.raises(InputError, match=r"too few.*got 2.*expected 3") as caught:
-        assign_splits(["a", "b"], PrepareConfig(), 0)
-    assert "too_few=fill" in str(caught.value)
-    assert sorted(assign_splits(["a", "b"], PrepareConfig(too_few="fill"), 0).values()) == ["train", "val"]
-    assert assign_splits(["a"], PrepareConfig(too_few="fill"), 0) == {"a": "train"}
-    assert set(assign_splits(["a"], PrepareConfig(val_fraction=0, test_fraction=0), 0).values()) == {"train"}
-
-
-def test_two_builds_of_a_town_are_one_group():
-    builds = [sample_of().model_copy(update={"town": town}) for town in ("Town03_Opt", "Town03")]
-    assert [sample.group("town") for sample in builds] == ["Town03", "Town03"]
+# --- leaks ------------------------------------------------------------------------------------------------------------
 
 
 def test_leak_check_passes_clean_splits_and_counts():
@@ -87,11 +52,10 @@ def test_leak_check_passes_clean_splits_and_counts():
 @pytest.mark.parametrize(
     ("other", "split_by", "word"),
     [
-        (sample_of(variant="aug_001"), "trajectory", "trajectory"),  # the perturbed flight of the same trajectory
-        (sample_of(frame=6), "trajectory", "trajectory"),
-        (sample_of(town="Town02"), "trajectory", "trajectory"),  # the same name in another town
+        (sample_of(variant="aug_001"), "walk", "walk"),  # the perturbed flight of the same trajectory
+        (sample_of(frame=6), "walk", "walk"),
+        (sample_of("t2").model_copy(update={"walk": "Town01/trajectory_1"}), "walk", "walk"),  # another timestamp
         (sample_of("t2", town="Town01_Opt"), "town", "town"),
-        (sample_of("t2").model_copy(update={"frames": sample_of().frames}), "trajectory", "image"),
     ],
 )
 def test_leak_check_fails(other, split_by, word):
@@ -99,9 +63,15 @@ def test_leak_check_fails(other, split_by, word):
         check_no_leak({"train": [sample_of()], "val": [other]}, split_by)
 
 
+def test_leak_check_fails_on_a_trajectory_of_two_walks():
+    other = sample_of(frame=6).model_copy(update={"walk": "elsewhere"})
+    with pytest.raises(VerifyError, match="of two walks"):
+        check_no_leak({"train": [sample_of()], "val": [other]})
+
+
 def test_leak_check_fails_on_a_double():
-    with pytest.raises(VerifyError, match="twice"):
-        check_no_leak({"train": [sample_of(), sample_of()]})
+    with pytest.raises(VerifyError, match=r"twice.*frame 4 of run/Town01/trajectory_1/ORI, language zh"):
+        check_no_leak({"train": [sample_of(), sample_of(language="zh"), sample_of(frame=6), sample_of(language="zh")]})
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------
@@ -137,7 +107,7 @@ def test_captions_of_an_earlier_version_are_refused_with_the_way_out(tree, tmp_p
     old = make_caption("Town01", "trajectory_1", "ORI", 4).model_dump(mode="json") | {"schema_version": "1.0"}
     (tmp_path / "captions.jsonl").write_text(json.dumps(old) + "\n")
     with pytest.raises(InputError, match=r"captions of another version.*got '1.0'; expected '2.0'.*run cosfly caption"):
-        run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+        prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
 def test_a_prompt_without_a_place_for_the_pictures_is_refused(tree, tmp_path):
@@ -145,15 +115,13 @@ def test_a_prompt_without_a_place_for_the_pictures_is_refused(tree, tmp_path):
     prompts = {language: prompt.told("Each frame is given as: RGB.") for language, prompt in caption.prompt.items()}
     write_captions(tmp_path / "captions.jsonl", [caption.model_copy(update={"prompt": prompts})])
     with pytest.raises(InputError, match=r"trajectory_1_ORI_frame_00004: prompt\.en: .*no place.*cosfly caption anew"):
-        run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+        prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
-def test_a_training_set_of_an_earlier_version_is_refused(tree, captions, tmp_path):
-    out = run(PrepareConfig(), captions, tree, tmp_path / "set")
-    path = out / "train.jsonl"
-    path.write_text(path.read_text().replace('"schema_version":"2.0"', '"schema_version":"1.0"'))
-    with pytest.raises(InputError, match=r"train\.jsonl:1: .*training set of another version.*distill prepare"):
-        list(read_split(out, "train"))
+def test_a_training_set_of_an_earlier_version_is_refused(tmp_path):
+    (tmp_path / "train.jsonl").write_text('{"schema_version": "2.0"}\n')
+    with pytest.raises(InputError, match=r"training set of another version.*train\.jsonl.*distill prepare"):
+        open_split(tmp_path, "train")
 
 
 def test_file_kinds_are_no_views():
@@ -224,15 +192,15 @@ def test_captions_of_unwanted_verdicts_and_noisy_labels_do_not_teach():
 # --- run --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("split_by", ["trajectory", "town"])
+@pytest.mark.parametrize("split_by", ["walk", "town"])
 def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_path, split_by):
-    cfg = PrepareConfig(split_by=split_by, too_few="fill")
-    out = run(cfg, captions, tree, tmp_path / "set")
-    splits = {split: list(read_split(out, split)) for split in SPLITS}
+    out = prepared(tree, captions, tmp_path / "set", split_by=split_by, too_few="fill")
+    splits = {split: list(open_split(out, split)) for split in SPLITS}
     owners = {}  # a slow obvious oracle: group -> splits
     for split, samples in splits.items():
         for sample in samples:
-            owners.setdefault(sample.group(split_by), set()).add(split)
+            group = sample.walk if split_by == "walk" else sample.town.removesuffix("_Opt")
+            owners.setdefault(group, set()).add(split)
             assert all((tree / image).is_file() for image in sample.images)
     assert all(len(found) == 1 for found in owners.values())
     manifest = json.loads((out / "manifest.json").read_text())
@@ -242,18 +210,18 @@ def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_
     assert {split: facts["samples"] for split, facts in manifest["splits"].items()} == {
         split: len(samples) for split, samples in splits.items()
     }
-    if split_by == "trajectory":
+    if split_by == "walk":
         assert splits["val"]
         assert splits["test"]
 
 
 def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):
-    first, second = (run(PrepareConfig(), captions, tree, tmp_path / name) for name in "ab")
+    first, second = (prepared(tree, captions, tmp_path / name) for name in "ab")
     for split in SPLITS:
-        assert (first / f"{split}.jsonl").read_bytes() == (second / f"{split}.jsonl").read_bytes()
-    assert run(PrepareConfig(), captions, tree, first) == first
+        assert split_path(first, split).read_bytes() == split_path(second, split).read_bytes()
+    assert prepared(tree, captions, first) == first
     with pytest.raises(ResumeError, match="languages"):
-        run(PrepareConfig(languages=("en",)), captions, tree, first)
+        prepared(tree, captions, first, languages=("en",))
 
 
 def test_run_counts_what_it_leaves_out(tree, tmp_path):
@@ -262,7 +230,7 @@ def test_run_counts_what_it_leaves_out(tree, tmp_path):
     records[1] = records[1].model_copy(update={"window": [90, 91, 92, 93, 94]})
     records[2] = records[2].model_copy(update={"zh": None})
     write_captions(tmp_path / "captions.jsonl", records)
-    out = run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
+    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
     counts = json.loads((out / "manifest.json").read_text())["counts"]
     assert counts["dropped"] == {"dropped_hard_conflict": 2, "missing_image": 2, "no_zh": 1}
     assert counts["input"] == counts["kept"] + 5
@@ -277,21 +245,17 @@ def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, 
         for record in records
     ]
     write_captions(tmp_path / "captions.jsonl", mixed)
-    plain = run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "plain")
+    plain = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "plain")
     write_captions(tmp_path / "captions.jsonl", mixed[::-1])
     caplog.set_level("INFO", logger="distill")
-    out = run(PrepareConfig(balance="decisions"), tmp_path / "captions.jsonl", tree, tmp_path / "balanced")
+    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "balanced", balance="decisions")
 
-    lines = {
-        (folder, split): sorted(split_path(folder, split).read_text().splitlines())
-        for folder in (plain, out)
-        for split in SPLITS
-    }
-    assert all(lines[plain, split] == lines[out, split] for split in ("val", "test"))
-    assert set(lines[out, "train"]) < set(lines[plain, "train"])
-    languages = Counter(sample.sample_id for sample in read_split(out, "train"))
+    keys = {(folder, split): {s.key for s in open_split(folder, split)} for folder in (plain, out) for split in SPLITS}
+    assert all(keys[plain, split] == keys[out, split] for split in ("val", "test"))
+    assert keys[out, "train"] < keys[plain, "train"]
+    languages = Counter(sample.sample_id for sample in open_split(out, "train"))
     assert set(languages.values()) == {2}
-    english = Counter(sample.decision for sample in read_split(out, "train") if sample.language == "en")
+    english = Counter(sample.decision for sample in open_split(out, "train") if sample.language == "en")
     assert english == {"track_straight": 8, "yaw_left_to_follow": 6, "slow_down": 6}  # of 12, 6, 6: an equal share is 8
 
     manifest = json.loads((out / "manifest.json").read_text())
@@ -304,8 +268,8 @@ def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, 
 
 
 def test_a_bound_that_nothing_reaches_gives_the_files_of_no_balance(tree, captions, tmp_path):
-    plain = run(PrepareConfig(), captions, tree, tmp_path / "plain")
-    wide = run(PrepareConfig(balance="decisions", balance_ratio=100), captions, tree, tmp_path / "wide")
+    plain = prepared(tree, captions, tmp_path / "plain")
+    wide = prepared(tree, captions, tmp_path / "wide", balance="decisions", balance_ratio=100)
     for split in SPLITS:
         assert split_path(plain, split).read_bytes() == split_path(wide, split).read_bytes()
     facts = [json.loads((folder / "manifest.json").read_text()) for folder in (plain, wide)]
@@ -322,23 +286,13 @@ def test_a_bound_that_is_none_is_refused(ratio):
 def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
     bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
     with pytest.raises(NothingKept, match=r"kept nothing.*missing_image 80.*--data"):
-        run(PrepareConfig(), captions, bare, tmp_path / "set")
+        prepared(bare, captions, tmp_path / "set")
 
 
 def test_run_refuses_a_name_that_leads_out(tree, tmp_path):
     write_captions(tmp_path / "captions.jsonl", [make_caption("..", "trajectory_1", "ORI", 4)])
     with pytest.raises(InputError, match="not a folder name"):
-        run(PrepareConfig(), tmp_path / "captions.jsonl", tree, tmp_path / "set")
-
-
-def test_reading_names_the_line(tree, captions, tmp_path):
-    out = run(PrepareConfig(), captions, tree, tmp_path / "set")
-    with open(out / "train.jsonl", "a") as file:
-        file.write('{"sample_id": 3}\n')
-    with pytest.raises(InputError, match=r"train\.jsonl:\d+: sample_id"):
-        list(read_split(out, "train"))
-    with pytest.raises(InputError, match="distill prepare"):
-        list(read_split(tmp_path, "train"))
+        prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
 def test_settings_that_leave_nothing_are_refused():

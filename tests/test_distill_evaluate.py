@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_distill import make_caption
+from specimens_distill import make_caption, write_set
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.predictions import Prediction
@@ -26,7 +26,7 @@ from distill.evaluation.stage import (
     wilson_interval,
 )
 from distill.inference.stage import make_prediction
-from distill.prepare.stage import PrepareConfig, make_sample
+from distill.prepare.samples import PrepareConfig, make_sample
 from distill.schema import Sample
 
 
@@ -143,10 +143,7 @@ def test_empty_texts_score_zero_and_are_not_asked():
 def place(tmp_path, samples) -> Path:
     """A training set of two languages and the predictions of its test split."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
-    (tmp_path / "set").mkdir()
-    for split in ("train", "val", "test"):
-        lines = [dump_json(sample.model_dump(mode="json")) for sample in both]
-        (tmp_path / "set" / f"{split}.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_set(tmp_path / "set", {"train": both, "val": both, "test": both})
     records = predictions_of(samples) + predictions_of(both[8:])
     lines = [dump_json(record.model_dump(mode="json")) for record in records]
     (tmp_path / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")

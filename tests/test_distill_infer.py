@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from specimens_distill import make_captions
+from specimens_distill import make_captions, prepared
 from teacher_server import TeacherServer, kept_answers
 from typer.testing import CliRunner
 
@@ -18,8 +18,7 @@ from cosfly.cli import app
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.predictions import read_predictions
 from distill.inference import stage as infer
-from distill.prepare import stage as dataset
-from distill.schema import read_split
+from distill.schema import open_split, resolve_trees
 from distill.student.encoding import load_pictures
 from specimens import make_playback_tree
 
@@ -31,8 +30,8 @@ def place(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("place")
     tree = make_playback_tree(root / "tree", 3, 8, with_augmented=False)
     make_captions(root / "captions.jsonl", tree)
-    cfg = dataset.PrepareConfig(modalities=("rgb", "depth"), val_fraction=0.3, test_fraction=0.3)
-    dataset.run(cfg, root / "captions.jsonl", tree, root / "set")
+    shares = {"val_fraction": 0.3, "test_fraction": 0.3}
+    prepared(tree, root / "captions.jsonl", root / "set", modalities=("rgb", "depth"), **shares)
     return root
 
 
@@ -42,11 +41,11 @@ def settings(**changes) -> infer.InferConfig:
 
 
 def infer_with(cfg: infer.InferConfig, place: Path, url: str, out: Path, **more) -> Path:
-    return infer.run(cfg, place / "set", place / "tree", url, out, **more)
+    return infer.run(cfg, place / "set", [place / "tree"], url, out, **more)
 
 
 def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
-    samples = list(read_split(place / "set", "train"))
+    samples = list(open_split(place / "set", "train"))
     with TeacherServer() as server:
         path = infer_with(settings(max_new_tokens=99, max_pixels=300), place, server.url, tmp_path / "out")
     predictions = read_predictions(path)
@@ -67,10 +66,11 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
 
 
 def test_a_small_picture_is_sent_as_it_is(place):
-    sample = next(read_split(place / "set", "train"))
-    request = infer.make_request(sample, place / "tree", settings())
+    sample = open_split(place / "set", "train")[0]
+    trees = resolve_trees(place / "set", [place / "tree"])
+    request = infer.make_request(sample, trees, settings())
     parts = [part for part in request.messages[1]["content"] if part["type"] == "image_url"]
-    for part, picture in zip(parts, load_pictures(sample, place / "tree"), strict=True):
+    for part, picture in zip(parts, load_pictures(sample, trees), strict=True):
         data = base64.b64decode(part["image_url"]["url"].partition(",")[2])
         assert np.array_equal(Image.open(io.BytesIO(data)), picture)
 

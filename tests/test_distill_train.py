@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from specimens_distill import make_captions
+from specimens_distill import make_captions, prepared, write_set
 
 from specimens import make_playback_tree
 
@@ -26,7 +26,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
-from distill.prepare import stage as dataset  # noqa: E402
+from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.encoding import IGNORED, count_tokens, encode, load_pictures, training_batch  # noqa: E402
 from distill.training import stage as train  # noqa: E402
@@ -50,7 +50,7 @@ def place(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("distill")
     make_playback_tree(root / "tree", num_flights=3, num_points=7)
     make_captions(root / "captions.jsonl", root / "tree")
-    dataset.run(dataset.PrepareConfig(), root / "captions.jsonl", root / "tree", root / "set")
+    prepared(root / "tree", root / "captions.jsonl", root / "set")
     student.make_tiny_student(root / "student")
     return root
 
@@ -59,7 +59,7 @@ def place(tmp_path_factory) -> Path:
 def trained(place) -> Path:
     """The output folder of a training of 12 steps without a break."""
     cfg = train.TrainConfig(**FAST, accumulate=2, batch_size=2, epochs=6, max_steps=12, save_every_steps=5)
-    train.run(cfg, place / "set", place / "tree", place / "student", place / "trained")
+    train.run(cfg, place / "set", [place / "tree"], place / "student", place / "trained")
     return place / "trained"
 
 
@@ -67,8 +67,12 @@ def load(place: Path) -> student.Student:
     return student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS)
 
 
-def samples_of(place: Path, split: str = "train") -> list[dataset.Sample]:
-    return list(dataset.read_split(place / "set", split))
+def samples_of(place: Path, split: str = "train") -> list[Sample]:
+    return list(open_split(place / "set", split))
+
+
+def trees_of(place: Path) -> dict[str, Path]:
+    return resolve_trees(place / "set", [place / "tree"])
 
 
 # --- student ----------------------------------------------------------------------------------------------------------
@@ -102,7 +106,7 @@ def test_processor_agrees_with_the_library_one(place):
     own, sample = load(place), samples_of(place)[0]
     oracle = WithoutVideos(own.image_processor, own.tokenizer, None, chat_template=own.tokenizer.chat_template)
     frames = []
-    for number, picture in enumerate(load_pictures(sample, place / "tree")):
+    for number, picture in enumerate(load_pictures(sample, trees_of(place))):
         frames += [{"type": "text", "text": f"t{number}:"}, {"type": "image", "image": picture}]
     messages = [
         {"role": "system", "content": [{"type": "text", "text": sample.prompt.system}]},
@@ -111,7 +115,7 @@ def test_processor_agrees_with_the_library_one(place):
     wanted = oracle.apply_chat_template(
         messages, add_generation_prompt=True, tokenize=True, return_dict=True, return_tensors="pt"
     )
-    found = encode(own, sample, place / "tree")
+    found = encode(own, sample, trees_of(place))
     assert found.prompt_ids.tolist() == wanted["input_ids"][0].tolist()
     assert np.array_equal(found.pixel_values, wanted["pixel_values"].numpy())
     assert found.image_grids.tolist() == wanted["image_grid_thw"].tolist()
@@ -146,7 +150,7 @@ def test_a_missing_package_gives_the_install_line():
 
 def test_mask_covers_exactly_the_answer(place):
     own = load(place)
-    rows = [encode(own, sample, place / "tree") for sample in samples_of(place)[:2]]  # one in each language
+    rows = [encode(own, sample, trees_of(place)) for sample in samples_of(place)[:2]]  # one in each language
     inputs, labels, weights = training_batch(own, rows)
     assert weights.tolist() == [1.0, 1.0]
     for i, sample in enumerate(samples_of(place)[:2]):
@@ -165,19 +169,19 @@ def test_mask_covers_exactly_the_answer(place):
 def test_counted_tokens_are_the_real_ones(place):
     own = load(place)
     for sample in samples_of(place)[:3]:
-        row = encode(own, sample, place / "tree")
+        row = encode(own, sample, trees_of(place))
         assert count_tokens(own, sample) == (len(row.prompt_ids), len(row.answer_ids))
 
 
 def test_every_modality_becomes_a_picture(place):
-    cfg = dataset.PrepareConfig(modalities=("rgb", "depth", "segmentation"))
-    out = dataset.run(cfg, place / "captions.jsonl", place / "tree", place / "set3")
-    sample = next(dataset.read_split(out, "train"))
+    views = ("rgb", "depth", "segmentation")
+    out = prepared(place / "tree", place / "captions.jsonl", place / "set3", modalities=views)
+    sample = open_split(out, "train")[0]
     own = load(place)
-    row = encode(own, sample, place / "tree")
+    row = encode(own, sample, trees_of(place))
     assert len(sample.images) == len(row.image_grids) == 15
     assert count_tokens(own, sample)[0] == len(row.prompt_ids)
-    depth = load_pictures(sample, place / "tree")[1]
+    depth = load_pictures(sample, trees_of(place))[1]
     assert depth.shape == (36, 64, 3)
     assert depth.std() > 0
 
@@ -187,12 +191,12 @@ def test_a_picture_of_another_size_is_refused_before_training(place, tmp_path):
     name = samples_of(place)[0].images[0]
     Image.new("RGB", (64, 40)).save(tmp_path / "tree" / name)
     with pytest.raises(InputError, match=r"rgb\.png: .*another size.*got 64 x 40 px; expected 64 x 36 px"):
-        train.run(train.TrainConfig(**FAST), place / "set", tmp_path / "tree", place / "student", tmp_path / "out")
+        train.run(train.TrainConfig(**FAST), place / "set", [tmp_path / "tree"], place / "student", tmp_path / "out")
 
 
 def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
     cfg = train.TrainConfig(**FAST | {"max_pixels": 0}, max_steps=1)
-    train.run(cfg, place / "set", place / "tree", place / "student", tmp_path / "out")
+    train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "adapter" / "cosfly_adapter.json").read_text())
     assert facts["max_pixels"] == 64 * 36
 
@@ -200,7 +204,7 @@ def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
 def test_loss_is_the_mean_over_answer_tokens_whatever_the_padding(place):
     own = load(place)
     own.model.eval()
-    rows = [encode(own, sample, place / "tree") for sample in samples_of(place)[:4]]
+    rows = [encode(own, sample, trees_of(place)) for sample in samples_of(place)[:4]]
     with torch.inference_mode():
         together, weight = train.answer_loss(own, rows)
         alone = [train.answer_loss(own, [row]) for row in rows]
@@ -217,8 +221,8 @@ def test_weights_scale_a_sample(place):
     sample = samples_of(place)[0]
     half = sample.model_copy(update={"weight": 0.5})
     with torch.inference_mode():
-        full = train.answer_loss(own, [encode(own, sample, place / "tree")])
-        less = train.answer_loss(own, [encode(own, half, place / "tree")])
+        full = train.answer_loss(own, [encode(own, sample, trees_of(place))])
+        less = train.answer_loss(own, [encode(own, half, trees_of(place))])
     assert float(less[0]) == pytest.approx(0.5 * float(full[0]))
     assert less[1] == pytest.approx(0.5 * full[1])
 
@@ -248,7 +252,7 @@ def test_learning_rate_rises_and_falls():
 def test_too_long_a_sample_is_named_and_nothing_is_cut(place, tmp_path):
     cfg = train.TrainConfig(**FAST, max_tokens=64)
     with pytest.raises(InputError, match=r"trajectory_\d+_\w+_frame_\d+/\w\w .* longer than max_tokens.*<= 64"):
-        train.run(cfg, place / "set", place / "tree", place / "student", tmp_path / "out")
+        train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
 
 
 def test_no_matching_layer_is_an_error(place):
@@ -278,7 +282,7 @@ def test_adapter_reloads_equal(place, trained):
     optimizer = torch.optim.AdamW([p for p in own.model.parameters() if p.requires_grad])
     assert train.load_checkpoint(trained / "checkpoints" / "step_00000012", own, optimizer) == 12
     again = student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS, adapter=trained / "adapter")
-    row = encode(own, samples_of(place)[0], place / "tree")
+    row = encode(own, samples_of(place)[0], trees_of(place))
     logits = []
     for model in (own, again, load(place)):
         inputs, _, _ = training_batch(model, [row])
@@ -302,10 +306,10 @@ def test_stopped_and_continued_is_the_same(place, trained, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "train_step", stop_after_seven)
         with pytest.raises(KeyboardInterrupt):
-            train.run(cfg, place / "set", place / "tree", place / "student", out)
+            train.run(cfg, place / "set", [place / "tree"], place / "student", out)
     assert [path.name for path in (out / "checkpoints").iterdir()] == ["step_00000005"]
     assert not (out / "manifest.json").exists()
-    train.run(cfg, place / "set", place / "tree", place / "student", out)
+    train.run(cfg, place / "set", [place / "tree"], place / "student", out)
     assert_same_training(out, trained)
 
 
@@ -317,7 +321,8 @@ def test_killed_and_continued_is_the_same(place, trained, tmp_path):
     code = (
         "import json, sys, pathlib; from distill.training import stage as train\n"
         "settings, *paths = json.loads(sys.argv[1])\n"
-        "train.run(train.TrainConfig(**settings), *map(pathlib.Path, paths))"
+        "dataset, tree, student, out = map(pathlib.Path, paths)\n"
+        "train.run(train.TrainConfig(**settings), dataset, [tree], student, out)"
     )
     paths = [str(path) for path in (place / "set", place / "tree", place / "student", out)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -337,7 +342,7 @@ def test_killed_and_continued_is_the_same(place, trained, tmp_path):
     assert newest is not None
     assert newest.name != damaged.name
     shutil.rmtree(damaged)
-    train.run(train.TrainConfig(**settings), *map(Path, paths))
+    train.run(train.TrainConfig(**settings), place / "set", [place / "tree"], place / "student", out)
     assert_same_training(out, trained)
 
 
@@ -352,7 +357,7 @@ def test_gradient_checkpointing_changes_nothing_but_memory(place, tmp_path):
         cfg = train.TrainConfig(
             **FAST, max_steps=2, accumulate=2, lora_dropout=0, validation_samples=0, gradient_checkpointing=is_on
         )
-        train.run(cfg, place / "set", place / "tree", place / "student", tmp_path / str(is_on))
+        train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / str(is_on))
         log = (tmp_path / str(is_on) / "log.jsonl").read_text().splitlines()
         losses.append([json.loads(line)["loss"] for line in log])
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
@@ -361,7 +366,7 @@ def test_gradient_checkpointing_changes_nothing_but_memory(place, tmp_path):
 def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path):
     cfg = train.TrainConfig(**{**FAST, "learning_rate": 1e30}, max_steps=5, accumulate=1)
     with pytest.raises(ConfigError, match=r"not finite.*lower learning_rate"):
-        train.run(cfg, place / "set", place / "tree", place / "student", tmp_path / "out")
+        train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
 
 
 # --- inference --------------------------------------------------------------------------------------------------------
@@ -369,7 +374,7 @@ def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path)
 
 def test_inference_is_deterministic_and_resumes(place, trained, tmp_path):
     cfg = infer.InferConfig(split="val", batch_size=3, max_new_tokens=12, device="cpu")
-    arguments = (cfg, place / "set", place / "tree", place / "student")
+    arguments = (cfg, place / "set", [place / "tree"], place / "student")
     first = infer.run(*arguments, tmp_path / "a", adapter=trained / "adapter")
     real, calls = infer.decode, []
 
@@ -399,24 +404,22 @@ def test_inference_is_deterministic_and_resumes(place, trained, tmp_path):
 @pytest.mark.slow
 def test_a_student_that_overfits_answers_right(place, tmp_path):
     """The whole way: two samples learned by heart come back as the answers they were, parsed."""
-    (tmp_path / "set").mkdir()
-    lines = (place / "set" / "train.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)[:2]
-    for split in dataset.SPLITS:
-        (tmp_path / "set" / f"{split}.jsonl").write_text("".join(lines), encoding="utf-8")
+    learnt = samples_of(place)[:2]
+    write_set(tmp_path / "set", {"train": learnt, "val": learnt}, [place / "tree"])
     cfg = train.TrainConfig(
         **{**FAST, "lora_rank": 16, "schedule": "cosine"}, lora_dropout=0, batch_size=2, accumulate=1, epochs=80
     )
-    adapter = train.run(cfg, tmp_path / "set", place / "tree", place / "student", tmp_path / "trained")
+    adapter = train.run(cfg, tmp_path / "set", [place / "tree"], place / "student", tmp_path / "trained")
     out = infer.run(
         infer.InferConfig(split="train", device="cpu"),
         tmp_path / "set",
-        place / "tree",
+        [place / "tree"],
         place / "student",
         tmp_path / "answers",
         adapter=adapter,
     )
     predictions = read_predictions(out)
-    assert [p.raw for p in predictions] == [json.loads(line)["answer"] for line in lines]
+    assert [p.raw for p in predictions] == [sample.answer for sample in learnt]
     assert all(p.coc is not None and p.is_finished for p in predictions)
 
 
@@ -426,7 +429,7 @@ def test_an_adapter_of_another_student_is_refused(place, trained, tmp_path):
         infer.run(
             infer.InferConfig(device="cpu"),
             place / "set",
-            place / "tree",
+            [place / "tree"],
             other,
             tmp_path / "out",
             adapter=trained / "adapter",
@@ -439,7 +442,7 @@ def test_an_unreadable_image_fails_its_batch_and_is_counted(place, tmp_path):
     # Frame 0 belongs to the first window alone, in two languages.
     (tmp_path / "tree" / sample.images[0]).write_bytes(b"not a picture")
     cfg = infer.InferConfig(split="val", batch_size=1, max_samples=6, max_new_tokens=2, device="cpu")
-    out = infer.run(cfg, place / "set", tmp_path / "tree", place / "student", tmp_path / "out")
+    out = infer.run(cfg, place / "set", [tmp_path / "tree"], place / "student", tmp_path / "out")
     predictions = read_predictions(out)
     assert predictions[0].reason == "failed_input"
     assert predictions[0].raw == ""

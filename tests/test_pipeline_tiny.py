@@ -29,7 +29,9 @@ from cosfly.reading.files import sha256_file
 from cosfly.settings import RunConfig
 from cosfly.stage_folder import read_failures
 from cosfly.store import read_checksums, write_checksums, write_json
-from distill.prepare import stage as dataset
+from distill.prepare import stage as prepare
+from distill.prepare.samples import PrepareConfig
+from distill.prepare.sources import Source as Prepared
 from release.package import stage as package
 from release.package.sources import Source
 from release.verify.verify import verify
@@ -282,7 +284,7 @@ def test_captions_and_inspections_of_another_tree_are_refused(base, tmp_path):
     write_json(other / "manifest.json", manifest)
     captions, inspected = base / "caption/captions.jsonl", base / "inspect/inspect.json"
     with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
-        dataset.run(dataset.PrepareConfig(), captions, other, tmp_path / "set")
+        prepare.run(PrepareConfig(), [Prepared.of_files(other, captions)], tmp_path / "set")
     with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
         package.run(package.ReleaseConfig(), [Source("x", other, captions, inspected)], tmp_path / "release")
     shutil.copy(captions, tmp_path / "captions.jsonl")

@@ -26,21 +26,36 @@ def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(hel
 
 @app.command("prepare")
 def distill_prepare(
-    captions: Annotated[Path, typer.Option(help="captions.jsonl")],
     out: options.Out,
-    data: options.Data = None,
+    runs: Annotated[
+        list[Path] | None, typer.Argument(help="Run folders, as `cosfly run` makes them; all go into one training set.")
+    ] = None,
+    captions: Annotated[
+        list[Path] | None, typer.Option(help="captions.jsonl of a tree; repeat both for several.")
+    ] = None,
+    data: options.Trees = None,
+    limit: Annotated[
+        int | None, typer.Option(help="Windows in all splits together, of each decision and flight its share; 0: all.")
+    ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
-    """Captions to a training set with splits that share no trajectory."""
-    from distill.prepare import stage as dataset
+    """Captions of one run or several to a training set with splits that share no walk."""
+    from distill.prepare import stage as prepare
+    from distill.prepare.sources import Source
 
-    cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
-    options.verify_first(verify, captions, tree, out)
-    typer.echo(dataset.run(cfg.distill.prepare, captions, tree, out, seed=cfg.seed, resume=resume))
+    sources = [Source.of_run(folder) for folder in runs or []]
+    if captions or data or not sources:
+        trees = options.data_folders(data)
+        if len(trees) != len(captions or []):
+            raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
+        sources += [Source.of_files(*files) for files in zip(trees, captions or [], strict=True)]
+    cfg = options.resolve(config, overrides, {"seed": seed, "distill.prepare.limit": limit})
+    options.verify_first(verify, *(path for source in sources for path in (source.data, source.captions)), out)
+    typer.echo(prepare.run(cfg.distill.prepare, sources, out, seed=cfg.seed, resume=resume))
 
 
 @app.command("train")
@@ -48,7 +63,7 @@ def distill_train(
     dataset: DatasetOption,
     model: ModelOption,
     out: options.Out,
-    data: options.Data = None,
+    data: options.Trees = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
@@ -58,9 +73,9 @@ def distill_train(
     """Train LoRA adapters; continues from its last checkpoint."""
     from distill.training import stage as train
 
-    cfg, tree = options.resolve(config, overrides, {"seed": seed}), options.data_folder(data)
-    options.verify_first(verify, dataset, tree, out)
-    typer.echo(train.run(cfg.distill.train, dataset, tree, model, out, seed=cfg.seed, resume=resume))
+    cfg, trees = options.resolve(config, overrides, {"seed": seed}), options.data_folders(data)
+    options.verify_first(verify, dataset, *trees, out)
+    typer.echo(train.run(cfg.distill.train, dataset, trees, model, out, seed=cfg.seed, resume=resume))
 
 
 @app.command("infer")
@@ -72,7 +87,7 @@ def distill_infer(
         str | None, typer.Option(help="transformers, endpoint (a server) or vllm. [default: transformers]")
     ] = None,
     adapter: Annotated[Path | None, typer.Option(help="Adapter folder; none: the base model as it is.")] = None,
-    data: options.Data = None,
+    data: options.Trees = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     verify: options.Verify = False,
@@ -82,10 +97,10 @@ def distill_infer(
     """Let the student answer a split; continues where it stopped."""
     from distill.inference import stage as infer
 
-    cfg, tree = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folder(data)
+    cfg, trees = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folders(data)
     options.set_aside(out, repair)
-    options.verify_first(verify, dataset, tree, adapter, out)
-    typer.echo(infer.run(cfg.distill.infer, dataset, tree, model, out, adapter=adapter, resume=resume))
+    options.verify_first(verify, dataset, *trees, adapter, out)
+    typer.echo(infer.run(cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=resume))
 
 
 @app.command("evaluate")

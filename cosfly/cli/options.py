@@ -42,6 +42,14 @@ Data = Annotated[
 ]
 
 
+Trees = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--data", help="Playback tree, once for each of several; by default that of the run folder one stands in."
+    ),
+]
+
+
 Repair = Annotated[
     bool,
     typer.Option(
@@ -132,6 +140,11 @@ def data_folder(data: Path | None) -> Path:
     raise InputError(
         "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
     )
+
+
+def data_folders(data: list[Path] | None) -> list[Path]:
+    """The playback trees: given, or that of the run folder one stands in."""
+    return data or [data_folder(None)]
 
 
 def verify_first(is_wanted: bool, *paths: Path | None) -> None:

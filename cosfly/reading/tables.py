@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
-from collections.abc import Collection, Iterator
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -58,15 +63,17 @@ def row_groups(
     """Yield the row groups of a parquet file, of these numbers or all, in memory one at a time; raises as `open_table`, and for one over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
-            if wanted is not None and k not in wanted:
-                continue
-            about = table.metadata.row_group(k)
-            size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
-            if size > limits().file_mb * MB:
-                raise over_limit("file_mb", f"{path}: row group {k}", f"{size / MB:,.0f} MB", " MB")
-            with arrow_errors(path):
-                group = table.read_row_group(k, columns=columns)
-            yield group
+            if wanted is None or k in wanted:
+                yield _row_group(path, table, k, columns)
+
+
+def _row_group(path: Path, table: pq.ParquetFile, k: int, columns: list[str] | None) -> pa.Table:
+    about = table.metadata.row_group(k)
+    size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
+    if size > limits().file_mb * MB:
+        raise over_limit("file_mb", f"{path}: row group {k}", f"{size / MB:,.0f} MB", " MB")
+    with arrow_errors(path):
+        return table.read_row_group(k, columns=columns)
 
 
 def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[dict[str, Any]]:
@@ -75,3 +82,67 @@ def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None =
         with arrow_errors(path):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
         yield from rows
+
+
+GROUPS_HELD = 4  # row groups that a look at single rows keeps
+
+
+class TableRows(Sequence[dict[str, Any]]):
+    """The rows of a parquet file by number. The file stays open, a few row groups in memory; each process opens its own.
+
+    Raises:
+        InputError: as `open_table`, when rows are counted or read; and for columns that are not there.
+    """
+
+    def __init__(self, path: Path, columns: list[str]) -> None:
+        self._path, self._columns = path, columns
+        self._begin()
+
+    def _begin(self) -> None:
+        self._process, self._lock = os.getpid(), threading.Lock()
+        self._stack = contextlib.ExitStack()
+        self._table: pq.ParquetFile | None = None
+        self._firsts: list[int] = []  # number of the first row of each group, and of all rows
+        self._held: OrderedDict[int, pa.Table] = OrderedDict()
+
+    def __getstate__(self) -> tuple[Path, list[str]]:
+        return self._path, self._columns
+
+    def __setstate__(self, state: tuple[Path, list[str]]) -> None:
+        self._path, self._columns = state
+        self._begin()
+
+    def _opened(self) -> pq.ParquetFile:
+        if self._process != os.getpid():  # a fork shares the place in the open file with its parent
+            self._begin()
+        if self._table is None:
+            table = self._stack.enter_context(open_table(self._path))
+            missing = sorted(set(self._columns) - set(table.schema_arrow.names))
+            if missing:
+                raise InputError("columns are missing", where=self._path, got=", ".join(missing)[:200])
+            counts = [table.metadata.row_group(k).num_rows for k in range(table.num_row_groups)]
+            self._firsts = list(accumulate(counts, initial=0))
+            self._table = table
+        return self._table
+
+    def __len__(self) -> int:
+        self._opened()
+        return self._firsts[-1]
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return rows_of(self._path, self._columns)
+
+    def __getitem__(self, number: int) -> dict[str, Any]:  # type: ignore[override]  # one row at a time
+        table = self._opened()
+        if not 0 <= number < self._firsts[-1]:
+            raise IndexError(number)
+        k = bisect.bisect_right(self._firsts, number) - 1
+        with self._lock:
+            if k not in self._held:
+                self._held[k] = _row_group(self._path, table, k, self._columns)
+                if len(self._held) > GROUPS_HELD:
+                    self._held.popitem(last=False)
+            self._held.move_to_end(k)
+            group = self._held[k]
+        with arrow_errors(self._path):
+            return group.slice(number - self._firsts[k], 1).to_pylist()[0]

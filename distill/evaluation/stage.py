@@ -34,7 +34,7 @@ from distill.evaluation.bertscore import (
     others_of,
     score_texts,
 )
-from distill.schema import Sample, read_split
+from distill.schema import Sample, open_split
 from distill.student.model import require
 
 STAGE = "distill.evaluate"
@@ -318,10 +318,10 @@ def run(
     splits = sorted({prediction.split for prediction in found})
     if len(splits) != 1:
         raise InputError("predictions of one split are needed", where=predictions, got=", ".join(splits) or "none")
-    samples = list(read_split(dataset, splits[0]))
+    samples = list(open_split(dataset, splits[0]))
     pairs = pair_up(samples, found)
     train_decisions: dict[Language, list[str]] = {}
-    for sample in read_split(dataset, "train"):
+    for sample in open_split(dataset, "train"):
         train_decisions.setdefault(sample.language, []).append(sample.decision)
     scorer, facts = None, None
     if bertscore_model is not None:

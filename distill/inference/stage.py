@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,7 @@ from cosfly.runner import Item, Outcome, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
 from cosfly.store import dump_json, write_bytes
 from cosfly.student_chat import StudentEndpointConfig, picture_to_send, student_request
-from distill.schema import Sample, read_split, split_path
+from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.decoding import decode
 from distill.student.encoding import encode, load_pictures, most_pixels
@@ -77,12 +78,14 @@ def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
 
 
-def make_worker(cfg: InferConfig, data: Path, model: Path, adapter: Path | None, max_pixels: int) -> Work:
+def make_worker(
+    cfg: InferConfig, trees: Mapping[str, Path], model: Path, adapter: Path | None, max_pixels: int
+) -> Work:
     student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=adapter)
 
     def work(item: Item) -> Outcome:
         samples: list[Sample] = item.payload
-        rows = [encode(student, sample, data) for sample in samples]
+        rows = [encode(student, sample, trees) for sample in samples]
         answers = decode(student, rows, max_tokens=cfg.max_new_tokens)
         records = [
             make_prediction(sample, cfg.split, answer.text, answer.num_tokens, answer.is_finished)
@@ -100,14 +103,19 @@ class _Predicted(BaseModel):
 
 
 def _infer(
-    cfg: InferConfig, stage: StageFolder, samples: list[Sample], data: Path, model: Path, adapter: Path | None
+    cfg: InferConfig,
+    stage: StageFolder,
+    samples: list[Sample],
+    trees: Mapping[str, Path],
+    model: Path,
+    adapter: Path | None,
 ) -> tuple[list[Prediction], Tally]:
     trained = read_adapter_facts(adapter, model).max_pixels if adapter else most_pixels(samples)
     # Whole batches are the unit of resumption: rounding may depend on what else is in a batch.
     batches = [samples[start : start + cfg.batch_size] for start in range(0, len(samples), cfg.batch_size)]
     items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
     max_pixels = cfg.max_pixels or trained
-    finished = run_items(stage, items, make_worker, (cfg, data, model, adapter, max_pixels), label=STAGE)
+    finished = run_items(stage, items, make_worker, (cfg, trees, model, adapter, max_pixels), label=STAGE)
     tally = Tally(input=len(samples))
     predictions: list[Prediction] = []
     for record, batch in zip(finished.records, batches, strict=True):
@@ -123,20 +131,20 @@ def _infer(
 # --- engines ----------------------------------------------------------------------------------------------------------
 
 
-def make_request(sample: Sample, data: Path, cfg: InferConfig) -> Request:
+def make_request(sample: Sample, trees: Mapping[str, Path], cfg: InferConfig) -> Request:
     """Give a sample as chat messages: its pictures as the student was taught to see them, then the question.
 
     Raises:
-        InputError: a picture of the playback tree `data` cannot be read.
+        InputError: a picture of its playback tree cannot be read.
     """
-    pictures = iter([picture_to_send(picture, cfg.max_pixels) for picture in load_pictures(sample, data)])
+    pictures = iter([picture_to_send(picture, cfg.max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
     sampling = cfg.endpoint.model_copy(update={"max_tokens": cfg.max_new_tokens})
     return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
 
 
 async def _ask(
-    cfg: InferConfig, stage: StageFolder, engine: Engine, samples: list[Sample], data: Path
+    cfg: InferConfig, stage: StageFolder, engine: Engine, samples: list[Sample], trees: Mapping[str, Path]
 ) -> tuple[list[Prediction], Tally]:
     """Ask an engine about every sample; answers are kept in `answers/`, so nothing answered is asked twice.
 
@@ -149,7 +157,7 @@ async def _ask(
     async def answer(sample: Sample) -> Prediction:
         async with in_flight:
             try:
-                request = await asyncio.to_thread(make_request, sample, data, cfg)
+                request = await asyncio.to_thread(make_request, sample, trees, cfg)
                 reply = await kept.ask(request, flight_of(sample.sample_id), sample.sample_id, sample.language)
             except InputError as error:
                 failed = Failed(id=sample.key, code=error.code, message=str(error))
@@ -191,14 +199,14 @@ def _make_engine(cfg: InferConfig, model: str, samples: list[Sample]) -> Engine:
 def run(
     cfg: InferConfig,
     dataset: Path,
-    data: Path,
+    data: Sequence[Path],
     model: str | Path,
     out: Path,
     *,
     adapter: Path | None = None,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read a split, the playback tree `data`, the model and (if given) its adapter; write `predictions.jsonl`.
+    """Read a split, its playback trees `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
     Args:
         model: a folder, or with engine `endpoint` a URL.
@@ -208,7 +216,8 @@ def run(
         InputError: an input is missing or does not fit. ConfigError: the engine takes no adapter.
         EnvironmentMissing: torch, transformers, peft or vllm is missing. TeacherError: the engine does not answer.
     """
-    inputs = {"dataset": dataset, "data": data}
+    trees = resolve_trees(dataset, data)
+    inputs = {"dataset": dataset, **tree_inputs(trees)}
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
@@ -227,15 +236,15 @@ def run(
     path = out / PREDICTIONS
     if stage.is_complete:
         return path
-    samples = list(read_split(dataset, cfg.split))[: cfg.max_samples or None]
+    samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]
     if not samples:
-        raise InputError("the split is empty", where=split_path(dataset, cfg.split), fix="choose another split")
+        raise InputError("the split is empty", where=dataset, got=cfg.split, fix="choose another split")
     if cfg.engine == "transformers":
-        predictions, tally = _infer(cfg, stage, samples, data, Path(model), adapter)
+        predictions, tally = _infer(cfg, stage, samples, trees, Path(model), adapter)
         name = Path(model).name if adapter is None else f"{Path(model).name}+{adapter.absolute().parent.name}"
     else:
         engine = _make_engine(cfg, str(model), samples)
-        predictions, tally = asyncio.run(_ask(cfg, stage, engine, samples, data))
+        predictions, tally = asyncio.run(_ask(cfg, stage, engine, samples, trees))
         name = engine.model
     predictions = [prediction.model_copy(update={"model": name}) for prediction in predictions]
     if not tally.kept:

@@ -6,7 +6,7 @@ keeps the loss on the answer is exact by construction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,13 +49,16 @@ def messages_of(sample: Sample) -> list[dict[str, Any]]:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-def load_pictures(sample: Sample, data: Path) -> list[np.ndarray]:
+def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]:
     """Load the pictures of a sample as its teacher saw them, each (h, w, 3) uint8 RGB.
 
+    Args:
+        trees: run -> playback tree (`resolve_trees`).
     Raises:
-        InputError: a picture of the playback tree `data` is missing, damaged or of another size.
+        InputError: a picture is missing, damaged or of another size.
     """
-    return [picture for frame in sample.frames for picture in sample.pictures.read(inside(data, frame))]
+    tree = trees[sample.run]
+    return [picture for frame in sample.frames for picture in sample.pictures.read(inside(tree, frame))]
 
 
 def most_pixels(samples: Sequence[Sample]) -> int:
@@ -109,13 +112,13 @@ def count_tokens(student: Student, sample: Sample) -> tuple[int, int]:
     return len(_prompt_ids(student, sample, [count] * len(sample.images))), len(_answer_ids(student, sample))
 
 
-def encode(student: Student, sample: Sample, data: Path) -> Encoded:
+def encode(student: Student, sample: Sample, trees: Mapping[str, Path]) -> Encoded:
     """Make the arrays of one sample.
 
     Raises:
-        InputError: an image of the playback tree `data` cannot be read.
+        InputError: a picture of its playback tree cannot be read.
     """
-    images = [Image.fromarray(picture) for picture in load_pictures(sample, data)]
+    images = [Image.fromarray(picture) for picture in load_pictures(sample, trees)]
     vision = student.image_processor(images, return_tensors="np")
     grids = np.asarray(vision["image_grid_thw"], dtype=np.int64)
     counts = (grids.prod(axis=1) // student.image_processor.merge_size**2).tolist()

@@ -10,7 +10,7 @@ import contextlib
 import logging
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from cosfly.reading.documents import parse_json
 from cosfly.reading.files import read_lines
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, dump_json, inside, storage_errors, write_json
-from distill.schema import Sample, read_split, split_path
+from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import (
     ADAPTER_FACTS,
     adapter_facts,
@@ -136,7 +136,9 @@ def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
     return cfg.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
 
 
-def preflight(student: Student, samples: Sequence[Sample], data: Path, max_tokens: int) -> dict[str, int]:
+def preflight(
+    student: Student, samples: Sequence[Sample], trees: Mapping[str, Path], max_tokens: int
+) -> dict[str, int]:
     """Count the real tokens of every sample, images included, so that nothing is ever cut off, and look at every image's size.
 
     Returns:
@@ -144,15 +146,15 @@ def preflight(student: Student, samples: Sequence[Sample], data: Path, max_token
     Raises:
         InputError: names the longest sample that does not fit, or an image of another size than its prompt says.
     """
-    checked: set[str] = set()
+    checked: set[tuple[str, str]] = set()
     totals = {"samples": len(samples), "tokens": 0, "answer_tokens": 0, "longest": 0}
     longest = ""
     with progress_bar(f"{STAGE}: counting tokens", total=len(samples)) as advance:
         for sample in samples:
             for name in sample.images:
-                if name not in checked:
-                    sample.pictures.check_size(path := inside(data, name), image_size(path))
-                    checked.add(name)
+                if (sample.run, name) not in checked:
+                    sample.pictures.check_size(path := inside(trees[sample.run], name), image_size(path))
+                    checked.add((sample.run, name))
             prompt, answer = count_tokens(student, sample)
             if prompt + answer > totals["longest"]:
                 totals["longest"], longest = prompt + answer, f"{sample.key} ({prompt} prompt + {answer} answer)"
@@ -230,7 +232,7 @@ def answer_loss(student: Student, rows: Sequence[Encoded]) -> tuple[Any, float]:
     return (nats * counted).sum(), float(counted.sum())
 
 
-def mean_loss(student: Student, samples: Sequence[Sample], data: Path, batch_size: int) -> float:
+def mean_loss(student: Student, samples: Sequence[Sample], trees: Mapping[str, Path], batch_size: int) -> float:
     """Give the mean loss (nats per answer token) without dropout or gradients."""
     import torch
 
@@ -238,7 +240,7 @@ def mean_loss(student: Student, samples: Sequence[Sample], data: Path, batch_siz
     total, weight = 0.0, 0.0
     with torch.inference_mode(), progress_bar(f"{STAGE}: validation loss", total=len(samples)) as advance:
         for start in range(0, len(samples), batch_size):
-            rows = [encode(student, sample, data) for sample in samples[start : start + batch_size]]
+            rows = [encode(student, sample, trees) for sample in samples[start : start + batch_size]]
             nats, count = answer_loss(student, rows)
             total, weight = total + float(nats), weight + count
             advance(len(rows))
@@ -249,7 +251,12 @@ def mean_loss(student: Student, samples: Sequence[Sample], data: Path, batch_siz
 
 
 def train_step(
-    student: Student, optimizer: Any, samples: Sequence[Sample], data: Path, cfg: TrainConfig, rate: float
+    student: Student,
+    optimizer: Any,
+    samples: Sequence[Sample],
+    trees: Mapping[str, Path],
+    cfg: TrainConfig,
+    rate: float,
 ) -> dict[str, Any]:
     """Take one optimizer step over `samples` in forward passes of `batch_size`.
 
@@ -258,7 +265,7 @@ def train_step(
     """
     import torch
 
-    rows = [encode(student, sample, data) for sample in samples]
+    rows = [encode(student, sample, trees) for sample in samples]
     weight = sum(len(row.answer_ids) * row.weight for row in rows)
     student.model.train()
     total = 0.0
@@ -288,7 +295,7 @@ def train_step(
 
 
 def fit(
-    student: Student, samples: Sequence[Sample], data: Path, out: Path, cfg: TrainConfig, *, seed: int
+    student: Student, samples: Sequence[Sample], trees: Mapping[str, Path], out: Path, cfg: TrainConfig, *, seed: int
 ) -> list[dict[str, Any]]:
     """Train the student's adapter, from the newest checkpoint of `out` if there is one, and give the log.
 
@@ -314,7 +321,7 @@ def fit(
             rate = learning_rate_at(cfg, step, steps.num_steps)
             chosen = [samples[i] for i in steps.samples_of(step)]
             with seeded(student, seed, f"step_{step}"):
-                facts = train_step(student, optimizer, chosen, data, cfg, rate)
+                facts = train_step(student, optimizer, chosen, trees, cfg, rate)
             record = {"step": step + 1, "epoch": step // steps.steps_per_epoch, "learning_rate": rate, **facts}
             file.write(dump_json(record) + "\n")
             file.flush()
@@ -326,9 +333,16 @@ def fit(
 
 
 def run(
-    cfg: TrainConfig, dataset: Path, data: Path, model: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
+    cfg: TrainConfig,
+    dataset: Path,
+    data: Sequence[Path],
+    model: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    resume: Resume = "if-same",
 ) -> Path:
-    """Read the training set, the playback tree `data` and the model folder; write `adapter/`, `log.jsonl`, `checkpoints/`.
+    """Read the training set, its playback trees `data` and the model folder; write `adapter/`, `log.jsonl`, `checkpoints/`.
 
     Returns:
         The adapter's folder, which peft loads.
@@ -338,25 +352,26 @@ def run(
     """
     require("torch", "transformers", "peft")
     weights = weight_files(model)
-    inputs = {"dataset": dataset, "data": data, **weights}
+    trees = resolve_trees(dataset, data)
+    inputs = {"dataset": dataset, **tree_inputs(trees), **weights}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     adapter = out / "adapter"
     if stage.is_complete:
         return adapter
-    samples = list(read_split(dataset, "train"))
+    samples = open_split(dataset, "train")
     if not samples:
-        raise InputError("the training split is empty", where=split_path(dataset, "train"))
-    validation = list(read_split(dataset, "val"))[: cfg.validation_samples]
+        raise InputError("the training split is empty", where=dataset)
+    validation = open_split(dataset, "val")[: cfg.validation_samples]
     max_pixels = cfg.max_pixels or most_pixels([*samples, *validation])
     student = load_student(model, device=cfg.device, max_pixels=max_pixels)
-    totals = preflight(student, [*samples, *validation], data, cfg.max_tokens)
+    totals = preflight(student, [*samples, *validation], trees, cfg.max_tokens)
     student = add_adapter(student, cfg, seed)
     if cfg.gradient_checkpointing:
         student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     # A fresh adapter changes nothing (its second matrix is zero), so this is the bare model's loss, resumed or not.
-    before = mean_loss(student, validation, data, cfg.batch_size) if validation else None
-    records = _fit_or_explain(student, samples, data, out, cfg, seed)
-    after = mean_loss(student, validation, data, cfg.batch_size) if validation else None
+    before = mean_loss(student, validation, trees, cfg.batch_size) if validation else None
+    records = _fit_or_explain(student, samples, trees, out, cfg, seed)
+    after = mean_loss(student, validation, trees, cfg.batch_size) if validation else None
     facts = adapter_facts(student, max_pixels, model)
     with atomic_folder(adapter) as partial:
         student.model.save_pretrained(partial)
@@ -376,12 +391,12 @@ def run(
 
 
 def _fit_or_explain(
-    student: Student, samples: Sequence[Sample], data: Path, out: Path, cfg: TrainConfig, seed: int
+    student: Student, samples: Sequence[Sample], trees: Mapping[str, Path], out: Path, cfg: TrainConfig, seed: int
 ) -> list[dict[str, Any]]:
     import torch
 
     try:
-        return fit(student, samples, data, out, cfg, seed=seed)
+        return fit(student, samples, trees, out, cfg, seed=seed)
     except torch.OutOfMemoryError as error:
         raise ConfigError(
             "the accelerator's memory is full",

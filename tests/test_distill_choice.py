@@ -1,4 +1,4 @@
-"""distill/prepare/balance.py: which training windows stay."""
+"""distill/prepare/choice.py: which windows stay."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.products.captions import ACTIONS
-from distill.prepare.balance import Ranks, cost_of
+from distill.prepare.choice import Ranks, cost_of, limit_to
 
 
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
@@ -21,7 +21,7 @@ def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tu
     ranks = Ranks(seed)
     for i, (decision, name) in enumerate(windows):
         ranks.add(f"group_{i % 3}", decision, name)
-    cut = ranks.cut(ranks.groups, ratio)
+    cut = ranks.cut(ranks.found, ratio)
     return [(decision, name) for decision, name in windows if cut.keeps(decision, name)]
 
 
@@ -79,3 +79,46 @@ def test_the_cost_by_hand():
     assert "track_straight 8 -> 2 (66.7% -> 33.3%); whole: hover 2, slow_down 2; absent: yaw_left_to_follow" in str(
         cost
     )
+
+
+# --- so many and no more ----------------------------------------------------------------------------------------------
+
+TABLES = st.dictionaries(
+    st.sampled_from([f"flight_{i}" for i in range(12)]),
+    st.dictionaries(st.sampled_from(ACTIONS[:6]), st.integers(1, 30), min_size=1),
+    min_size=1,
+)
+
+
+def limited(table: dict[str, dict[str, int]], num_windows: int, seed: int = 0, ratio: float = 0.0):
+    """Give the windows that stay, (flight, decision, name), and the limit."""
+    ranks = Ranks(seed)
+    windows = [(f, d, f"{f}_{d}_{i}") for f, counts in table.items() for d, n in counts.items() for i in range(n)]
+    for window in windows:
+        ranks.add(*window)
+    cut = ranks.cut(table, ratio) if ratio else None
+    limit = limit_to(ranks, num_windows, dict.fromkeys(table, cut))
+    left = [window for window in windows if cut is None or cut.keeps(*window[1:])]
+    return [window for window in left if limit is None or limit.keeps(*window)], left, limit
+
+
+@given(TABLES, st.floats(0.0, 1.2), st.integers(0, 2), st.sampled_from([0.0, 0.5, 1.0]))
+def test_a_limit_is_exact_and_each_decision_and_flight_has_its_share(table, part, seed, ratio):
+    _, left, _ = limited(table, 0, seed, ratio)
+    num_windows = int(part * len(left))
+    kept, left, limit = limited(table, num_windows, seed, ratio)
+    assert len(kept) == min(num_windows, len(left))
+    assert (limit is None) == (num_windows >= len(left))
+    share = len(kept) / len(left)
+    for place, slack in ((1, 1.0), (0, 2.0)):
+        before, after = (Counter(window[place] for window in found) for found in (left, kept))
+        for name, count in before.items():
+            assert abs(after[name] - share * count) <= slack + 1e-9, (name, count, after[name])
+
+
+def test_a_limit_by_hand():
+    table = {"a": {"hover": 60, "track_straight": 20}, "b": {"hover": 20}}
+    kept, _, _ = limited(table, 10)
+    assert Counter(window[:2] for window in kept) == {("a", "hover"): 6, ("a", "track_straight"): 2, ("b", "hover"): 2}
+    assert set(kept) != set(limited(table, 10, seed=1)[0])
+    assert set(kept) == set(limited(dict(reversed(table.items())), 10)[0])

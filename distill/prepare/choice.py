@@ -1,12 +1,13 @@
-"""A training split in which no decision crowds out the others.
+"""Which windows stay: a training split in which no decision crowds out the others, and no more than were asked for.
 
-Windows are ranked by a hash of the seed and their name. Of a decision that has too many the first in rank stay, so neither the order of the
+Windows are ranked by a hash of the seed and their name. Of what has too many the first in rank stay, so neither the order of the
 captions nor the number of workers matters. A window goes or stays with all its languages.
 """
 
 from __future__ import annotations
 
 import hashlib
+import heapq
 import math
 from array import array
 from collections import defaultdict
@@ -37,37 +38,111 @@ class Cut:
 
 
 class Ranks:
-    """The 64-bit ranks of the windows by group and decision, which is all that is held of them."""
+    """The 64-bit ranks of the windows by flight and decision, which is all that is held of them."""
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed
-        self._ranks: dict[str, dict[str, array[int]]] = {}
+        self.seed = seed
+        self.found: dict[str, dict[str, array[int]]] = {}
 
-    def add(self, group: str, decision: str, sample_id: str) -> None:
-        self._ranks.setdefault(group, {}).setdefault(decision, array("Q")).append(_rank(sample_id, self._seed))
+    def add(self, flight: str, decision: str, sample_id: str) -> None:
+        ranks = self.found.setdefault(flight, {}).setdefault(decision, array("Q"))
+        ranks.append(_rank(sample_id, self.seed))
 
-    @property
-    def groups(self) -> list[str]:
-        return list(self._ranks)
-
-    def cut(self, groups: Iterable[str], ratio: float) -> Cut:
+    def cut(self, flights: Iterable[str], ratio: float) -> Cut:
         """Find the cut that leaves of each decision at most `ratio` times an equal share, and one window at least.
 
         An equal share is the windows over the decisions that occur. The median or the least of the counts would be no measure: a few
         stray decisions of one or two windows bring them down, and nearly all of the others with them.
 
         Args:
-            groups: those of the training split, one at least.
+            flights: those of the training split, one at least.
             ratio: > 0.
         """
         ranks: dict[str, array[int]] = defaultdict(lambda: array("Q"))
-        for group in groups:
-            for decision, found in self._ranks[group].items():
+        for flight in flights:
+            for decision, found in self.found[flight].items():
                 ranks[decision].extend(found)
         windows = {decision: len(found) for decision, found in sorted(ranks.items())}
         most = max(1, math.floor(ratio * sum(windows.values()) / len(windows)))
         last_rank = {decision: sorted(found)[most - 1] for decision, found in ranks.items() if len(found) > most}
-        return Cut(self._seed, ratio, most, windows, last_rank)
+        return Cut(self.seed, ratio, most, windows, last_rank)
+
+
+# --- so many and no more ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Which windows stay of all: of each flight and decision those up to a rank."""
+
+    seed: int
+    last_rank: Mapping[tuple[str, str], int]
+
+    def keeps(self, flight: str, decision: str, sample_id: str) -> bool:
+        return _rank(sample_id, self.seed) <= self.last_rank.get((flight, decision), -1)
+
+
+def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> Limit | None:
+    """Choose exactly so many windows, of each decision and each flight its share; None where there are no more anyway.
+
+    The shares of the decisions are rounded first. Then each decision's windows are dealt to its flights, and what a flight got too
+    much or too little of is made up for by its next decision.
+
+    Args:
+        cuts: flight -> what has been cut of it already.
+    """
+    left: dict[str, dict[str, list[int]]] = defaultdict(dict)  # decision -> flight -> ranks, in order
+    for flight, found in sorted(ranks.found.items()):
+        for decision, all_ranks in found.items():
+            cut = cuts[flight]
+            last = math.inf if cut is None else cut.last_rank.get(decision, math.inf)
+            left[decision][flight] = sorted(rank for rank in all_ranks if rank <= last)
+    counts = {decision: sum(map(len, flights.values())) for decision, flights in left.items()}
+    total = sum(counts.values())
+    if num_windows >= total:
+        return None
+    share = num_windows / total
+    order = sorted(counts, key=lambda decision: _rank(decision, ranks.seed))
+    wanted = _dealt(num_windows, {decision: (counts[decision] * share, counts[decision]) for decision in order})
+    carried: dict[str, float] = defaultdict(float)
+    last_rank: dict[tuple[str, str], int] = {}
+    for decision in order:
+        flights = sorted(left[decision], key=lambda flight: _rank(f"{decision}/{flight}", ranks.seed))
+        own = wanted[decision] / max(1, counts[decision])
+        have = {flight: len(left[decision][flight]) for flight in flights}
+        for flight, number in _dealt(
+            wanted[decision], {flight: (own * have[flight] + carried[flight], have[flight]) for flight in flights}
+        ).items():
+            carried[flight] += share * have[flight] - number
+            if number:
+                last_rank[flight, decision] = left[decision][flight][number - 1]
+    return Limit(ranks.seed, last_rank)
+
+
+def _dealt(total: int, wishes: Mapping[str, tuple[float, int]]) -> dict[str, int]:
+    """Deal `total` in whole numbers as near to the wishes as can be: name -> number.
+
+    Args:
+        wishes: name -> (wish, most); the mosts add up to `total` or more. Of equal wishes the first comes first.
+    """
+    dealt = {name: min(most, max(0, math.floor(wish))) for name, (wish, most) in wishes.items()}
+    missing = total - sum(dealt.values())
+    step = 1 if missing > 0 else -1
+    places = {name: place for place, name in enumerate(wishes)}
+
+    def key(name: str) -> tuple[float, int, str]:
+        return step * (dealt[name] - wishes[name][0]), places[name], name
+
+    heap = [key(name) for name, (_, most) in wishes.items() if 0 <= dealt[name] + step <= most]
+    heapq.heapify(heap)
+    for _ in range(abs(missing)):
+        name = heap[0][2]
+        dealt[name] += step
+        if 0 <= dealt[name] + step <= wishes[name][1]:
+            heapq.heapreplace(heap, key(name))
+        else:
+            heapq.heappop(heap)
+    return dealt
 
 
 # --- what it cost -----------------------------------------------------------------------------------------------------

@@ -1,0 +1,150 @@
+"""A caption to the samples of its languages, or the words for why there are none."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from cosfly.config import Config
+from cosfly.errors import InputError
+from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
+from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, parse_answer
+from cosfly.splits import SPLITS, Split
+from cosfly.store import dump_json
+from distill.schema import Sample
+
+
+class PrepareConfig(Config):
+    """Settings of `distill prepare`."""
+
+    languages: tuple[Language, ...] = Field(
+        ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
+    )
+    modalities: tuple[View, ...] = Field(
+        ("rgb",), min_length=1, description="pictures of each window frame, in this order: rgb, depth, segmentation"
+    )
+    split_by: Literal["walk", "town"] = Field(
+        "walk",
+        description="what may not be shared by two splits: all flights after one person on one way, or all builds of a town",
+    )
+    val_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
+    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
+    too_few: Literal["refuse", "fill"] = Field(
+        "refuse",
+        description="with fewer walks (towns) than splits: refuse, or fill train, then val, and leave the rest empty",
+    )
+    unbound: Literal["refuse", "accept"] = Field(
+        "refuse",
+        description="captions of which no record says from which tree they were made, as after copying the file alone: another tree's "
+        "would go unseen",
+    )
+    repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
+    repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
+    verdicts: tuple[Verdict, ...] = Field(
+        ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
+    )
+    contradicted: Literal["keep", "exclude"] = Field(
+        "exclude", description="what happens to answers of which the geometry contradicts a sentence"
+    )
+    min_proved: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="least share of an answer's sentences that the geometry proves; 0 takes unread ones too",
+    )
+    weigh_proved: bool = Field(
+        False,
+        description="multiply a sample's weight by that share (half at least, so that what is unread still counts)",
+    )
+    balance: Literal["none", "decisions"] = Field(
+        "none",
+        description="decisions: training windows of a decision beyond `balance_ratio` are left out; validation and test stay",
+    )
+    balance_ratio: float = Field(
+        1.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="most training windows of a decision, as a multiple of an equal share (windows / decisions that occur)",
+    )
+
+    limit: int = Field(
+        0, ge=0, description="windows in all splits together, of each decision and flight its share; 0: all there are"
+    )
+
+    @model_validator(mode="after")
+    def _fractions_leave_something(self) -> PrepareConfig:
+        if self.val_fraction + self.test_fraction >= 1.0:
+            raise ValueError("val_fraction + test_fraction must stay below 1, or nothing is left to train on")
+        if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
+            raise ValueError("languages and modalities may name each entry once")
+        return self
+
+    @property
+    def fractions(self) -> dict[Split, float]:
+        shares: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
+        return {split: shares[split] for split in SPLITS if shares.get(split)}
+
+
+def make_sample(
+    caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", walk: str = "", sample_id: str = ""
+) -> Sample | str:
+    """Give the sample of a caption in one language, or the word for why there is none.
+
+    Args:
+        run, walk: of its flight. sample_id: unique among the samples of all runs; "" takes the caption's.
+    Raises:
+        InputError: the prompt cannot say which pictures the student gets.
+    """
+    if caption.status != "accepted":
+        return f"dropped_{caption.drop_reason or 'unknown'}"
+    if caption.repair is not None and cfg.repaired == "exclude":
+        return "repaired"
+    if caption.verdict not in cfg.verdicts:
+        return f"verdict_{str(caption.verdict).lower()}"
+    states = (caption.checks.sentences or {}).get(language, [])
+    if "contradicted" in states and cfg.contradicted == "exclude":
+        return "contradicted"
+    proved = caption.coverage(language)
+    if (proved or 0.0) < cfg.min_proved:
+        return "too_little_proved"
+    coc = caption.en if language == "en" else caption.zh
+    if coc is None or language not in caption.prompt:
+        return f"no_{language}"
+    answer = dump_json(coc.model_dump())
+    parsed = parse_answer(answer, language)
+    if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
+        return f"answer_{parsed.reason}"
+    if PICTURES_MARK not in caption.prompt[language].user:
+        raise InputError(
+            "the prompt of a caption has no place for the sentence about the pictures",
+            where=f"{caption.sample_id}: prompt.{language}",
+            expected=f"{PICTURES_MARK} in it",
+            fix="run cosfly caption anew",
+        )
+    pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
+    return Sample(
+        sample_id=sample_id or caption.sample_id,
+        language=language,
+        run=run,
+        town=caption.town,
+        trajectory=caption.trajectory,
+        variant=caption.variant,
+        walk=walk,
+        window=tuple(caption.window),
+        views=pictures.views,
+        picture_px=pictures.size_px,
+        depth_range_m=pictures.depth_range_m,
+        prompt=caption.prompt[language].told(pictures.sentence(language)),
+        answer=answer,
+        decision=parsed.coc.flight_decision,
+        label=None if caption.label_from == "perturbed" else caption.label,  # that one holds noise
+        repair=None if caption.repair is None else caption.repair.strategy,
+        proved=proved,
+        weight=_weight(caption, proved, cfg),
+    )
+
+
+def _weight(caption: Caption, proved: float | None, cfg: PrepareConfig) -> float:
+    weight = 1.0 if caption.repair is None else cfg.repaired_weight
+    return weight * (0.5 + 0.5 * (proved or 0.0)) if cfg.weigh_proved else weight
