@@ -22,6 +22,7 @@ from cosfly.render.stage import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worker_pool import Watch
 from distill.evaluation.stage import EvaluateConfig
+from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.samples import PrepareConfig
 from distill.training.stage import TrainConfig
@@ -36,6 +37,7 @@ class DistillConfig(Config):
     prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
+    merge: MergeConfig = Field(default_factory=MergeConfig, description="an adapter into its base's weights")
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
 
 

@@ -9,17 +9,20 @@ import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
-from cosfly.frame_views import encode_picture, frame_label
-from cosfly.products.captions import Prompt
-from cosfly.store import sha256_bytes
+from cosfly.errors import InputError
+from cosfly.frame_views import View, encode_picture, frame_label
+from cosfly.products.captions import Language, Prompt
+from cosfly.reading.documents import read_model
+from cosfly.store import sha256_bytes, write_model
 
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it
 MAX_ANSWER_TOKENS = 512  # unless told otherwise: an answer as long as is taught, and a half more
@@ -89,3 +92,55 @@ def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
         return picture
     size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
+
+
+# --- what a student was taught ----------------------------------------------------------------------------------------
+
+TAUGHT, TAUGHT_SCHEMA, TAUGHT_VERSION = "cosfly_student.json", "cosfly.student", "1.0"
+
+
+class Look(BaseModel):
+    """How frames were shown: their views in this order, (width, height) of each picture, and the dark end of those of depth."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    views: tuple[View, ...]
+    size_px: tuple[PositiveInt, PositiveInt]
+    depth_range_m: float = Field(gt=0, allow_inf_nan=False)
+
+
+class Taught(BaseModel):
+    """`cosfly_student.json`, beside a student's weights: what its chats looked like when it was taught.
+
+    prompts: of each language that it was taught, one of the questions, whose words tell the version of all. num_frames: of a window.
+    looks: of all training samples, sorted. max_pixels: most that its image processor kept of a picture.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prompts: dict[Language, Prompt] = Field(min_length=1)
+    num_frames: int = Field(ge=1)
+    looks: list[Look] = Field(min_length=1)
+    max_pixels: int = Field(ge=1)
+
+
+def write_taught(folder: Path, taught: Taught) -> None:
+    write_model(folder / TAUGHT, taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION)
+
+
+def read_taught(folder: Path) -> Taught:
+    """Read what a student was taught, from the folder of its weights or the output folder that they stand in.
+
+    Raises:
+        InputError: there is none, or it is malformed.
+    """
+    places = [folder, folder / "adapter", folder / "model"]
+    place = next((place for place in places if (place / TAUGHT).is_file()), None)
+    if place is None:
+        raise InputError(
+            "nothing here says what the student was taught",
+            where=folder,
+            expected=f"{TAUGHT} in it, in adapter/ or in model/",
+            fix="give what cosfly distill train or merge wrote",
+        )
+    return read_model(place / TAUGHT, Taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION, what="student", tree=place)

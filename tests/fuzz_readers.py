@@ -69,6 +69,7 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.stage_events import EventLog, read_events
 from cosfly.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.store import CHECKSUMS, write_checksums, write_json
+from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.evaluation import stage as evaluate
 from distill.inference.stage import make_prediction
 from distill.prepare import stage as prepare
@@ -77,6 +78,7 @@ from distill.prepare.sources import Source as Prepared
 from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
+from distill.student.taught import taught_by
 from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
@@ -258,6 +260,7 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
             "max_pixels": 4,
         },
     )
+    write_taught(model, taught_by(samples, 4))
 
 
 def _records(root: Path) -> None:
@@ -488,6 +491,7 @@ READERS: dict[str, Reader] = {
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),
     "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
+    "student's teaching": _one(f"model/{TAUGHT}", lambda path: read_taught(path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),
     "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),

@@ -103,6 +103,24 @@ def distill_infer(
     typer.echo(infer.run(cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=resume))
 
 
+@app.command("merge")
+def distill_merge(
+    model: ModelOption,
+    adapter: Annotated[Path, typer.Option(help="Adapter folder, the output of `distill train`.")],
+    out: options.Out,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    verify: options.Verify = False,
+    resume: options.Resume = "if-same",
+) -> None:
+    """Put an adapter into the weights of its base: a model folder for transformers, vLLM and servers."""
+    from distill.inference import merge
+
+    cfg = options.resolve(config, overrides, {})
+    options.verify_first(verify, adapter, out)
+    typer.echo(merge.run(cfg.distill.merge, model, adapter, out, resume=resume))
+
+
 @app.command("evaluate")
 def distill_evaluate(
     dataset: DatasetOption,

@@ -25,6 +25,7 @@ from cosfly.reading.documents import parse_json
 from cosfly.reading.files import read_lines
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, dump_json, inside, storage_errors, write_json
+from cosfly.student_chat import write_taught
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import (
     ADAPTER_FACTS,
@@ -37,6 +38,7 @@ from distill.student.checkpoint import (
 )
 from distill.student.encoding import IGNORED, Encoded, count_tokens, encode, image_size, most_pixels, training_batch
 from distill.student.model import Device, Student, load_student, require, weight_files
+from distill.student.taught import taught_by
 
 log = logging.getLogger(__name__)
 
@@ -376,6 +378,7 @@ def run(
     with atomic_folder(adapter) as partial:
         student.model.save_pretrained(partial)
         write_json(partial / ADAPTER_FACTS, facts)
+        write_taught(partial, taught_by(samples, max_pixels))
     stage.finish(
         [path for path in (out / "log.jsonl", *adapter.iterdir()) if path.is_file()],
         Tally(input=len(samples), kept=len(samples)),

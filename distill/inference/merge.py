@@ -1,0 +1,210 @@
+"""An adapter's updates put into the weights of its base: a model folder that needs no peft, for transformers, vLLM and any server.
+
+The base's files are gone through one tensor after the other, so a model of any size fits, and what the adapter leaves alone
+(the vision tower, layers that transformers does not load) comes out byte for byte as it was.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+from cosfly.config import Config
+from cosfly.console import progress_bar
+from cosfly.errors import InputError
+from cosfly.reading.documents import read_json, read_object, validation_errors
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import atomic_folder, storage_errors, write_json
+from cosfly.student_chat import TAUGHT
+from distill.student.checkpoint import read_adapter_facts
+from distill.student.model import require, weight_files
+
+STAGE = "distill.merge"
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+PREFIX = "base_model.model."  # of the names that peft gives
+# Files of a model folder that are neither weights nor code: what the model is, what its processor and its chats are.
+COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")
+
+
+class MergeConfig(Config):
+    """Settings of `distill merge`."""
+
+    dtype: Literal["base", "float32"] = Field(
+        "base",
+        description="of the tensors that the adapter changes: as in the base, or float32; sums are made in float32",
+    )
+
+
+class LoraSettings(BaseModel):
+    """Of `adapter_config.json`, what decides how an update is computed."""
+
+    peft_type: Literal["LORA"]
+    r: int = Field(ge=1)
+    lora_alpha: float = Field(gt=0, allow_inf_nan=False)
+    use_rslora: bool = False
+    # What else a LoRA may be, and none of ours is; each is refused unless it is off.
+    use_dora: Literal[False] = False
+    use_qalora: Literal[False] = False
+    lora_bias: Literal[False] = False
+    fan_in_fan_out: Literal[False] = False
+    bias: Literal["none"] = "none"
+    alpha_pattern: dict[str, float] = Field({}, max_length=0)
+    rank_pattern: dict[str, int] = Field({}, max_length=0)
+    modules_to_save: list[str] | None = Field(None, max_length=0)
+
+    @property
+    def scale(self) -> float:
+        return self.lora_alpha / (math.sqrt(self.r) if self.use_rslora else self.r)
+
+
+def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") -> Path:
+    """Read a base model's folder and an adapter that was trained on it; write `model/`.
+
+    Returns:
+        The folder `model/`, which transformers and vLLM load.
+    Raises:
+        InputError: the adapter is of another base, or of a kind that is not merged here. StorageError: the disk is full.
+        EnvironmentMissing: torch or safetensors is missing.
+    """
+    require("torch", "safetensors")
+    inputs = {**weight_files(model), **adapter_files(adapter)}
+    read_adapter_facts(adapter, model)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)
+    merged = out / "model"
+    if stage.is_complete:
+        return merged
+    updates = Updates(adapter)
+    with atomic_folder(merged) as partial:
+        _copy_settings(model, adapter, partial)
+        shards, num_bytes = sorted(model.glob("*.safetensors")), 0
+        with progress_bar(STAGE, total=len(shards)) as advance:
+            for shard in shards:
+                num_bytes += _merge_shard(shard, partial / shard.name, updates, cfg.dtype)
+                advance(1)
+        _mend_index(partial, num_bytes)
+        if left := updates.unused():
+            raise InputError(
+                "the base has no layer that the adapter changes",
+                where=adapter,
+                got=left[0],
+                fix="give the base that it was trained on",
+            )
+    outputs = [path for path in merged.iterdir() if path.is_file()]
+    tally = Tally(input=len(updates.names), kept=len(updates.names))
+    stage.finish(outputs, tally, dtype=cfg.dtype)
+    return merged
+
+
+def adapter_files(adapter: Path) -> dict[str, Path]:
+    """Give the files of an adapter, for the inputs of a stage: name -> path.
+
+    Raises:
+        InputError: it is none, or whole weights already.
+    """
+    names = ("adapter_config.json", "adapter_model.safetensors")
+    if not all((adapter / name).is_file() for name in names):
+        whole = (adapter / "config.json").is_file()
+        raise InputError(
+            "whole weights already, with nothing to merge" if whole else "not an adapter",
+            where=adapter, expected=" and ".join(names), fix="give --model this folder" if whole else "give adapter/ of cosfly distill train",
+        )  # fmt: skip
+    return {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
+
+
+class Updates:
+    """The updates of an adapter by the name of the tensor that they are added to."""
+
+    def __init__(self, adapter: Path) -> None:
+        path = adapter / "adapter_config.json"
+        value = read_json(path, what="adapter")
+        with validation_errors(path):
+            self._scale = LoraSettings.model_validate(value).scale
+        _, tensors = _read_tensors(adapter / "adapter_model.safetensors")
+        self._pairs: dict[str, list[Any]] = {}
+        for name, tensor in tensors.items():
+            layer, _, part = name.removeprefix(PREFIX).rpartition(".lora_")
+            if part not in ("A.weight", "B.weight") or not name.startswith(PREFIX):
+                raise InputError("not a tensor of a LoRA adapter", where=adapter, got=name)
+            self._pairs.setdefault(f"{layer}.weight", [None, None])["AB".index(part[0])] = tensor
+        for name, (down, up) in self._pairs.items():
+            if down is None or up is None or down.shape[0] != up.shape[1]:
+                raise InputError("half an update", where=adapter, got=name, expected="lora_A (r, n) and lora_B (m, r)")
+        self.names = sorted(self._pairs)
+        self._used: set[str] = set()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._pairs
+
+    def add_to(self, name: str, weight: Any) -> Any:
+        """Give a weight (m, n) with its update, in float32."""
+        down, up = self._pairs[name]
+        if weight.shape != (up.shape[0], down.shape[1]):
+            raise InputError(
+                "an update of another shape than its layer",
+                where=name,
+                got=(up.shape[0], down.shape[1]),
+                expected=str(tuple(weight.shape)),
+            )
+        self._used.add(name)
+        return weight.float() + self._scale * (up.float() @ down.float())
+
+    def unused(self) -> list[str]:
+        return [name for name in self.names if name not in self._used]
+
+
+def _copy_settings(model: Path, adapter: Path, out: Path) -> None:
+    """Copy what is no weights: from the base all, from the adapter what it was taught."""
+    files = {path for pattern in COPIED for path in model.glob(pattern) if path.is_file()}
+    for path in sorted(files, key=lambda path: path.name):
+        shutil.copyfile(path, out / path.name)  # a hub's cache holds links, of which the content counts
+    if (adapter / TAUGHT).is_file():
+        shutil.copyfile(adapter / TAUGHT, out / TAUGHT)
+
+
+def _read_tensors(path: Path) -> tuple[dict[str, str] | None, dict[str, Any]]:
+    """Read a file of weights: what it says of itself, and its tensors by name."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise InputError("a damaged file of weights", where=path, got=str(error)[:200]) from error
+
+
+def _merge_shard(shard: Path, out: Path, updates: Updates, dtype: str) -> int:
+    """Write one file of weights with the updates in it; gives the bytes of its tensors."""
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    metadata, tensors = _read_tensors(shard)
+    for name in tensors:
+        if name in updates:
+            merged = updates.add_to(name, tensors[name])
+            tensors[name] = merged.to(tensors[name].dtype if dtype == "base" else torch.float32).contiguous()
+    for name in tensors:
+        if name in updates and not torch.isfinite(tensors[name]).all():
+            raise InputError("a merged weight is not finite", where=shard, got=name, fix="look at the training's loss")
+    with storage_errors(out):
+        try:
+            save_file(tensors, out, metadata)
+        except SafetensorError as error:  # in whose words the library hides what the disk says
+            if number := _OS_ERROR.search(str(error)):
+                raise OSError(int(number[1]), os.strerror(int(number[1])), str(out)) from error
+            raise
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+
+
+def _mend_index(folder: Path, num_bytes: int) -> None:
+    """Say in the index of several files how many bytes their tensors have now."""
+    path = folder / "model.safetensors.index.json"
+    if path.is_file():
+        index = read_object(path, what="index of weights")
+        write_json(path, index | {"metadata": {**(index.get("metadata") or {}), "total_size": num_bytes}})
