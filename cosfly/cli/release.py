@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -104,3 +104,40 @@ def release_viewer(
     chosen = {"flights": flights, "frames": frames, "picture_px": picture_px, "max_mb": max_mb}
     written = page.run(folder, out, build(ViewerConfig, chosen, "the options"), captions)
     typer.echo(f"{written}: {written.stat().st_size / 1e6:,.1f} MB")
+
+
+@app.command("export")
+def release_export(
+    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    out: Annotated[Path, typer.Option(help="Folder for the export and its records.")],
+    format: Annotated[
+        Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"],
+        typer.Option(help="Playback tree (CosFly-Track v7), WebDataset, LeRobot v3.0 or v2.1."),
+    ],
+    depth: Annotated[
+        Literal["float32", "millimetre", "logarithmic"],
+        typer.Option(
+            help="How depth is coded: lossless, or for WebDataset PNG of 16 bits; what that costs is measured."
+        ),
+    ] = "float32",
+    shard_mb: Annotated[int | None, typer.Option(help="Size of a file of many frames, about, in MB.")] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    workers: options.Workers = None,
+    verify: options.Verify = False,
+    resume: options.Resume = "if-same",
+    repair: options.Repair = False,
+) -> None:
+    """Write a release in another format, without loss, with its licence and where it came from."""
+    from cosfly.config import build
+    from release.export import stage as export
+    from release.export.contract import ExportConfig
+
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    options.set_aside(out, repair)
+    options.verify_first(verify, folder, out)
+    given = {"format": format, "depth": depth} | ({} if shard_mb is None else {"shard_mb": shard_mb})
+    product = export.run(
+        build(ExportConfig, given, "--format, --depth, --shard-mb"), folder, out, **options.manner(cfg, resume)
+    )
+    options.tell_product(product, out, cfg)

@@ -25,7 +25,7 @@ LEAST_ROW_BYTES = 1_000  # of a row in memory, as values of Python: packed, a mi
 
 
 @contextlib.contextmanager
-def arrow_errors(path: Path) -> Iterator[None]:
+def arrow_errors(path: Path | str) -> Iterator[None]:
     """Turn what pyarrow raises on a damaged file into an InputError; only its calls stand in it."""
     try:
         yield
@@ -64,10 +64,15 @@ def row_groups(
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
             if wanted is None or k in wanted:
-                yield _row_group(path, table, k, columns)
+                yield read_row_group(path, table, k, columns)
 
 
-def _row_group(path: Path, table: pq.ParquetFile, k: int, columns: list[str] | None) -> pa.Table:
+def read_row_group(path: Path | str, table: pq.ParquetFile, k: int, columns: list[str] | None) -> pa.Table:
+    """Read one row group of an open table; `path` is for messages.
+
+    Raises:
+        InputError: it is damaged, or over the limit.
+    """
     about = table.metadata.row_group(k)
     size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
     if size > limits().file_mb * MB:
@@ -139,7 +144,7 @@ class TableRows(Sequence[dict[str, Any]]):
         k = bisect.bisect_right(self._firsts, number) - 1
         with self._lock:
             if k not in self._held:
-                self._held[k] = _row_group(self._path, table, k, self._columns)
+                self._held[k] = read_row_group(self._path, table, k, self._columns)
                 if len(self._held) > GROUPS_HELD:
                     self._held.popitem(last=False)
             self._held.move_to_end(k)

@@ -1,0 +1,390 @@
+"""LeRobot v3.0 and v2.1: a flight is an episode, or several where the release leaves frames of it out.
+
+    v3.0    data/chunk-000/file-000.parquet of several episodes, meta/{info.json, stats.json, tasks.parquet, episodes/chunk-000/file-000.parquet}
+    v2.1    data/chunk-000/episode_000000.parquet, meta/{info.json, tasks.jsonl, episodes.jsonl, episodes_stats.jsonl}
+
+LeRobot counts time by frames, so an episode holds frames that follow each other without a gap. Pictures are the released PNG bytes in the
+parquet files; depth is TIFF of float32, LeRobot's own lossless form. The task of a frame is its caption's decision in words.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cosfly.errors import InputError
+from cosfly.geometry import step_s
+from cosfly.products.captions import ACTIONS
+from cosfly.products.frames import FrameFile
+from cosfly.reading.arrays import parse_array, parse_picture
+from cosfly.runner import advance
+from cosfly.store import atomic_file, dump_json
+from release.columns import PICTURES
+from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
+from release.export.lerobot.features import CAMERAS, COLUMNS, Feature, features_of, schema_of, tiff_of_depth, values_of
+from release.export.lerobot.summary import QUANTILES, Summary, merged, sampled, summarize, thinned
+from release.export.source import SPLITS, Release, ReleasedRows, picture, read_span, rows_of_flight
+
+MB = 1024 * 1024
+CHUNK = 1000  # files, or in v2.1 episodes, of one folder
+STEP_TOLERANCE_S = 1e-3
+FOLLOW_TASK = "Follow the walking person from the air."
+DATA_PATH = {
+    "lerobot": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "lerobot-v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+}
+VERSIONS = {"lerobot": "v3.0", "lerobot-v2.1": "v2.1"}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a unit must know of the whole. episode, index: the numbers of its first episode and frame; file: its own number."""
+
+    split: str
+    file: int
+    episode: int
+    index: int
+    fps: int
+    size_px: tuple[int, int]
+    tasks: tuple[str, ...]  # decisions; "" for frames without a caption
+
+
+def runs_of(flight: ReleasedRows) -> list[tuple[int, int]]:
+    """Cut a flight into [start, stop) of frames that follow each other."""
+    cuts = np.flatnonzero(np.diff(flight.frame_index) != 1) + 1
+    edges = [0, *cuts.tolist(), len(flight)]
+    return list(itertools.pairwise(edges))
+
+
+def task_of(decision: str) -> str:
+    return f"{FOLLOW_TASK} Now: {decision.replace('_', ' ')}." if decision else FOLLOW_TASK
+
+
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+    """Number episodes and frames; a unit is a data file of whole flights, in v2.1 one flight.
+
+    Raises:
+        InputError: pictures of several sizes, or times that no whole number of frames a second gives.
+    """
+    fps, size_px = _fps(flights), _size(release)
+    found = {decision for flight in flights for decision in flight.decisions}
+    tasks = tuple(decision for decision in ("", *ACTIONS) if decision in found)
+    if unknown := found - set(tasks):
+        raise InputError(
+            "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]
+        )
+    units: list[Unit] = []
+    episode = index = 0
+    for split in SPLITS:
+        groups: list[list[ReleasedRows]] = []
+        for flight in (flight for flight in flights if flight.split == split):
+            is_full = groups and sum(member.num_bytes for member in groups[-1]) >= cfg.shard_mb * MB
+            if not groups or is_full or cfg.format == "lerobot-v2.1":
+                groups.append([])
+            groups[-1].append(flight)
+        for group in groups:
+            layout = Layout(split, len(units), episode, index, fps, size_px, tasks)
+            frames = sum(map(len, group))
+            units.append(Unit(f"{split}-{len(units):06d}", frames, flights=tuple(group), extra=layout))
+            episode += sum(len(runs_of(flight)) for flight in group)
+            index += frames
+    return units
+
+
+def _fps(flights: list[ReleasedRows]) -> int:
+    wrong, fps = [], set()
+    for flight in flights:
+        for start, stop in runs_of(flight):
+            if stop - start < 2:
+                continue
+            time_s = flight.time_s[start:stop]
+            dt_s = step_s(time_s)
+            fps.add(round(1 / dt_s))
+            if (
+                np.abs(np.diff(time_s) - dt_s).max() > STEP_TOLERANCE_S
+                or abs(1 / round(1 / dt_s or 1) - dt_s) > STEP_TOLERANCE_S
+            ):
+                wrong.append(f"{flight.name}: steps of {np.diff(time_s).min():.4f} to {np.diff(time_s).max():.4f} s")
+    if wrong or len(fps) > 1:
+        raise InputError(
+            "LeRobot has one whole number of frames a second",
+            where="time_s",
+            got="; ".join(wrong[:10]) or f"{sorted(fps)} a second",
+        )
+    return fps.pop() if fps else 2  # the paper's
+
+
+def _size(release: Release) -> tuple[int, int]:
+    sizes = release.record.numbers.frames_by.image_px
+    if len(sizes) != 1:
+        raise InputError(
+            "LeRobot has pictures of one size",
+            where=release.folder,
+            got=", ".join(sizes),
+            fix="build a release of each size",
+        )
+    width, _, height = next(iter(sizes)).replace(" ", "").partition("x")
+    return int(width), int(height)
+
+
+# --- a unit -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of a unit: its number, its flight, rows [start, stop) of that, the number of its first frame in the whole."""
+
+    number: int
+    flight: ReleasedRows
+    start: int
+    stop: int
+    index: int
+
+
+def _episodes(unit: Unit) -> Iterator[Episode]:
+    number, index = unit.extra.episode, unit.extra.index
+    for flight in unit.flights:
+        for start, stop in runs_of(flight):
+            yield Episode(number, flight, start, stop, index)
+            number, index = number + 1, index + stop - start
+
+
+def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+    """Write the data files of a unit, and of v3.0 its part of the table of episodes."""
+    layout: Layout = unit.extra
+    features = features_of(release.modalities, layout.size_px)
+    files, rows_about = Files(folder), list[dict[str, Any]]()
+    if cfg.format == "lerobot":
+        name = DATA_PATH[cfg.format].format(chunk_index=layout.file // CHUNK, file_index=layout.file % CHUNK)
+        tables = (
+            table for episode in _episodes(unit) for table in _tables(release, episode, layout, features, rows_about)
+        )
+        _write_parquet(files, name, schema_of(features), tables)
+        _write_episodes(files, layout, rows_about)
+        whole = _merge_all([row["stats"] for row in rows_about])
+        return files.written(stats=whole, episodes=len(rows_about))
+    for episode in _episodes(unit):
+        name = DATA_PATH[cfg.format].format(episode_chunk=episode.number // CHUNK, episode_index=episode.number)
+        _write_parquet(files, name, schema_of(features), _tables(release, episode, layout, features, rows_about))
+    for row in rows_about:
+        row["stats"] = {
+            name: {k: v for k, v in summary.items() if k not in QUANTILES} for name, summary in row["stats"].items()
+        }
+    return files.written(about=rows_about, episodes=len(rows_about))
+
+
+def _tables(
+    release: Release, episode: Episode, layout: Layout, features: dict[str, Feature], about: list[dict[str, Any]]
+) -> Iterator[pa.Table]:
+    """Yield an episode's rows, a row group of the release at a time; at its end `about` has what the records say of it."""
+    flight, n = episode.flight, episode.stop - episode.start
+    scalars = [
+        row for i, row in enumerate(rows_of_flight(release, flight, COLUMNS)) if episode.start <= i < episode.stop
+    ]
+    values = values_of(scalars)
+    decisions = flight.decisions[episode.start : episode.stop]
+    values["task_index"] = np.array([layout.tasks.index(decision) for decision in decisions], dtype=np.int64)
+    values["frame_index"] = np.arange(n, dtype=np.int64)
+    values["timestamp"] = (np.arange(n) / layout.fps).astype(np.float32)
+    values["episode_index"] = np.full(n, episode.number, dtype=np.int64)
+    values["index"] = episode.index + np.arange(n, dtype=np.int64)
+    pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in release.modalities}
+    schema, wanted = schema_of(features), sampled(n)
+    for first, rows in _pictures(release, episode):
+        images = {CAMERAS[file]: [_image(row, file) for row in rows] for file in release.modalities}
+        for i in wanted & set(range(first, first + len(rows))):
+            for file in release.modalities:
+                pixels[CAMERAS[file]].append(_pixels(rows[i - first], file))
+        part = slice(first, first + len(rows))
+        columns = [images[name] if name in images else _column(values[name][part], features[name]) for name in features]
+        yield pa.table(
+            [pa.array(c, schema.field(k).type) if isinstance(c, list) else c for k, c in enumerate(columns)],
+            schema=schema,
+        )
+        advance(len(rows))
+    stats: dict[str, Summary] = {}
+    for name, feature in features.items():
+        if feature.dtype == "image":
+            stats[name] = summarize(np.concatenate(pixels[name]), len(pixels[name]), is_picture=True)
+        elif feature.dtype != "string":
+            stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
+    about.append(
+        {
+            "episode_index": episode.number, "tasks": [task_of(d) for d in dict.fromkeys(decisions)], "length": n,
+            "flight": flight.name, "split": flight.split, "first_frame": int(flight.frame_index[episode.start]),
+            "from": episode.index, "stats": stats,
+        }
+    )  # fmt: skip
+
+
+def _pictures(release: Release, episode: Episode) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Yield an episode's rows with pictures alone, and the number of the first of them in the episode."""
+    columns = ["sample_id", *(PICTURES[file].name for file in release.modalities)]
+    at = 0
+    for span in episode.flight.spans:
+        begin, end = max(at, episode.start), min(at + span.stop - span.start, episode.stop)
+        if begin < end:
+            yield begin - episode.start, read_span(release, span, columns)[begin - at : end - at]
+        at += span.stop - span.start
+
+
+def _image(row: dict[str, Any], file: FrameFile) -> dict[str, Any]:
+    data = picture(row, file)
+    ending = "tiff" if file == "depth" else "png"
+    return {
+        "bytes": tiff_of_depth(data, row["sample_id"]) if file == "depth" else data,
+        "path": f"{row['sample_id']}.{file}.{ending}",
+    }
+
+
+def _pixels(row: dict[str, Any], file: FrameFile) -> np.ndarray:
+    data, where = picture(row, file), row["sample_id"]
+    if file == "depth":
+        return thinned(parse_array(data, where, dtype=np.float32, ndim=2))
+    return thinned(parse_picture(data, where)[..., ::-1])
+
+
+def _column(values: Any, feature: Feature) -> Any:
+    if feature.dtype == "string":
+        return list(values)
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    return flat if feature.shape == (1,) else pa.FixedSizeListArray.from_arrays(flat, feature.shape[0])
+
+
+def _write_parquet(files: Files, name: str, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
+    """Write tables as row groups. PNG bytes are stored as they are; everything else, TIFF too, is zstd."""
+    leaves = [f"{f.name}.{m.name}" for f in schema if pa.types.is_struct(f.type) for m in f.type]
+    leaves += [
+        f"{f.name}.list.element" if pa.types.is_list(f.type) or pa.types.is_fixed_size_list(f.type) else f.name
+        for f in schema
+        if not pa.types.is_struct(f.type)
+    ]
+    stored = {f"{CAMERAS[file]}.bytes" for file in ("rgb", "instance")}
+    compression = {leaf: "none" if leaf in stored else "zstd" for leaf in leaves}
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    with atomic_file(files.folder / name) as file:
+        hashed = HashedFile(file)
+        with pq.ParquetWriter(
+            hashed, schema, compression=compression, use_dictionary=texts, write_statistics=["episode_index"]
+        ) as writer:
+            for table in tables:
+                writer.write_table(table, row_group_size=len(table))
+    files.note(name, hashed.digest.hexdigest(), hashed.num_bytes)
+
+
+def _write_episodes(files: Files, layout: Layout, about: list[dict[str, Any]]) -> None:
+    """Write a unit's part of v3.0's table of episodes."""
+    place = {"chunk_index": layout.file // CHUNK, "file_index": layout.file % CHUNK}
+    rows = []
+    for row in about:
+        stats = {
+            f"stats/{name}/{kind}": values for name, summary in row["stats"].items() for kind, values in summary.items()
+        }
+        rows.append(
+            {
+                **{name: row[name] for name in ("episode_index", "tasks", "length", "flight", "split", "first_frame")},
+                **{f"data/{name}": value for name, value in place.items()},
+                "dataset_from_index": row["from"], "dataset_to_index": row["from"] + row["length"],
+                **stats,
+                **{f"meta/episodes/{name}": value for name, value in place.items()},
+            }
+        )  # fmt: skip
+    name = "meta/episodes/chunk-{:03d}/file-{:03d}.parquet".format(*place.values())
+    files.put(name, _parquet_bytes(pa.Table.from_pylist(rows)))
+
+
+def _parquet_bytes(table: pa.Table) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def _merge_all(stats: list[dict[str, Summary]]) -> dict[str, Summary]:
+    return {name: merged([one[name] for one in stats]) for name in stats[0]}
+
+
+# --- the whole --------------------------------------------------------------------------------------------------------
+
+
+def finish(
+    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
+) -> Facts:
+    """Write `meta/`."""
+    layout: Layout = units[0].extra
+    files, tasks = Files(folder), [task_of(decision) for decision in layout.tasks]
+    counts = [one.facts["episodes"] for one in written]
+    info = _info(release, units, counts, cfg)
+    if cfg.format == "lerobot":
+        files.put("meta/stats.json", dump_json(_merge_all([one.facts["stats"] for one in written]), indent=4).encode())
+        files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
+    else:
+        about = [row for one in written for row in one.facts["about"]]
+        plain = [
+            {k: row[k] for k in ("episode_index", "tasks", "length", "flight", "split", "first_frame")} for row in about
+        ]
+        files.put("meta/tasks.jsonl", _lines({"task_index": k, "task": task} for k, task in enumerate(tasks)))
+        files.put("meta/episodes.jsonl", _lines(plain))
+        files.put("meta/episodes_stats.jsonl", _lines({k: row[k] for k in ("episode_index", "stats")} for row in about))
+    files.put("meta/info.json", dump_json(info, indent=4).encode())
+    num_flights = sum(len(unit.flights) for unit in units)
+    return Facts(
+        version=VERSIONS[cfg.format],
+        codings={
+            file: "TIFF of float32, m, uncompressed before the parquet file's zstd: the released numbers"
+            if file == "depth" else "PNG, the released bytes"
+            for file in release.modalities
+        }
+        | {"poses and points": "float32 of the released float64: a coordinate of 1,000 m is rounded by at most 0.00003 m"},
+        notes=[
+            f"{info['total_episodes']} episodes of {num_flights} flights at {layout.fps} frames a second; a flight of which frames were left out "
+            "is cut there. meta/episodes says of each its flight, split and first frame.",
+            "action is what takes a frame's pose to the next one's: forward, left, up in m in the drone's level axes, yaw in degrees "
+            "(counter-clockwise); that of an episode's last frame is zero, for what follows is not in the release (next.done).",
+            "task is the caption's decision in words; frames without a caption have the plain order. What a frame has not is NaN, or an empty text.",
+        ],
+        how_to_open="from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
+        "frames = LeRobotDataset('cosfly/flights', root='.')",
+        files=files.digests,
+    )  # fmt: skip
+
+
+def _info(release: Release, units: Sequence[Unit], counts: list[int], cfg: ExportConfig) -> dict[str, Any]:
+    layout: Layout = units[0].extra
+    splits: dict[str, str] = {}
+    total = 0
+    for split in SPLITS:
+        here = sum(count for unit, count in zip(units, counts, strict=True) if unit.extra.split == split)
+        if here:
+            splits[split] = f"{total}:{total + here}"
+        total += here
+    features = features_of(release.modalities, layout.size_px)
+    info: dict[str, Any] = {
+        "codebase_version": VERSIONS[cfg.format], "robot_type": "cosfly_drone", "total_episodes": total,
+        "total_frames": sum(unit.frames for unit in units), "total_tasks": len(layout.tasks), "chunks_size": CHUNK, "fps": layout.fps,
+        "splits": splits, "data_path": DATA_PATH[cfg.format], "video_path": None,
+        "features": {name: feature.declared() for name, feature in features.items()},
+    }  # fmt: skip
+    if cfg.format == "lerobot":
+        return info | {"data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb}
+    return info | {"total_videos": 0, "total_chunks": (total + CHUNK - 1) // CHUNK}
+
+
+def _tasks_table(tasks: list[str]) -> pa.Table:
+    """The table of tasks as pandas reads it: the text is the index."""
+    named = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    about = {"index_columns": ["task"], "column_indexes": [], "columns": [named], "pandas_version": "2.0.0"}
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
+    return table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
+
+
+def _lines(rows: Any) -> bytes:
+    return "".join(dump_json(row) + "\n" for row in rows).encode()

@@ -1,0 +1,236 @@
+"""The release that an export is made of: its flights, where their rows stand, and the rows themselves, read a row group at a time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from cosfly.errors import InputError
+from cosfly.products.frames import FrameFile
+from cosfly.reading.arrays import png_size
+from cosfly.reading.files import sha256_file
+from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
+from cosfly.store import inside, sha256_bytes
+from release.columns import PICTURES, PLACE, schema
+from release.record import ReleaseRecord, read_record
+
+# Names of columns below come from `release/columns.py`; those of shards from `release build`.
+SHARD_NAME = re.compile(r"data/(train|validation|test)-(?:[0-9a-f]{12}-)?\d{5}-of-\d{5}\.parquet")
+SPLITS = ("train", "validation", "test")
+NEVER_NULL = ("sample_id", "track", "style", "pace", "width_px", "height_px", "frame_index", "time_s")
+LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision"]
+# What one part of a path may be that rows name: no separator, nothing hidden, no ".."
+PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
+
+Place = tuple[str, str, str, str]  # run, town, trajectory, variant
+
+
+@dataclass(frozen=True)
+class Span:
+    """Rows [start, stop) of row group `group` of a shard, all of one flight."""
+
+    shard: str
+    group: int
+    start: int
+    stop: int
+
+
+@dataclass
+class ReleasedRows:
+    """One flight of a release, n frames. frames (n,) int32, rising; time_s (n,) float64; decisions: of the captions, "" where none.
+
+    num_bytes: of its rows, unpacked.
+    """
+
+    run: str
+    town: str
+    trajectory: str
+    variant: str
+    split: str
+    spans: list[Span] = field(default_factory=list)
+    frames: list[np.ndarray] = field(default_factory=list)
+    times: list[np.ndarray] = field(default_factory=list)
+    decisions: list[str] = field(default_factory=list)
+    num_bytes: int = 0
+
+    @property
+    def name(self) -> str:
+        return "/".join((self.run, self.town, self.trajectory, self.variant))
+
+    @property
+    def frame_index(self) -> np.ndarray:
+        return np.concatenate(self.frames)
+
+    @property
+    def time_s(self) -> np.ndarray:
+        return np.concatenate(self.times)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.frames))
+
+
+@dataclass(frozen=True)
+class Release:
+    """A release folder and its record. record_sha256: of `release.json`."""
+
+    folder: Path
+    record: ReleaseRecord
+    record_sha256: str
+
+    @property
+    def modalities(self) -> list[FrameFile]:
+        return self.record.settings.modalities
+
+    @property
+    def digest(self) -> str:
+        """Of its content; of a record without one, of the list of its shards."""
+        listed = "".join(f"{shard.sha256} {shard.path}\n" for shard in self.record.shards)
+        return getattr(self.record, "content", None) or sha256_bytes(listed.encode())
+
+
+def open_release(folder: Path) -> Release:
+    """Open a release folder, or the `dataset` folder inside a release stage's.
+
+    Raises:
+        InputError: it is none, or its record names files that no release has; lists them all.
+    """
+    if not (folder / "release.json").is_file() and (folder / "dataset" / "release.json").is_file():
+        folder = folder / "dataset"
+    record = read_record(folder / "release.json")
+    wrong = [shard.path for shard in record.shards if not SHARD_NAME.fullmatch(shard.path)]
+    missing = [s.path for s in record.shards if s.path not in wrong and not inside(folder, s.path).is_file()]
+    if wrong or missing:
+        got = "; ".join(
+            [*(f"{name!r} is no name of a shard" for name in wrong), *(f"{name} is missing" for name in missing)]
+        )
+        raise InputError("not a whole release", where=folder, got=got, fix="see `cosfly release verify`")
+    return Release(folder, record, sha256_file(folder / "release.json", tree=folder))
+
+
+def split_of(shard: str) -> str:
+    """Give the split that a shard's name says: train, validation or test."""
+    match = SHARD_NAME.fullmatch(shard)
+    assert match is not None, shard
+    return match[1]
+
+
+def scan(release: Release) -> list[ReleasedRows]:
+    """Find the flights of a release and where their rows stand, splits in their order; reads no picture.
+
+    Raises:
+        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two splits, a name
+            that is no part of a path); names them.
+    """
+    flights: dict[Place, ReleasedRows] = {}
+    shards = sorted(
+        (shard.path for shard in release.record.shards), key=lambda path: (SPLITS.index(split_of(path)), path)
+    )
+    wanted = schema(release.modalities)
+    for shard in shards:
+        path = inside(release.folder, shard)
+        with open_table(path, tree=release.folder) as table:
+            found = {member.name: member.type for member in table.schema_arrow}
+            if differing := [member.name for member in wanted if found.get(member.name) != member.type]:
+                raise InputError(
+                    "not a shard of this version", where=path, got=f"missing or of another type: {', '.join(differing)}",
+                    fix="build the release again with this version of cosfly",
+                )  # fmt: skip
+            for k in range(table.num_row_groups):
+                _scan_group(flights, shard, k, read_row_group(path, table, k, LIGHT), _unpacked_bytes(table, k))
+    for flight in flights.values():
+        _check(flight, release.folder)
+    return list(flights.values())
+
+
+def _unpacked_bytes(table: Any, k: int) -> int:
+    return table.metadata.row_group(k).total_byte_size
+
+
+def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: Any, num_bytes: int) -> None:
+    """Note the flights of one row group, which may hold several."""
+    with arrow_errors(shard):
+        rows = {name: group.column(name).to_pylist() for name in LIGHT}
+    places: list[Place] = list(zip(*(rows[name] for name in PLACE), strict=True))
+    begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
+    for start, stop in zip(begins, [*begins[1:], len(places)], strict=True):
+        place = places[start]
+        if not all(
+            isinstance(part, str) and (PART.fullmatch(part) or (part == "" and n == 0)) for n, part in enumerate(place)
+        ):
+            raise InputError(
+                "not names of folders", where=f"{shard}: {rows['sample_id'][start]}", got=repr(place)[:200]
+            )
+        flight = flights.setdefault(place, ReleasedRows(*place, split_of(shard)))
+        if flight.split != split_of(shard):
+            raise InputError("a flight in two splits", where=flight.name, got=f"{flight.split} and {split_of(shard)}")
+        times = rows["time_s"][start:stop]
+        if None in times or None in rows["frame_index"][start:stop]:
+            raise InputError("a frame without index or time", where=f"{shard}: {flight.name}")
+        flight.spans.append(Span(shard, k, start, stop))
+        flight.frames.append(np.array(rows["frame_index"][start:stop], dtype=np.int32))
+        flight.times.append(np.array(times, dtype=np.float64))
+        flight.decisions += [decision or "" for decision in rows["decision"][start:stop]]
+        flight.num_bytes += num_bytes * (stop - start) // len(places)
+
+
+def _check(flight: ReleasedRows, where: Path) -> None:
+    frames, time_s = flight.frame_index, flight.time_s
+    if not (np.diff(frames) > 0).all() or not (np.diff(time_s) > 0).all():
+        raise InputError("the frames of a flight do not rise", where=f"{where}: {flight.name}")
+
+
+def read_span(release: Release, span: Span, columns: list[str] | None = None) -> list[dict[str, Any]]:
+    """Read the rows of a span, pictures included; in memory they are one row group."""
+    path = inside(release.folder, span.shard)
+    (group,) = row_groups(path, columns, tree=release.folder, wanted=[span.group])
+    _check_values(group, f"{path}: row group {span.group}")
+    with arrow_errors(path):
+        return group.slice(span.start, span.stop - span.start).to_pylist()
+
+
+def _check_values(group: pa.Table, where: str) -> None:
+    """See that what every row must have is there, and that numbers are finite.
+
+    Raises:
+        InputError: names the column.
+    """
+    for member in group.schema:
+        column = group.column(member.name)
+        if member.name in NEVER_NULL and column.null_count:
+            raise InputError("a row without a value that all have", where=f"{where}: {member.name}", got="null")
+        parts = column.combine_chunks().flatten() if pa.types.is_struct(member.type) else [column]
+        for part in parts:
+            if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
+                raise InputError("a number that is not finite", where=f"{where}: {member.name}")
+
+
+def rows_of_flight(
+    release: Release, flight: ReleasedRows, columns: list[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a flight in order."""
+    for span in flight.spans:
+        yield from read_span(release, span, columns)
+
+
+def picture(row: dict[str, Any], file: FrameFile) -> bytes:
+    """Give the bytes of a picture of a row.
+
+    Raises:
+        InputError: there are none, or those of a picture are no PNG.
+    """
+    value = row[PICTURES[file].name]
+    data = value if file == "depth" else value and value["bytes"]
+    if not data or (file != "depth" and png_size(data) is None):
+        raise InputError(
+            "a frame without its picture",
+            where=f"{row['sample_id']}: {PICTURES[file].name}",
+            got="none" if not data else "no PNG",
+        )
+    return data

@@ -1,0 +1,213 @@
+"""The playback tree (CosFly-Track v7) of a release: what other people's loaders of that layout, and `cosfly caption`, read.
+
+    Town*/trajectory_*/{ORI, aug_001}/trajectory.json
+    Town*/trajectory_*/{ORI, aug_001}/frames_playback/frame_00000/{rgb.png, depth.npy, instance.png}
+
+Pictures are the released bytes; every number of `trajectory.json` is the release's, its axes the tree's (products/playback.py). Frames are
+counted from 0, as the layout asks; which frame of the flight each was says `source.released_frames`. A release of several runs becomes
+a tree a run, in a folder of its name.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.products.boxes import UNKNOWN_LICENCE
+from cosfly.products.frames import COORDINATES, FILE_NAMES, Camera, frame_name
+from cosfly.products.places import TOWN
+from cosfly.products.playback import Flight, write_flight
+from cosfly.products.segments import FOLLOW, Segment
+from cosfly.products.town import TOWN_FILE, TOWN_SCHEMA, TOWN_VERSION, TownMap
+from cosfly.products.walks import pace_field
+from cosfly.reading.files import sha256_file
+from cosfly.runner import advance
+from cosfly.store import CHECKSUMS, checksum_lines, write_model
+from release.columns import BOX, PICTURES, POINT, POSE, SCALAR_NAMES
+from release.export.contract import ExportConfig, Facts, Files, Unit, Written
+from release.export.source import Release, ReleasedRows, picture, read_span
+
+VERSION = "drone_nav_traj_v7 7.0.0"
+Row = dict[str, Any]
+
+
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+    """A unit is one flight.
+
+    Raises:
+        InputError: the layout cannot hold the release; lists what is in the way.
+    """
+    wrong = [] if "rgb" in release.modalities else ["no colour pictures, which every frame of the layout has"]
+    wrong += [
+        f"{flight.name}: a town's folder begins with {TOWN}" for flight in flights if not flight.town.startswith(TOWN)
+    ]
+    wrong += [
+        f"{flight.name}: a trajectory's folder begins with trajectory_"
+        for flight in flights
+        if not flight.trajectory.startswith("trajectory_")
+    ]
+    if wrong:
+        raise InputError("the playback tree cannot hold this release", where=release.folder, got="; ".join(wrong[:20]))
+    has_runs = len({flight.run for flight in flights}) > 1
+    numbers: dict[tuple[str, str, str], int] = {}
+    units = []
+    for flight in flights:
+        number = numbers.setdefault((flight.run, flight.town, flight.trajectory), len(numbers))
+        folder = Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
+        units.append(Unit(flight.name, len(flight), flights=(flight,), extra=(folder.as_posix(), number)))
+    return units
+
+
+def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+    """Write one flight: its pictures, then trajectory.json, then the checksums of all."""
+    (rows,), (place, number) = unit.flights, unit.extra
+    files, digests, scalars = Files(folder), dict[str, str](), list[Row]()
+    for i, row in enumerate(_rows(release, rows)):
+        for file in release.modalities:
+            name = f"{frame_name(i)}/{FILE_NAMES[file]}"
+            digests[name] = files.put(f"{place}/{name}", picture(row, file), listed=False)
+        scalars.append({column: row[column] for column in SCALAR_NAMES})
+        advance()
+    (folder / place).mkdir(parents=True, exist_ok=True)
+    write_flight(folder / place, flight_of_rows(scalars, rows, number))
+    digests["trajectory.json"] = sha256_file(folder / place / "trajectory.json")
+    files.put(f"{place}/{CHECKSUMS}", checksum_lines(digests).encode())
+    has_gaps = bool((np.diff(rows.frame_index) != 1).any() or rows.frame_index[0] != 0)
+    return files.written(is_original=scalars[0]["track"] == "clean", has_gaps=has_gaps)
+
+
+def _rows(release: Release, flight: ReleasedRows) -> Iterator[Row]:
+    for span in flight.spans:
+        yield from read_span(release, span, [*SCALAR_NAMES, *(PICTURES[file].name for file in release.modalities)])
+
+
+def finish(
+    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
+) -> Facts:
+    """Write each town's `map.json`, and say which flights the strictest readers will miss something of."""
+    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.flights[0].town) for unit in units}
+    maps = {entry.town: entry for entry in release.record.maps}
+    files = {}
+    for place, town in sorted(towns):
+        shown = maps.get(town)
+        about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
+        about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
+        write_model(folder / place / TOWN_FILE, about, schema=TOWN_SCHEMA, version=TOWN_VERSION)
+        files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
+    return Facts(
+        version=VERSION,
+        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in release.modalities},
+        coordinates=COORDINATES,
+        notes=list(_notes(units, written)),
+        how_to_open="from cosfly.products.playback import find_flights, read_flight\n"
+        "flights = [read_flight(folder, strict=False) for folder in find_flights(Path('.'))]",
+        files=files,
+    )
+
+
+def _notes(units: Sequence[Unit], written: Sequence[Written]) -> Iterator[str]:
+    yield (
+        "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of the flight each was. "
+        "The layout has no captions: they stand in the release. meta.json and the order of missions are not released."
+    )
+    gaps = sum(one.facts["has_gaps"] for one in written)
+    if gaps:
+        yield f"{gaps} of {len(units)} flights are parts of a flight: steps between their frames are uneven, which strict readers of time refuse."
+    tracks = defaultdict(set)
+    for unit, one in zip(units, written, strict=True):
+        tracks[unit.extra[0].rpartition("/")[0]].add(one.facts["is_original"])
+    alone = sum(len(found) < 2 for found in tracks.values())
+    if alone:
+        yield f"{alone} of {len(tracks)} trajectories have one track alone; some public loaders ask for both."
+
+
+# --- trajectory.json --------------------------------------------------------------------------------------------------
+
+
+def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight:
+    """Give the flight that released rows are of; `number` is its trajectory's among those of the release.
+
+    Raises:
+        InputError: a row has no pose or intrinsics, or the camera changes on the way.
+    """
+    cameras = {(r["width_px"], r["height_px"], *(r["intrinsics"] or {}).values()) for r in rows}
+    if len(cameras) != 1 or any(r["pose"] is None or r["intrinsics"] is None for r in rows):
+        raise InputError(
+            "a flight has one camera, and every frame a pose", where=placed.name, got=f"{len(cameras)} cameras"
+        )
+    k = rows[0]["intrinsics"]
+    intrinsic = np.array([[k["fx"], 0.0, k["cx"]], [0.0, k["fy"], k["cy"]], [0.0, 0.0, 1.0]])
+    poses = _vectors(rows, "pose", POSE)
+    offsets = _vectors(rows, "drone_offset", POSE)
+    has_mask_box = any(row["target_mask_bbox"] is not None for row in rows)
+    is_original = rows[0]["track"] == "clean"
+    return Flight(
+        town=placed.town,
+        trajectory=placed.trajectory,
+        variant=placed.variant,
+        camera=Camera(rows[0]["width_px"], rows[0]["height_px"], intrinsic),
+        time_s=placed.time_s,
+        positions_m=poses[:, :3],
+        rotations_deg=poses[:, 3:],
+        targets_m=_vectors(rows, "target", POINT),
+        target_in_view=_flags(rows, "target_in_view"),
+        target_visible=_flags(rows, "target_visible"),
+        target_depth_m=_numbers(rows, "target_depth_m"),
+        target_uv=_vectors(rows, "target_uv", ("u_px", "v_px")),
+        target_bbox=_vectors(rows, "target_bbox", BOX),
+        target_mask_bbox=_vectors(rows, "target_mask_bbox", BOX) if has_mask_box else None,
+        visibility=_numbers(rows, "visibility"),
+        is_perturbed=_flags(rows, "is_perturbed"),
+        drone_offsets_m=offsets[:, :3],
+        rotation_offsets_deg=offsets[:, 3:],
+        target_offsets_m=_vectors(rows, "target_offset", POINT),
+        is_original=is_original,
+        segments=_segments([row["style"] for row in rows]),
+        source={
+            "path_index": number,
+            "scenario_id": f"{placed.run}/{placed.town}/{placed.trajectory}".lstrip("/"),
+            "scenario_name": placed.town,
+            "released_frames": placed.frame_index.tolist(),
+            **pace_field(rows[0]["pace"]),
+        },
+        raw={"points": [_point(row) for row in rows]},
+    )
+
+
+def _point(row: Row) -> dict[str, Any]:
+    """What a point says of its perturbation beside the offsets: what became of it, or that there was one whose offsets nobody knows."""
+    told = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
+    if row["is_perturbed"] and row["drone_offset"] is None:
+        told |= {"drone_position": True, "drone_rotation": True}
+    return {"perturbation": told} if told else {}
+
+
+def _segments(styles: list[str]) -> tuple[Segment, ...]:
+    """Give the parts of a flight by style; none where it follows from end to end."""
+    if set(styles) == {FOLLOW}:
+        return ()
+    parts, begin = [], 0
+    for style, group in groupby(styles):
+        end = begin + len(list(group))
+        parts.append(Segment(style, begin, end))
+        begin = end
+    return tuple(parts)
+
+
+def _vectors(rows: list[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
+    nothing = dict.fromkeys(members, np.nan)
+    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
+
+
+def _numbers(rows: list[Row], name: str) -> np.ndarray:
+    return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
+
+
+def _flags(rows: list[Row], name: str) -> np.ndarray:
+    return np.array([bool(row[name]) for row in rows])

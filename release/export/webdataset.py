@@ -1,0 +1,122 @@
+"""WebDataset: tar shards in which the files of a frame stand together under one key.
+
+    train-00000.tar     trajectory_1_ORI_frame_00000.depth.npy, .instance.png, .json, .rgb.png, then the next frame
+
+A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend on the rows alone
+(no times, no owners). The JSON holds every column but the pictures.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Sequence
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, cast
+
+from cosfly.errors import InputError
+from cosfly.products.frames import FrameFile
+from cosfly.runner import advance
+from cosfly.store import atomic_file, dump_json
+from release.columns import PICTURES
+from release.export import depth as depth_coding
+from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
+from release.export.source import PART, SPLITS, Release, ReleasedRows, Span, picture, read_span
+
+MB = 1024 * 1024
+VERSION = "tar, keys sorted"
+ENDINGS: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
+PICTURE_COLUMNS = {column.name for column in PICTURES.values()}
+
+
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+    """Cut each split into shards of about `shard_mb`; a unit is one shard."""
+    units = []
+    for split in SPLITS:
+        groups: list[list[Span]] = []
+        filled = 0.0
+        for flight in (flight for flight in flights if flight.split == split):
+            bytes_per_frame = flight.num_bytes / len(flight)
+            for span in flight.spans:
+                if not groups or filled >= cfg.shard_mb * MB:
+                    groups.append([])
+                    filled = 0.0
+                groups[-1].append(span)
+                filled += bytes_per_frame * (span.stop - span.start)
+        for number, spans in enumerate(groups):
+            frames = sum(span.stop - span.start for span in spans)
+            units.append(Unit(f"{split}-{number:05d}", frames, spans=tuple(spans), extra=split))
+    return units
+
+
+def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+    """Write one shard.
+
+    Raises:
+        InputError: a picture is missing or damaged, two frames have one key, or the depth is beyond its coding.
+    """
+    files, loss = Files(folder), depth_coding.Loss()
+    name, keys = f"{unit.name}.tar", set[str]()
+    with atomic_file(folder / name) as file:
+        hashed = HashedFile(file)
+        with tarfile.open(fileobj=cast(IO[bytes], hashed), mode="w|", format=tarfile.GNU_FORMAT) as tar:
+            for span in unit.spans:
+                for row in read_span(release, span):
+                    key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
+                    if key in keys or not PART.fullmatch(key):
+                        raise InputError("two frames of one name, or no name of a file", where=unit.name, got=key)
+                    keys.add(key)
+                    for ending, data in members(row, release.modalities, cfg, loss):
+                        tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))
+                    advance()
+    files.note(name, hashed.digest.hexdigest(), hashed.num_bytes)
+    return files.written(loss=vars(loss) if loss.farthest_m else None)
+
+
+def members(
+    row: dict[str, Any], modalities: Sequence[FrameFile], cfg: ExportConfig, loss: depth_coding.Loss
+) -> list[tuple[str, bytes]]:
+    """Give the files of one frame, by their endings in order."""
+    scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
+    found = {"json": (dump_json(scalars) + "\n").encode()}
+    for file in modalities:
+        data = picture(row, file)
+        if file == "depth" and cfg.depth != "float32":
+            found["depth.png"] = depth_coding.encode(data, row["sample_id"], cfg.depth, loss)
+        else:
+            found[ENDINGS[file]] = data
+    return sorted(found.items())
+
+
+def _header(name: str, size: int) -> tarfile.TarInfo:
+    header = tarfile.TarInfo(name)
+    header.size, header.mode = size, 0o644
+    return header  # times, owners: zero
+
+
+def finish(
+    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
+) -> Facts:
+    """Say how the shards are opened and what the depth coding cost."""
+    codings = {file: f"{ENDINGS[file]}, the released bytes" for file in release.modalities}
+    if cfg.depth != "float32" and "depth" in codings:
+        total = depth_coding.Loss()
+        for one in written:
+            if one.facts["loss"]:
+                total.merge(replace(total, **one.facts["loss"]))
+        codings["depth"] = f"depth.png: {depth_coding.in_words(cfg.depth, total)}"
+    first = units[0].extra
+    last = sum(unit.extra == first for unit in units) - 1
+    shards = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
+    splits = ", ".join(
+        f"{split}: {sum(u.extra == split for u in units)} shards"
+        for split in SPLITS
+        if any(u.extra == split for u in units)
+    )
+    return Facts(
+        version=VERSION,
+        codings={**codings, "json": "every other column of the release, one object"},
+        notes=[f"Splits: {splits}. A key is the sample_id, dots replaced by _."],
+        how_to_open=f'import webdataset\nrows = webdataset.WebDataset("{shards}", shardshuffle=False).decode("rgb8")',
+    )

@@ -1,0 +1,71 @@
+"""Environments of libraries that cannot share the tests' own: made once, kept in `.venv-owners/`, one for each list of pins.
+
+They see the packages of this environment (torch among them, which is large) behind their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+KEPT_IN = Path(__file__).resolve().parents[1] / ".venv-owners"
+UNREACHABLE = (
+    "NewConnectionError",
+    "ConnectTimeoutError",
+    "name resolution",
+    "Network is unreachable",
+    "Max retries exceeded",
+)
+
+_LIGHT = (
+    "draccus==0.10.0",
+    "mergedeep==1.3.4",
+    "typing-inspect==0.9.0",
+    "mypy_extensions==1.1.0",
+    "pyyaml-include==1.4.1",
+    "toml==0.10.2",
+)
+_OF_LEROBOT = (
+    *_LIGHT,
+    "torchvision==0.28.0",
+    "jsonlines==4.0.0",
+    "attrs==25.3.0",
+    "einops==0.8.1",
+    "termcolor==3.1.0",
+    "huggingface_hub==0.35.3",
+)
+# LeRobot's own pins ask for another torch; what reads data sets works with ours, so the packages are named one by one.
+LEROBOT = {
+    "lerobot": ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_OF_LEROBOT),
+    "lerobot-v2.1": (
+        "lerobot==0.3.3", "datasets==3.6.0", "av==15.1.0", "fsspec==2025.3.0", "dill==0.3.8", "multiprocess==0.70.16", *_OF_LEROBOT,
+        "aiohttp==3.12.15", "aiohappyeyeballs==2.6.1", "aiosignal==1.4.0", "frozenlist==1.7.0", "multidict==6.6.4", "yarl==1.20.1", "propcache==0.3.2",
+    ),
+}  # fmt: skip
+
+
+def python_with(pins: tuple[str, ...]) -> Path:
+    """Give the interpreter of an environment with these packages; skips the test only where no registry can be reached."""
+    name = hashlib.sha256("\n".join([sys.version, *pins]).encode()).hexdigest()[:16]
+    folder = KEPT_IN / name
+    python = folder / "bin" / "python"
+    if (folder / ".complete").exists():
+        return python
+    shutil.rmtree(folder, ignore_errors=True)
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    shared = [path for path in sys.path if path.endswith("site-packages")]
+    (packages / "shared.pth").write_text("".join(f"{path}\n" for path in shared))
+    command = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", *pins]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode and any(sign in done.stderr for sign in UNREACHABLE):
+        shutil.rmtree(folder)
+        pytest.skip(f"no package registry can be reached: {done.stderr[-300:]}")
+    assert not done.returncode, done.stderr[-3000:]
+    (folder / ".complete").touch()
+    return python

@@ -1,0 +1,561 @@
+"""A release in other formats: nothing is lost on the way, whatever interrupts it, and what cannot be is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import tarfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from public_reader import read_public
+from test_release_package import CFG, all_bytes, build, make_caption, make_inspection
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.config import build as build_config
+from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.products.captions import write_captions
+from cosfly.products.frames import depth_bytes
+from cosfly.products.inspection import write_inspection
+from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.town import read_town_map
+from cosfly.reading.arrays import parse_picture
+from cosfly.reading.files import sha256_file
+from cosfly.store import CHECKSUMS, read_checksums
+from release.export import depth
+from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
+from release.export.lerobot.features import moves, tiff_of_depth
+from release.export.lerobot.format import runs_of
+from release.export.lerobot.summary import merged, summarize
+from release.export.manifest import read_export
+from release.export.source import ReleasedRows, Span, open_release, read_span, rows_of_flight, scan
+from release.export.stage import run as export
+from specimens import make_playback_tree
+
+NUM_POINTS = 12
+TOWNS = ("Town01", "Town02")
+
+
+def config(format: str, **more) -> ExportConfig:
+    return build_config(ExportConfig, {"format": format, "shard_mb": 1, **more}, "test")
+
+
+def make_release(root: Path, num_frames: int = 400, **change) -> Path:
+    tree = make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
+    flights = [read_flight(folder) for folder in find_flights(tree)]
+    write_captions(
+        root / "captions.jsonl", [make_caption(flight, i) for flight in flights for i in range(4, NUM_POINTS - 1)]
+    )
+    write_inspection(root / "inspect.json", make_inspection(tree, {}))
+    return build(root, root / "release", CFG.model_copy(update={"num_frames": num_frames, **change}))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """tree/ and dataset/, a release of every frame of it."""
+    root = tmp_path_factory.mktemp("whole")
+    make_release(root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def dataset(whole) -> Path:
+    return whole / "release" / "dataset"
+
+
+def rows_by_id(dataset: Path) -> dict[str, dict]:
+    release = open_release(dataset)
+    return {
+        row["sample_id"]: row for flight in scan(release) for span in flight.spans for row in read_span(release, span)
+    }
+
+
+# --- the playback tree ------------------------------------------------------------------------------------------------
+
+
+def assert_same_flight(found: Path, given: Path, frames: list[int] | None = None) -> None:
+    """Every number and every picture of a flight, or of some frames of it."""
+    a, b = read_flight(given), read_flight(found, strict=frames is None)
+    kept = np.arange(len(a)) if frames is None else np.array(frames)
+    for name in type(a).__dataclass_fields__:
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, np.ndarray):
+            assert np.array_equal(x[kept], y, equal_nan=True), name
+        elif name not in ("folder", "raw", "source", "camera", "issues"):
+            assert x == y, name
+    assert np.array_equal(a.camera.intrinsic, b.camera.intrinsic)
+    assert (a.camera.width_px, a.camera.height_px) == (b.camera.width_px, b.camera.height_px)
+    assert b.source["released_frames"] == kept.tolist()
+    for i, k in enumerate(kept.tolist()):
+        for name in ("rgb.png", "depth.npy", "instance.png"):
+            assert (a.frame_folder(k) / name).read_bytes() == (b.frame_folder(i) / name).read_bytes()
+
+
+def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
+    product = export(config("tree"), dataset, tmp_path / "out")
+    given = find_flights(whole / "tree")
+    found = find_flights(product)
+    assert [p.relative_to(product) for p in found] == [p.relative_to(whole / "tree") for p in given]
+    for a, b in zip(given, found, strict=True):
+        assert_same_flight(b, a)
+        assert read_checksums(b) == {
+            p.relative_to(b).as_posix(): sha256_file(p) for p in b.rglob("*") if p.is_file() and p.name != CHECKSUMS
+        }
+    assert len(read_public(product)) == 3  # the strictest public reader
+    about = read_export(product / "export.json")
+    assert about.coordinates["handedness"] == "left"
+    assert read_town_map(product / "Town01").licence == about.maps[0].licence
+
+
+def test_a_tree_of_chosen_frames_says_which_they_were(tmp_path):
+    """Every second frame or so: counted anew from 0, uneven steps told."""
+    dataset = make_release(tmp_path, num_frames=8)
+    product = export(config("tree"), dataset, tmp_path / "out")
+    frames = [flight.frame_index.tolist() for flight in scan(open_release(dataset))]
+    for a, b, kept in zip(find_flights(tmp_path / "tree"), find_flights(product), frames, strict=True):
+        assert len(kept) == 8
+        assert_same_flight(b, a, kept)
+    read_public(product)
+    assert any("6 of 6 flights are parts" in note for note in read_export(product / "export.json").notes)
+
+
+def test_a_second_release_of_the_exported_tree_has_the_same_rows(whole, dataset, tmp_path):
+    """tree -> release -> tree -> release: pictures, poses, and all that follows from them."""
+    product = export(config("tree"), dataset, tmp_path / "out")
+    write_captions(tmp_path / "captions.jsonl", [])
+    write_inspection(tmp_path / "inspect.json", make_inspection(product, {}))
+    shutil.copytree(product, tmp_path / "tree")
+    again = build(tmp_path, tmp_path / "release", CFG.model_copy(update={"num_frames": 400}))
+    first, second = rows_by_id(dataset), rows_by_id(again)
+    assert first.keys() == second.keys()
+    told_elsewhere = {name for name in next(iter(first.values())) if name.startswith(("caption_", "proved", "prompt_", "system_"))} | {
+        "has_caption", "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing", "look",
+    }  # fmt: skip
+    for name, row in first.items():
+        for column in row.keys() - told_elsewhere:
+            if "sentence" not in column:
+                assert row[column] == second[name][column], (name, column)
+
+
+def test_a_tree_needs_colour_and_names_of_the_layout(dataset, tmp_path):
+    release = open_release(dataset)
+    bare = replace(
+        release,
+        record=release.record.model_copy(
+            update={"settings": release.record.settings.model_copy(update={"modalities": ["depth"]})}
+        ),
+    )
+    flights = scan(release)
+    flights[0].town = "Delft"
+    from release.export import tree
+
+    with pytest.raises(InputError, match=r"colour pictures.*Delft"):
+        tree.plan(bare, flights, config("tree"))
+
+
+# --- WebDataset -------------------------------------------------------------------------------------------------------
+
+
+def test_webdataset_holds_every_row_and_byte(dataset, tmp_path):
+    product = export(config("webdataset"), dataset, tmp_path / "out")
+    rows = rows_by_id(dataset)
+    seen = set()
+    for shard in sorted(product.glob("*.tar")):
+        with tarfile.open(shard) as tar:
+            names = tar.getnames()
+            keys = [name.partition(".")[0] for name in names]
+            assert keys == [key for key in dict.fromkeys(keys) for _ in range(4)]  # the files of a frame stand together
+            assert names == [
+                f"{key}.{end}"
+                for key in dict.fromkeys(keys)
+                for end in ("depth.npy", "instance.png", "json", "rgb.png")
+            ]
+            assert all(member.mtime == 0 and member.uid == 0 for member in tar)
+            for key in dict.fromkeys(keys):
+                row = rows[key]
+                assert tar.extractfile(f"{key}.rgb.png").read() == row["image"]["bytes"]
+                assert tar.extractfile(f"{key}.instance.png").read() == row["instance"]["bytes"]
+                assert tar.extractfile(f"{key}.depth.npy").read() == row["depth"]
+                scalars = {name: value for name, value in row.items() if name not in ("image", "depth", "instance")}
+                assert json.loads(tar.extractfile(f"{key}.json").read()) == scalars
+                seen.add(key)
+    assert seen == rows.keys()
+
+
+def names_in(shard: Path) -> list[str]:
+    with tarfile.open(shard) as tar:
+        return tar.getnames()
+
+
+def test_webdataset_shards_keep_to_their_size(dataset, tmp_path):
+    release = open_release(dataset)
+    flights = scan(release)
+    for flight in flights:
+        flight.num_bytes = 900_000 * len(flight)  # of 12 frames in one row group
+    from release.export import webdataset
+
+    units = webdataset.plan(release, flights, config("webdataset", shard_mb=20))
+    assert [unit.frames for unit in units] == [24, 24, 24]  # two row groups pass 20 MB
+    assert [unit.name for unit in units] == ["train-00000", "train-00001", "train-00002"]
+
+
+def test_webdataset_opens_it(dataset, tmp_path):
+    wds = pytest.importorskip("webdataset", reason="extra dev")
+    product = export(config("webdataset"), dataset, tmp_path / "out")
+    shards = sorted(str(path) for path in product.glob("*.tar"))
+    rows = rows_by_id(dataset)
+    samples = list(wds.WebDataset(shards, shardshuffle=False).decode("rgb8"))
+    assert [sample["__key__"] for sample in samples] == list(rows)
+    for sample in samples[::7]:
+        row = rows[sample["__key__"]]
+        assert (sample["rgb.png"] == parse_picture(row["image"]["bytes"], "x")[..., ::-1]).all()
+        assert sample["depth.npy"].dtype == np.float32
+        assert (sample["depth.npy"] == np.load(io.BytesIO(row["depth"]))).all()
+        assert sample["json"]["pose"] == row["pose"]
+    first_two = wds.WebDataset(shards, shardshuffle=False).to_tuple("rgb.png", "json").slice(2)
+    assert len(list(first_two)) == 2
+
+
+# --- depth ------------------------------------------------------------------------------------------------------------
+
+
+def npy(values) -> bytes:
+    return depth_bytes(np.array(values, dtype=np.float32))
+
+
+def test_millimetres_are_what_they_say():
+    loss = depth.Loss()
+    png = depth.encode(npy([[0.0, 1000.0, 1.2344, 65.534]]), "x", "millimetre", loss)
+    codes = parse_picture(png, "x", flags=-1)
+    assert codes.tolist() == [[0, 65535, 1234, 65534]]
+    assert loss.error_m == pytest.approx(0.0004, abs=1e-6)
+    assert (loss.nearest_m, loss.farthest_m) == (pytest.approx(1.2344), pytest.approx(65.534))
+
+
+@pytest.mark.parametrize("far_m", [65.5346, 66.0, 999.0])
+def test_millimetres_end_at_65_metres(far_m):
+    with pytest.raises(InputError, match=r"beyond what the millimetre coding holds.*expected 0.0005 to 65.534"):
+        depth.encode(npy([[1.0, far_m]]), "x", "millimetre", depth.Loss())
+
+
+@given(st.lists(st.floats(0.125, 999.5, width=32), min_size=1, max_size=50))
+def test_the_logarithmic_coding_loses_what_it_measured(values):
+    loss = depth.Loss()
+    given_m = np.array([values], dtype=np.float32)
+    codes = parse_picture(depth.encode(npy(given_m), "x", "logarithmic", loss), "x", flags=-1)
+    errors = np.abs(depth.decode(codes, "logarithmic") / given_m.astype(np.float64) - 1)
+    assert errors.max() == pytest.approx(loss.error_share, rel=1e-6, abs=1e-12)
+    assert loss.error_share < 1e-4
+
+
+def test_another_coding_stands_with_its_measured_error(dataset, tmp_path):
+    product = export(config("webdataset", depth="logarithmic"), dataset, tmp_path / "out")
+    said = read_export(product / "export.json").codings["depth"]
+    assert "Measured over all pixels" in said
+    worst = 0.0
+    rows = rows_by_id(dataset)
+    with tarfile.open(product / "train-00000.tar") as tar:
+        for name in tar.getnames():
+            if name.endswith("depth.png"):
+                exact = np.load(io.BytesIO(rows[name.partition(".")[0]]["depth"]))
+                codes = parse_picture(tar.extractfile(name).read(), name, flags=-1)
+                is_distance = (exact != 0) & (exact != 1000)
+                worst = max(worst, np.abs(depth.decode(codes, "logarithmic") - exact)[is_distance].max())
+                assert (codes[exact == 1000] == depth.SKY).all()
+    assert 0 < worst <= float(said.split("error at most ")[1].split(" ")[0]) + 1e-6
+
+
+def test_only_webdataset_takes_another_coding(dataset, tmp_path):
+    with pytest.raises(ConfigError, match="float32 only"):
+        export(config("lerobot", depth="millimetre"), dataset, tmp_path / "out")
+
+
+# --- LeRobot: what needs no LeRobot -----------------------------------------------------------------------------------
+
+
+def flight_of(frames: list[int]) -> ReleasedRows:
+    flight = ReleasedRows("r", "Town01", "trajectory_1", "ORI", "train", [Span("s", 0, 0, len(frames))])
+    flight.frames, flight.times = [np.array(frames, dtype=np.int32)], [np.array(frames) * 0.5]
+    return flight
+
+
+@pytest.mark.parametrize(
+    ("frames", "runs"),
+    [([0, 1, 2], [(0, 3)]), ([0, 2, 3, 7], [(0, 1), (1, 3), (3, 4)]), ([5], [(0, 1)])],
+)
+def test_an_episode_has_no_gap(frames, runs):
+    assert runs_of(flight_of(frames)) == runs
+
+
+def test_a_move_is_in_the_drones_own_axes():
+    poses = np.array([[0, 0, 10, 0, 90, 0], [0, 2, 11, 0, -175, 0], [0, 2, 11, 0, -175, 0]], dtype=np.float64)
+    assert np.allclose(moves(poses), [[2, 0, 1, 95], [0, 0, 0, 0], [0, 0, 0, 0]])  # it looked north and flew north
+    poses = np.array([[0, 0, 0, 0, 180, 0], [0, 3, 0, 0, 180, 0]], dtype=np.float64)
+    assert np.allclose(moves(poses)[0], [0, -3, 0, 0])  # looking west, north is on the right
+
+
+@given(st.lists(st.floats(0, 1000, width=32), min_size=1, max_size=40))
+def test_depth_as_tiff_is_the_same_numbers(values):
+    from PIL import Image
+
+    exact = np.array([values], dtype=np.float32)
+    with Image.open(io.BytesIO(tiff_of_depth(depth_bytes(exact), "x"))) as image:
+        assert np.asarray(image).tobytes() == exact.tobytes()
+
+
+@given(st.lists(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=9), min_size=1, max_size=5))
+def test_merged_statistics_are_those_of_all_values(groups):
+    parts = [summarize(np.array(group).reshape(-1, 1), len(group)) for group in groups]
+    values = np.concatenate(groups)
+    found = merged(parts)
+    assert found["count"] == [len(values)]
+    assert found["min"] == [values.min()]
+    assert found["max"] == [values.max()]
+    assert found["mean"] == pytest.approx([values.mean()], abs=1e-6)
+    assert found["std"] == pytest.approx([values.std()], abs=1e-3)
+
+
+def test_statistics_leave_out_what_is_unknown():
+    assert summarize(np.array([[1.0, np.nan], [3.0, np.nan]]), 2)["mean"] == [2.0, 0.0]
+    assert summarize(np.array([[np.nan]]), 1)["count"] == [0]
+
+
+def test_a_flight_with_gaps_is_several_episodes(tmp_path):
+    dataset = make_release(tmp_path, num_frames=8)
+    product = export(config("lerobot"), dataset, tmp_path / "out")
+    info = json.loads((product / "meta/info.json").read_text())
+    episodes = pq.read_table(product / "meta/episodes").to_pylist()
+    frames = [flight.frame_index for flight in scan(open_release(dataset))]
+    runs = [stop - start for index in frames for start, stop in runs_of(flight_of(index.tolist()))]
+    assert [row["length"] for row in sorted(episodes, key=lambda row: row["episode_index"])] == runs
+    assert info["total_episodes"] == len(runs) > 6
+    assert info["total_frames"] == 48
+
+
+# --- whatever the format ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path):
+    one = export(config(format), dataset, tmp_path / "one")
+    two = export(config(format), dataset, tmp_path / "two", workers=2)
+    assert all_bytes(one) == all_bytes(two)
+    listed = read_checksums(one)
+    assert all(sha256_file(one / name) == digest for name, digest in listed.items())
+    unlisted = set(all_bytes(one)) - set(listed) - {"README.md", CHECKSUMS}
+    assert not unlisted or format == "tree"  # whose flights have lists of their own
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
+    product = export(config(format), dataset, tmp_path / "out")
+    about, record = read_export(product / "export.json"), open_release(dataset).record
+    assert about.release.record_sha256 == sha256_file(dataset / "release.json")
+    assert (about.licence, about.credits, about.maps) == (record.licence, record.credits, record.maps)
+    assert about.frames == record.numbers.frames
+    readme = (product / "README.md").read_text()
+    assert "license: cc-by-4.0" in readme
+    assert "Map: a specimen." in readme
+    assert about.coordinates["handedness"] in readme
+
+
+def _export_in_process(format: str, dataset: str, out: str) -> None:
+    export(config(format), Path(dataset), Path(out))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", FORMATS)
+def test_killed_at_any_moment_it_goes_on_and_gives_the_same_bytes(format, dataset, tmp_path):
+    whole = all_bytes(export(config(format), dataset, tmp_path / "whole"))
+    context = multiprocessing.get_context("spawn")
+    out = tmp_path / "out"
+    for delay_s in (0.0, 0.05, 0.15, 0.4, 0.8):
+        process = context.Process(target=_export_in_process, args=(format, str(dataset), str(out)))
+        process.start()
+        while process.is_alive() and not (out / "stage.json").exists():
+            time.sleep(0.005)
+        time.sleep(delay_s)
+        if process.is_alive():
+            os.kill(process.pid, signal.SIGKILL)
+        process.join()
+    assert all_bytes(export(config(format), dataset, out)) == whole
+
+
+def test_a_kill_between_the_last_rename_and_the_manifest(dataset, tmp_path):
+    product = export(config("webdataset"), dataset, tmp_path / "out")
+    before = all_bytes(product)
+    (tmp_path / "out/manifest.json").unlink()
+    assert all_bytes(export(config("webdataset"), dataset, tmp_path / "out")) == before
+
+
+def test_a_folder_of_something_else_is_refused(dataset, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/notes.txt").write_text("mine")
+    with pytest.raises(ResumeError, match="not cosfly's"):
+        export(config("tree"), dataset, tmp_path / "out")
+    export(config("webdataset"), dataset, tmp_path / "two")
+    with pytest.raises(ResumeError, match="other settings"):
+        export(config("tree"), dataset, tmp_path / "two")
+
+
+def plan(release, flights, cfg):
+    """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
+    return [Unit(flight.name, len(flight), flights=(flight,)) for flight in flights]
+
+
+def write(release, unit, folder, cfg):
+    files, (flight,) = Files(folder), unit.flights
+    poses = [row["pose"] for row in rows_of_flight(release, flight, ["pose"])]
+    lines = [",".join(repr(value) for value in pose.values()) for pose in poses]
+    files.put(f"{unit.name.replace('/', '__')}.csv", "\n".join(lines).encode())
+    return files.written(lines=len(lines))
+
+
+def finish(release, units, written, folder, cfg):
+    files = Files(folder)
+    files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
+    return Facts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
+
+
+def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):
+    monkeypatch.setitem(FORMATS, "lerobot", __name__)
+    product = export(config("lerobot"), dataset, tmp_path / "out")
+    assert (product / "lines.txt").read_text() == "72"
+    assert len(list(product.glob("*.csv"))) == 6
+    assert all(sha256_file(product / name) == digest for name, digest in read_checksums(product).items())
+
+
+# --- what is no release -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def broken(dataset, tmp_path) -> Path:
+    return shutil.copytree(dataset, tmp_path / "broken")
+
+
+def change_record(folder: Path, change) -> None:
+    record = json.loads((folder / "release.json").read_text())
+    change(record)
+    (folder / "release.json").write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize(
+    "path", ["../../secret.parquet", "/etc/passwd", "data/x.parquet", "data/train-00000-of-00001.parquet/../x"]
+)
+def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, path):
+    change_record(broken, lambda record: record["shards"][0].update(path=path))
+    with pytest.raises(InputError, match="not a whole release"):
+        export(config("webdataset"), broken, tmp_path / "out")
+
+
+def rewrite(folder: Path, change) -> None:
+    """Change the rows of the first shard."""
+    path = next((folder / "data").glob("*.parquet"))
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, row_group_size=NUM_POINTS)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows[0].update(town="../../Town01"), "not names of folders"),
+        (lambda rows: rows[0].update(trajectory=".."), "not names of folders"),
+        (lambda rows: rows[1].update(frame_index=0), "do not rise"),
+        (lambda rows: rows[1].update(time_s=None), "without index or time"),
+    ],
+)
+def test_rows_that_cannot_be_are_refused_before_anything_is_written(broken, tmp_path, change, words):
+    rewrite(broken, change)
+    with pytest.raises(InputError, match=words):
+        export(config("webdataset"), broken, tmp_path / "out")
+    assert not list((tmp_path / "out").rglob("*.tar"))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows[3].update(image=None), "a frame without its picture"),
+        (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
+        (lambda rows: rows[3].update(depth=None), "a frame without its picture"),
+        (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
+        (lambda rows: rows[3].update(width_px=None), "without a value"),
+        (lambda rows: rows[3].update(sample_id="../../escaped"), "no name of a file"),
+        (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "two frames of one name"),
+    ],
+)
+def test_a_unit_that_fails_publishes_nothing_and_is_done_again(broken, tmp_path, change, words):
+    good = {p.name: p.read_bytes() for p in (broken / "data").iterdir()}
+    rewrite(broken, change)
+    with pytest.raises(InputError, match="could not be exported"):
+        export(config("webdataset"), broken, tmp_path / "out")
+    failures = (tmp_path / "out/failures.jsonl").read_text()
+    assert words in failures
+    assert '"bug"' not in failures
+    assert not (tmp_path / "out/webdataset").exists()
+    for name, data in good.items():
+        (broken / "data" / name).write_bytes(data)
+    product = export(config("webdataset"), broken, tmp_path / "out")
+    names = [name for shard in product.glob("*.tar") for name in names_in(shard)]
+    assert len(rows_by_id(broken)) == sum(name.endswith(".json") for name in names)
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows[3].update(pose=None), lambda rows: rows[3].update(width_px=97)])
+def test_a_flight_of_two_cameras_or_without_a_pose_is_no_tree(broken, tmp_path, change):
+    rewrite(broken, change)
+    with pytest.raises(InputError, match="could not be exported"):
+        export(config("tree"), broken, tmp_path / "out")
+    assert "one camera, and every frame a pose" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def test_a_shard_of_another_version_is_refused(broken, tmp_path):
+    path = next((broken / "data").glob("*.parquet"))
+    pq.write_table(pq.read_table(path).drop_columns(["style"]), path)
+    with pytest.raises(InputError, match=r"not a shard of this version.*style"):
+        export(config("webdataset"), broken, tmp_path / "out")
+
+
+def test_lerobot_has_one_size_of_picture(broken, tmp_path):
+    change_record(broken, lambda record: record["numbers"]["frames_by"].update(image_px={"96 x 54": 1, "64 x 36": 1}))
+    with pytest.raises(InputError, match="one size"):
+        export(config("lerobot"), broken, tmp_path / "out")
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command(dataset, tmp_path):
+    done = CliRunner().invoke(
+        app,
+        ["release", "export", str(dataset), "--format", "webdataset", "--out", str(tmp_path / "out"), "--workers", "1"],
+    )
+    assert done.exit_code == 0, done.output
+    assert str(tmp_path / "out/webdataset") in done.output
+    done = CliRunner().invoke(
+        app,
+        ["release", "export", str(dataset), "--format", "tree", "--depth", "millimetre", "--out", str(tmp_path / "x")],
+    )
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output
+
+
+def test_digests_of_bytes_do_not_depend_on_the_folder(dataset, tmp_path):
+    moved = shutil.copytree(dataset, tmp_path / "moved")
+    a = export(config("webdataset"), dataset, tmp_path / "a")
+    b = export(config("webdataset"), moved, tmp_path / "b")
+    digest = [hashlib.sha256((p / "train-00000.tar").read_bytes()).hexdigest() for p in (a, b)]
+    assert digest[0] == digest[1]
