@@ -258,11 +258,46 @@ def warn_unbound(paths: Iterable[Path]) -> None:
             log.warning("%s: no record says of which tree this was made", path)
 
 
+def is_bound(product: Path) -> bool:
+    """Tell whether a record binds a product to what it was made of."""
+    return _record_of(product) is not None
+
+
 def was_made_of(product: Path, name: str) -> str | None:
     """Give the fingerprint that an input of a product's stage had; None where there is no record of it."""
     begun = _record_of(product)
     found = begun.inputs.get(name) if begun is not None else None
     return None if found is None else found.sha256
+
+
+def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
+    """Give the records of the stages that made some products, before each those that made its inputs, as far as these still stand
+    as they were.
+
+    Raises:
+        InputError: a record cannot be read.
+    """
+    found: set[str] = set()
+    ordered: list[StageRecord] = []
+
+    def visit(path: Path) -> None:
+        record = _record_of(path)
+        if record is None:
+            return
+        made_of = sorted((name, entry.sha256) for name, entry in record.inputs.items())
+        known = dump_json([record.stage, record.seed, record.config, made_of])  # where it stands does not matter
+        if known in found:
+            return
+        found.add(known)
+        for entry in record.inputs.values():
+            before = Path(entry.path)
+            if before.exists() and _record_of(before) is not None and fingerprint(before) == entry.sha256:
+                visit(before)
+        ordered.append(record)
+
+    for path in products:
+        visit(path)
+    return ordered
 
 
 def _lineage(path: Path, digest: str) -> set[str]:

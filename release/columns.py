@@ -1,7 +1,7 @@
 """The columns of the released parquet files: schema, one row per frame, and what a reader needs to decode them.
 
 The HuggingFace key in the schema's metadata makes `datasets.load_dataset` decode `image` and `instance` as pictures. No
-list and no nested list stands in a row except the caption's window and picture size, so that every reader of parquet shows plain columns.
+list stands in a row except the caption's window, picture size and states of sentences, so that every reader of parquet shows plain columns.
 """
 
 from __future__ import annotations
@@ -9,22 +9,22 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 
-from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.captions import FIELDS
-from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, tree_of
+from cosfly.products.captions import FIELDS, Language, SentenceState
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, Look
 from cosfly.products.playback import EVENTS, Flight, sample_id
-from cosfly.reading.files import read_bytes
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
+LOOK = tuple(Look.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
-CAPTION_FIELDS = tuple(f"caption_{language}_{field}" for language in ("en", "zh") for field in FIELDS)
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+CAPTION_FIELDS = tuple(f"caption_{language}_{field}" for language in LANGUAGES for field in FIELDS)
 CAPTION_FACTS = (
     "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing",
 )  # fmt: skip
@@ -33,13 +33,22 @@ CAPTION_SHARES = (
     "proved_zh",
 )  # of the sentences, those that the geometry proves; null where none was judged
 
+STATES: tuple[SentenceState, ...] = get_args(SentenceState)
+# How many sentences the geometry proves, contradicts, leaves unread: `proved_sentences_en`; null where none was judged.
+CAPTION_COUNTS = tuple(f"{state}_sentences_{language}" for language in LANGUAGES for state in STATES)
+CAPTION_STATES = tuple(f"sentence_states_{language}" for language in LANGUAGES)  # of each sentence, in order
+CAPTION_PROMPTS = tuple(f"{part}_{language}" for language in LANGUAGES for part in ("system", "prompt"))
+
 WINDOW, PICTURE_PX = "caption_window", "caption_picture_px"
 CAPTION_LISTS = (WINDOW, PICTURE_PX)
-ReleasedCaption = dict[
-    str, Any
-]  # what a row holds of an accepted caption: CAPTION_FACTS, CAPTION_SHARES, CAPTION_FIELDS and CAPTION_LISTS
+# What a row holds of an accepted caption, and nulls where there is none.
+CAPTION_COLUMNS = (
+    *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_COUNTS, *CAPTION_STATES, *CAPTION_FIELDS, *CAPTION_PROMPTS, *CAPTION_LISTS
+)  # fmt: skip
+ReleasedCaption = dict[str, Any]  # CAPTION_COLUMNS -> value
 PLACE = ("run", "town", "trajectory", "variant")  # what a flight is told from others by
-PNG_END = b"IEND\xaeB`\x82"  # the last chunk and its checksum
+SplitName = Literal["train", "validation", "test"]
+SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)  # as `datasets` shows them
 
 CONTRACT: dict[str, Any] = {
     "handedness": "right",
@@ -79,23 +88,45 @@ TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
         pa.list_(pa.field("element", pa.int32())),
         {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"},
     ),
+    "texts": (
+        pa.list_(pa.field("element", pa.string())),
+        {"feature": {"dtype": "string", "_type": "Value"}, "_type": "Sequence"},
+    ),
 }
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What the rows of a flight say of its place in the release: the columns of these names.
+
+    pair: the name of its twin in the records, None where that is not released. look: (4,) sun and air (LOOK), None where nobody says.
+    """
+
+    walk: str
+    split: SplitName
+    pair: str | None = None
+    look: np.ndarray | None = None
+
 
 Value = Callable[[Flight, int, ReleasedCaption | None], Any]
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its type (of TYPES, or the members of a struct) and its value at frame i of a flight; NaN becomes null."""
+    """One column: its type (of TYPES, or the members of a struct) and its value at frame i of a flight; NaN becomes null.
+
+    value: None for a picture, whose bytes the writer has, and for what Placed says.
+    """
 
     name: str
     type: str | tuple[str, ...]
-    value: Value
+    value: Value | None = None
 
-    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None) -> Any:
-        value = self.value(flight, i, caption)
+    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> Any:
+        value = getattr(placed, self.name) if self.value is None else self.value(flight, i, caption)
         if isinstance(self.type, tuple):  # adding 0.0 turns -0.0 into 0.0
-            return None if np.isnan(value).any() else dict(zip(self.type, (value + 0.0).tolist(), strict=True))
+            is_null = value is None or np.isnan(value).any()
+            return None if is_null else dict(zip(self.type, (value + 0.0).tolist(), strict=True))
         if self.type == "float64":
             return None if value is None or np.isnan(value) else float(value)
         return bool(value) if self.type == "bool" else value
@@ -105,17 +136,10 @@ def _said(name: str, kind: str = "string") -> Column:
     return Column(name, kind, lambda _, __, caption: caption and caption[name])
 
 
-def _picture(file: FrameFile) -> Value:
-    def value(flight: Flight, i: int, _: ReleasedCaption | None) -> dict[str, Any]:
-        return {"bytes": _read(flight, i, file), "path": f"{sample_id(flight.flight_id, i)}_{FILE_NAMES[file]}"}
-
-    return value
-
-
 PICTURES: dict[FrameFile, Column] = {
-    "rgb": Column("image", "image", _picture("rgb")),
-    "depth": Column("depth", "binary", lambda f, i, _: _read(f, i, "depth")),
-    "instance": Column("instance", "image", _picture("instance")),
+    "rgb": Column("image", "image"),
+    "depth": Column("depth", "binary"),
+    "instance": Column("instance", "image"),
 }
 
 
@@ -128,6 +152,12 @@ SCALARS = (  # everything but pictures and depth
     Column("track", "string", lambda f, i, _: "clean" if f.is_original else "perturbed"),
     Column("style", "string", lambda f, i, _: f.styles[i]),
     Column("pace", "string", lambda f, i, _: f.pace),
+    Column("walk", "string"),
+    Column("split", "string"),
+    Column("pair", "string"),
+    Column("weather", "string", lambda f, i, _: f.weather["weather"]),
+    Column("time_of_day", "string", lambda f, i, _: f.weather["time_of_day"]),
+    Column("look", LOOK),
     Column("frame_index", "int32", lambda f, i, _: i),
     Column("time_s", "float64", lambda f, i, _: f.time_s[i]),
     Column("width_px", "int32", lambda f, i, _: f.camera.width_px),
@@ -155,7 +185,10 @@ SCALARS = (  # everything but pictures and depth
     Column("has_caption", "bool", lambda f, i, caption: caption is not None),
     *map(_said, CAPTION_FACTS),
     *(_said(name, "float64") for name in CAPTION_SHARES),
+    *(_said(name, "int32") for name in CAPTION_COUNTS),
+    *(_said(name, "texts") for name in CAPTION_STATES),
     *map(_said, CAPTION_FIELDS),
+    *map(_said, CAPTION_PROMPTS),
     *(_said(name, "indices") for name in CAPTION_LISTS),
 )
 SCALAR_NAMES = [column.name for column in SCALARS]
@@ -180,26 +213,12 @@ def schema(files: Collection[FrameFile]) -> pa.Schema:
     return pa.schema(fields, {b"huggingface": json.dumps({"info": {"features": features}}).encode()})
 
 
-def row(flight: Flight, i: int, files: Collection[FrameFile], caption: ReleasedCaption | None) -> dict[str, Any]:
-    """Give the row of one frame, right-handed axes.
-
-    Raises:
-        InputError: a file of the frame cannot be read.
-    """
-    return {column.name: column.cell(flight, i, caption) for column in columns_of(files)}
+def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> dict[str, Any]:
+    """Give the row of one frame without its pictures, right-handed axes."""
+    return {column.name: column.cell(flight, i, caption, placed) for column in SCALARS}
 
 
 def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:
     """Give the bytes of a picture in a row."""
     value = row[PICTURES[file].name]
     return value if file == "depth" else value["bytes"]
-
-
-def _read(flight: Flight, i: int, file: FrameFile) -> bytes:
-    """Read a frame's file and see that its end is there; `release verify` decodes all of it."""
-    path = flight.frame_folder(i) / FILE_NAMES[file]
-    data = read_bytes(path, what="frame's file", fix="run cosfly inspect again", tree=tree_of(path.parent))
-    num_pixels = flight.camera.width_px * flight.camera.height_px
-    if not (len(data) > 4 * num_pixels if file == "depth" else PNG_END in data[-256:]):
-        raise InputError("a frame's file is cut short", where=path, got=f"{len(data)} bytes", fix="render it again")
-    return data

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -12,11 +13,15 @@ from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.reading.documents import read_model
-from cosfly.store import write_model
+from cosfly.store import sha256_bytes, write_model
+from release.columns import SplitName
 
-RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "2.0"
+RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"
 
 Counts = dict[str, int]
+SplitBy = Literal["walk", "town"]
+DepthCodingName = Literal["float32", "float16", "millimetre_png"]
+Pairs = Literal["both", "any"]
 
 
 class Strict(BaseModel):
@@ -24,20 +29,27 @@ class Strict(BaseModel):
 
 
 class Shard(Strict):
-    """One parquet file."""
+    """One parquet file; its rows are of one split, and of whole flights."""
 
     path: str
+    split: SplitName
     rows: int
     bytes: int
     sha256: str
 
 
 class ReleasedFlight(Strict):
-    """One flight, `run/town/trajectory/variant`; `frames_available` is the length of the flight that was rendered."""
+    """One flight, `run/town/trajectory/variant`; `frames_available` is the length of the flight that was rendered.
+
+    pair: the other track's flight of the same trajectory, null where that is not released.
+    """
 
     flight: str
     frames: int
     frames_available: int
+    split: SplitName
+    walk: str
+    pair: str | None
 
 
 class ReleasedMap(TownMap):
@@ -47,11 +59,98 @@ class ReleasedMap(TownMap):
 
 
 class Settings(Strict):
-    """The settings that change what is released."""
+    """The settings that change what is released. num_frames: of each flight, null for all; window_frames: of a caption's window."""
 
-    num_frames: int = Field(ge=1)
+    num_frames: int | None = Field(ge=1)
+    window_frames: int = Field(ge=1)
     tracks: list[str]
+    pairs: Pairs
     modalities: list[FrameFile] = Field(min_length=1)
+
+
+class DepthCoding(Strict):
+    """How `depth` is stored. The error is the greatest one of a pixel, measured over all released ones that are neither sky nor invalid.
+
+    min_m, max_m: of these pixels; null where nothing was coded anew, so that nothing was measured.
+    """
+
+    coding: DepthCodingName
+    unit: Literal["metre", "millimetre"]
+    sky: float
+    invalid: float
+    min_m: float | None
+    max_m: float | None
+    max_error_m: float
+
+
+class SplitNumbers(Strict):
+    """One split; walks and towns by name."""
+
+    frames: int
+    captions: int
+    flights: int
+    trajectories: int
+    walks: list[str]
+    towns: list[str]
+
+
+class Splits(Strict):
+    """What two splits may not share, how it was handed out, and what came of it; a split without rows is left out."""
+
+    by: SplitBy
+    rule: str
+    seed: int
+    fractions: dict[SplitName, float]
+    splits: dict[SplitName, SplitNumbers]
+
+
+class MadeBy(Strict):
+    """One stage of one source: its settings, seed, version, and the sha256 of what it read. Paths and addresses are left out."""
+
+    stage: str
+    code_version: str
+    seed: int
+    config: dict[str, Any]
+    inputs: dict[str, str]
+
+
+class SourceRecord(Strict):
+    """One source of the release: fingerprints of its tree, captions and inspection (null: without), and the stages that made them."""
+
+    run: str
+    tree_sha256: str
+    captions_sha256: str
+    inspect_sha256: str | None
+    stages: list[MadeBy]
+
+
+class Teacher(Strict):
+    """Who was asked, and how: of all captions that were read, the released ones and the others."""
+
+    kind: str
+    model: str
+    settings: dict[str, Any]
+    captions: int
+
+
+class Repairs(Strict):
+    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung; shares of all accepted ones."""
+
+    accepted: int
+    first_answers: int
+    repaired_by_rung: Counts
+    shares: dict[str, float]
+
+
+class Provenance(Strict):
+    """Where it all comes from: versions of what built it, its sources, teachers, repairs, and tokens of all asks."""
+
+    versions: dict[str, str]
+    sources: list[SourceRecord]
+    teachers: list[Teacher]
+    repairs: Repairs
+    tokens: Counts
+    asks: int
 
 
 class Spread(Strict):
@@ -123,28 +222,33 @@ class Numbers(Strict):
 
 
 class FlightHistory(Strict):
-    """inspected = released + left_out, by reason."""
+    """found = released + left_out, by reason; those of trees without an inspection were not inspected."""
 
+    found: int
     inspected: int
     released: int
     left_out: Counts
 
 
 class CaptionHistory(Strict):
-    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + flight_left_out."""
+    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + window_not_whole + flight_left_out."""
 
     read: int
     dropped: Counts
     accepted: int
     released: int
     frame_not_selected: int
+    window_not_whole: int
     flight_left_out: int
 
 
 class History(Strict):
-    """What the shards cannot tell: where all flights and captions went. It can only add up."""
+    """What the shards cannot tell: where all flights and captions went. It can only add up.
 
-    trajectories: TrajectoryFunnel
+    trajectories: of the sources that were inspected; null where none was.
+    """
+
+    trajectories: TrajectoryFunnel | None
     flights: FlightHistory
     captions: CaptionHistory
 
@@ -155,15 +259,37 @@ class ReleaseRecord(Strict):
     name: str
     licence: str
     credits: str
-    maps: list[ReleasedMap] = []  # older releases name theirs in `credits`
+    maps: list[ReleasedMap]
     made_by: str
     settings: Settings
     frame_selection: str
+    depth: DepthCoding | None  # null: without depth
     coordinates: dict[str, Any]
+    splits: Splits
     numbers: Numbers
     history: History
+    provenance: Provenance
     flights: list[ReleasedFlight]
+    content_digest: str
     shards: list[Shard]
+
+
+DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
+
+
+def content_digest(shards: Iterable[tuple[SplitName, str]]) -> str:
+    """Give the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another digest."""
+    return sha256_bytes("".join(f"{split} {sha256}\n" for split, sha256 in shards).encode())
+
+
+def shard_path(split: SplitName, digest: str, number: int, count: int) -> str:
+    """Give the name of a shard in its release: one of `count` of its split."""
+    return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-{number:05d}-of-{count:05d}.parquet"
+
+
+def shard_pattern(split: SplitName, digest: str) -> str:
+    """Give the pattern that the card names for a split. The library's cache goes by it: without the digest a new release shows old rows."""
+    return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
 def write_record(path: Path, record: ReleaseRecord) -> None:

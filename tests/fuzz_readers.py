@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import shutil
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -158,6 +159,7 @@ def make_specimens(root: Path) -> Path:
         root / "inspect.json", flights.model_copy(update={"flights": accepted, "funnel": funnel})
     )
     package.run(RELEASE, [Source("one", tree, captions, root / "inspect.json")], root / "release")
+    shutil.copy(_first_shard(root), root / "shard.parquet")
     _students(root, captions, tree)
     _records(root)
     for name, text in TEXTS.items():
@@ -166,7 +168,7 @@ def make_specimens(root: Path) -> Path:
 
 
 METRICS = dict.fromkeys((*(name for name, *_ in compare.FIGURES), "collision_fraction"), 1.0)
-RELEASE = package.ReleaseConfig(num_frames=6, shard_mb=1, row_group_mb=1, licence="cc-by-4.0")
+RELEASE = package.ReleaseConfig(num_frames=6, shard_mb=1, row_group_mb=1, licence="cc-by-4.0", unbound="accept")
 
 
 def _maps(root: Path) -> None:
@@ -438,6 +440,16 @@ def _evaluated(root: Path, scratch: Path) -> None:
     evaluate.run(evaluate.EvaluateConfig(), root / "predictions.jsonl", root / "train", scratch / "scores")
 
 
+def _first_shard(root: Path) -> Path:
+    return min((root / "release/dataset/data").iterdir())
+
+
+def _verified(root: Path) -> None:
+    """Verify the release with the changed shard in its place; it is called by its content, which no table can know."""
+    shutil.copy(root / "shard.parquet", _first_shard(root))
+    verify(root / "release/dataset")
+
+
 def _released(root: Path, scratch: Path) -> None:
     source = Source("one", root / "render", root / "captions.jsonl", root / "inspect.json")
     _stage(lambda: package.run(RELEASE, [source], scratch / "release"), scratch / "release")
@@ -497,9 +509,9 @@ READERS: dict[str, Reader] = {
     "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
     "release record": _one("release/dataset/release.json", read_record),
     "release, verify": Reader(
-        tuple(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md", "data/train-00000-of-00001.parquet")),
-        lambda root, _: verify(root / "release/dataset"), share=0.4, hashes=True),
-    "shard": Reader(("release/dataset/data/train-00000-of-00001.parquet",), lambda root, _: _shard(root)),
+        ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md"))),
+        lambda root, _: _verified(root), share=0.4, hashes=True),
+    "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
     "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),
     "verify": Reader(("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"), lambda root, _: provenance.verify([root / "inspect", root / "render"]), share=0.3, hashes=True),
@@ -526,6 +538,6 @@ READERS: dict[str, Reader] = {
 def _shard(root: Path) -> None:
     from cosfly.reading.tables import num_rows, rows_of
 
-    path = root / "release/dataset/data/train-00000-of-00001.parquet"
+    path = root / "shard.parquet"
     num_rows(path)
     list(rows_of(path))

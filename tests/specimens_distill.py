@@ -64,7 +64,7 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
         ),
         "label_from": "flight",
         "label": None if frame % 3 == 0 else decision,
-        "verdict": "CONSISTENT",
+        "verdict": "ABSTAIN" if frame % 3 == 0 else "CONSISTENT",  # as geometry cannot tell
         "status": "accepted",
     }
     return Caption.model_validate({**fields, **changes})

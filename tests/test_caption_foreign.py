@@ -19,13 +19,14 @@ from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
+from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction
 from distill.inference import stage as infer
 from distill.inference.stage import failed_prediction, make_prediction
 from distill.prepare.samples import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.package import stage as package
-from release.package.captions import load_captions
+from release.package.captions import index_captions, released
 from release.package.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
@@ -223,10 +224,15 @@ def test_a_students_answers_are_judged_marked_and_released(tree, rules, tmp_path
         assert (caption.teacher.kind, caption.teacher.model, caption.writing) == ("student", "base+mine", "prose")
         assert (caption.en, caption.zh, caption.label) == (taught.en, taught.zh, taught.label)
         assert (caption.checks.sentences or {}).keys() == {"en", "zh"}
-    by_flight, dropped = load_captions(tmp_path / "out/captions.jsonl")
-    (frames,) = by_flight.values()
-    assert {row["teacher_kind"] for row in frames.values()} == {"student"}
-    assert (len(frames), dropped) == (6, {"not_in_file": 5})
+    flight = town_folder(found[0].town), found[0].trajectory, found[0].variant
+    problems: list[object] = []
+    by_flight, account = index_captions(
+        tmp_path / "out/captions.jsonl", {flight: 100}, set(), lambda *told: problems.append(told)
+    )
+    assert problems == []
+    rows = [released(caption) for caption in by_flight[flight].read()]
+    assert {row["teacher_kind"] for row in rows} == {"student"}
+    assert (len(rows), account.accepted, account.dropped) == (6, 6, {"not_in_file": 5})
 
 
 def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from specimens_foreign import NOBODY, write_foreign_tree
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.errors import InputError, NothingKept, VerifyError
+from cosfly.errors import InputError, VerifyError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.products.captions import read_captions
@@ -478,11 +479,14 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     cfg, clean = ReleaseConfig(licence="mit", modalities=("rgb",)), find_flights(tree)[0]
 
     def failed(out: str, source: Source) -> list[str]:
-        package.run(cfg, [source], tmp_path / out)
-        return [
-            f.message.split(";")[0].rpartition("trajectory_1777083733/")[2]
-            for f in read_failures(tmp_path / out / "failures.jsonl")
-        ]
+        found: list[str] = []
+        try:
+            package.run(cfg, [source], tmp_path / out)
+        except VerifyError:
+            failures = " ".join(failure.message for failure in read_failures(tmp_path / out / "failures.jsonl"))
+            found = re.findall(r"trajectory_1777083733/(\S+: [^;]+);", failures)
+        assert (tmp_path / out / "dataset").exists() == (not found)
+        return found
 
     picture = clean / "frames_playback/frame_00003/rgb.png"
     before = picture.read_bytes()
@@ -494,15 +498,16 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     shutil.copy(picture, alone / "private.png")  # the same bytes, but who knows what stands there tomorrow
     picture.unlink()
     picture.symlink_to(alone / "private.png")
-    assert failed("d", source) == ["ORI/frames_playback/frame_00003/rgb.png: a link leads out of its folder"]
+    with pytest.raises(InputError, match=r"ORI/frames_playback/frame_00003/rgb\.png: a link leads out of its folder"):
+        failed("d", source)
     picture.unlink()
     picture.write_bytes(before)
     value = read_json(inspected)
     one, two = value["flights"]
     one["sha256"], two["sha256"] = two["sha256"], one["sha256"]
     write_json(alone / "inspect.json", value)
-    with pytest.raises(NothingKept, match="verify 2"):
-        failed("b", replace(source, inspect=alone / "inspect.json"))
+    both = [f"{track}: the flight is not the one that was inspected" for track in ("ORI", "aug_001")]
+    assert failed("b", replace(source, inspect=alone / "inspect.json")) == both
     one["folder"], two["folder"] = two["folder"], one["folder"]
     write_json(alone / "inspect.json", value)
     with pytest.raises(InputError, match="the record of one flight has the folder of another"):

@@ -251,13 +251,13 @@ def test_no_changed_picture_reaches_a_release(base, tmp_path):
     for flight, name in zip(flights[:3], ("rgb.png", "depth.npy", "instance.png"), strict=True):
         frames = flight / "frames_playback"
         shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)
-    work(tiny(), out, "release")
-    failures = read_failures(out / "release/failures.jsonl")
-    named = {
-        f.message.split(": ")[0].rpartition("/")[2] for f in failures if "not the one that was inspected" in f.message
-    }
-    assert named == {"rgb.png", "depth.npy", "instance.png"}
-    assert read_json(out / "release/manifest.json")["counts"]["kept"] == 1
+    with pytest.raises(VerifyError, match="nothing is released"):
+        work(tiny(), out, "release")
+    failures = " ".join(failure.message for failure in read_failures(out / "release/failures.jsonl"))
+    assert failures.count("not the one that is on record") == 3
+    assert all(f"frame_00000/{name}: a file" in failures for name in ("rgb.png", "depth.npy", "instance.png"))
+    assert not (out / "release/dataset").exists()
+    assert not (out / "release/manifest.json").exists()
 
 
 def test_a_flight_whose_records_were_changed_too_is_rejected(base, tmp_path):

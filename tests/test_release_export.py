@@ -53,12 +53,15 @@ def config(format: str, **more) -> ExportConfig:
     return build_config(ExportConfig, {"format": format, "shard_mb": 1, **more}, "test")
 
 
-def make_release(root: Path, num_frames: int = 400, **change) -> Path:
+def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -> Path:
     tree = make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
     flights = [read_flight(folder) for folder in find_flights(tree)]
-    write_captions(
-        root / "captions.jsonl", [make_caption(flight, i) for flight in flights for i in range(4, NUM_POINTS - 1)]
-    )
+    captions = [
+        make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
+        for flight in flights
+        for i in range(4, NUM_POINTS - 1)
+    ]
+    write_captions(root / "captions.jsonl", captions)
     write_inspection(root / "inspect.json", make_inspection(tree, {}))
     return build(root, root / "release", CFG.model_copy(update={"num_frames": num_frames, **change}))
 
@@ -122,7 +125,7 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
 
 def test_a_tree_of_chosen_frames_says_which_they_were(tmp_path):
     """Every second frame or so: counted anew from 0, uneven steps told."""
-    dataset = make_release(tmp_path, num_frames=8)
+    dataset = make_release(tmp_path, num_frames=8, window=1)  # without windows to keep, frames are spread evenly
     product = export(config("tree"), dataset, tmp_path / "out")
     frames = [flight.frame_index.tolist() for flight in scan(open_release(dataset))]
     for a, b, kept in zip(find_flights(tmp_path / "tree"), find_flights(product), frames, strict=True):
@@ -334,7 +337,7 @@ def test_statistics_leave_out_what_is_unknown():
 
 
 def test_a_flight_with_gaps_is_several_episodes(tmp_path):
-    dataset = make_release(tmp_path, num_frames=8)
+    dataset = make_release(tmp_path, num_frames=8, window=1)  # without windows to keep, frames are spread evenly
     product = export(config("lerobot"), dataset, tmp_path / "out")
     info = json.loads((product / "meta/info.json").read_text())
     episodes = pq.read_table(product / "meta/episodes").to_pylist()

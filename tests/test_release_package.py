@@ -37,16 +37,25 @@ from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.store import write_json
 from release.card.render import render_card, size_category
-from release.columns import SCALARS
+from release.columns import SCALARS, Placed
+from release.package.plan import plan_shards
 from release.package.sources import Source
-from release.package.stage import ReleaseConfig, plan_shards, run
+from release.package.stage import ReleaseConfig, run
 from release.record import read_record
 from release.verify.verify import picture_problem, verify
 from specimens import make_flight, make_playback_tree
 
 NUM_POINTS = 12
-CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", licence="cc-by-4.0")
+FREE = {
+    "licence": "cc-by-4.0",
+    "unbound": "accept",
+    "pairs": "any",
+    "validation_fraction": 0,
+    "test_fraction": 0,
+}
+CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
 
+PLACED = Placed("a walk", "train")
 REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 
 
@@ -79,7 +88,7 @@ def make_caption(flight, index: int, **change) -> Caption:
         ),
         "label_from": "flight",
         "label": "track_straight",
-        "verdict": "CONSISTENT",
+        "verdict": "CONSISTENT" if decision == "track_straight" else "SOFT_CONFLICT",
         "repair": REPAIR if index % 4 == 0 else None,
         "writing": "slots",
         "checks": {"sentences": {"en": ["proved", "unread", "proved", "proved"]}} if index % 2 else {},
@@ -153,6 +162,11 @@ def loaded(built, tmp_path_factory):
     return datasets.load_dataset(str(built), split="train", cache_dir=str(cache))
 
 
+def rows_of(folder: Path) -> list[dict]:
+    record = read_record(folder / "release.json")
+    return [row for shard in record.shards for row in pq.read_table(folder / shard.path).to_pylist()]
+
+
 def all_bytes(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
@@ -202,8 +216,8 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, inputs):
 def test_the_box_of_the_pixels_reaches_its_row():
     flight = replace(make_flight(3)[0], target_mask_bbox=np.array([[1.0, 2.0, 3.0, 4.0], [np.nan] * 4, [5.0] * 4]))
     column = next(column for column in SCALARS if column.name == "target_mask_bbox")
-    assert column.cell(flight, 0, None) == {"xmin_px": 1.0, "ymin_px": 2.0, "xmax_px": 3.0, "ymax_px": 4.0}
-    assert column.cell(flight, 1, None) is None
+    assert column.cell(flight, 0, None, PLACED) == {"xmin_px": 1.0, "ymin_px": 2.0, "xmax_px": 3.0, "ymax_px": 4.0}
+    assert column.cell(flight, 1, None, PLACED) is None
 
 
 def test_what_became_of_a_frames_perturbation_reaches_its_row():
@@ -212,8 +226,8 @@ def test_what_became_of_a_frames_perturbation_reaches_its_row():
         make_flight(3)[0], raw={"points": [{"perturbation": told}, {"perturbation": {"drone_position": True}}, {}]}
     )
     column = next(column for column in SCALARS if column.name == "perturbation")
-    assert [column.cell(flight, i, None) for i in range(3)] == [told, None, None]
-    assert column.cell(replace(flight, raw={}), 0, None) is None
+    assert [column.cell(flight, i, None, PLACED) for i in range(3)] == [told, None, None]
+    assert column.cell(replace(flight, raw={}), 0, None, PLACED) is None
 
 
 def test_the_decode_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
@@ -254,19 +268,20 @@ def test_numbers_against_a_slow_oracle(loaded, built):
 def test_the_account_names_every_flight_and_caption(built):
     history = read_json(built / "release.json")["history"]
     assert history["flights"] == {
-        "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
+        "found": 6, "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
     }  # fmt: skip
     captions = history["captions"]
     assert captions["read"] == 6 * 8
     assert captions["dropped"] == {"hard_conflict": 6}
     assert captions["flight_left_out"] == 2 * 7
-    assert captions["released"] + captions["frame_not_selected"] == 4 * 7
-    chosen = {0, 1, 3, 4, 6, 7, 9, 11}  # floor(k * 11 / 7)
-    assert captions["released"] == 4 * len(chosen & set(range(4, 11)))
+    # Of 12 frames 2 to 9 are released; captions stand at 4 to 10, and each needs the four frames before its own.
+    assert captions["released"] == 4 * 4
+    assert captions["window_not_whole"] == 4 * 2
+    assert captions["frame_not_selected"] == 4
 
 
 def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
-    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), licence="cc-by-4.0"))
+    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), **FREE))
     record = read_json(folder / "release.json")
     assert [flight["frames"] for flight in record["flights"]] == [NUM_POINTS] * 4
     assert record["numbers"]["flights_shorter_than_num_frames"] == 4
@@ -352,9 +367,9 @@ def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(inputs, tmp_path):
         shutil.copytree(inputs / "tree", tmp_path / "in" / "tree" / name)
         for town in ("Town01", "Town02"):
             write_town_map(tmp_path / "in" / "tree" / name / town, MapHeader(licence=licence))
-    shutil.copy(inputs / "captions.jsonl", tmp_path / "in")
+    (tmp_path / "in/captions.jsonl").write_text("")
     write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
-    with pytest.raises(ConfigError, match=r"Town01: mit, Town01: cc0-1\.0, Town02: mit, Town02: cc0-1\.0"):
+    with pytest.raises(ConfigError, match=r"Town01: cc0-1\.0, Town01: mit, Town02: cc0-1\.0, Town02: mit"):
         build(tmp_path / "in", tmp_path / "r", CFG.model_copy(update={"licence": None}))
     shutil.rmtree(tmp_path / "in" / "tree" / "b")
     write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
@@ -444,24 +459,27 @@ def test_runs_are_given_as_folders_or_file_by_file(inputs, tmp_path):
         shutil.copy(inputs / "inspect.json", place / "inspect")
     a, b = (tmp_path / "runs" / name for name in ("a", "b"))
     assert [Source.of_run(place).run for place in (a, b)] == ["a", "b"]
-    more = ["--out", str(tmp_path / "out"), "--set", "release.licence=mit", "--set", "release.num_frames=2"]
+    more = [
+        "--out",
+        str(tmp_path / "out"),
+        "--set",
+        "release.licence=mit",
+        "--frames",
+        "2",
+        "--set",
+        "release.unbound=accept",
+    ]
     files = ["--data", str(b / "render"), "--captions", str(b / "caption/captions.jsonl")]
     result = CliRunner().invoke(
         app, ["release", "build", str(a), *files, "--workers", "1", "--inspect", str(b / "inspect/inspect.json"), *more]
     )
     assert result.exit_code == 0, result.output
     assert {i.partition("_")[0] for i in ids_of(tmp_path / "out/dataset")} == {"a", "b"}
-    assert CliRunner().invoke(app, ["release", "build", *files, *more]).exit_code == 2
+    assert CliRunner().invoke(app, ["release", "build", *files[:2], *more]).exit_code == 2
+    assert CliRunner().invoke(app, ["release", "build", *files, *more, "--frames", "some"]).exit_code == 2
     refused = CliRunner().invoke(app, ["release", "build", str(inputs), *more])
     assert isinstance(refused.exception, InputError)
     assert "not a run folder" in str(refused.exception)
-
-
-def test_releases_from_before_there_were_maps_in_the_record_verify(dataset):
-    edit_record(dataset, lambda r: r.pop("maps"))
-    card = re.sub(r"\n\nMap of [^\n]*", "", (dataset / "README.md").read_text(encoding="utf-8"))
-    (dataset / "README.md").write_text(card, encoding="utf-8")
-    assert codes(dataset) == {"checksum"}
 
 
 @given(st.lists(st.integers(1, 50), max_size=30), st.integers(1, 120))
@@ -495,21 +513,25 @@ def test_a_second_run_has_nothing_to_do(inputs, built):
 
 
 @pytest.mark.parametrize(("name", "left"), [("depth.npy", None), ("depth.npy", 300), ("rgb.png", 500)])
-def test_a_flight_that_cannot_be_read_is_counted_and_the_others_go_on(inputs, tmp_path, name, left):
+def test_a_flight_that_cannot_be_read_leaves_nothing_behind_and_the_next_run_mends_it(
+    inputs, built, tmp_path, name, left
+):
     copy = shutil.copytree(inputs, tmp_path / "inputs")
     first = find_flights(copy / "tree")[0]
-    damaged = first / "frames_playback" / "frame_00000" / name
+    damaged = first / "frames_playback" / "frame_00003" / name
     data = damaged.read_bytes()
     damaged.unlink()
     if left is not None:  # cut short
         assert left < len(data)
         damaged.write_bytes(data[:left])
-    folder = build(copy, tmp_path / "r")
-    record = read_json(folder / "release.json")
-    assert record["history"]["flights"]["left_out"]["failed: input"] == 1
-    assert record["numbers"]["flights"] == 3
+    with pytest.raises(InputError, match="nothing is released") as caught:
+        build(copy, tmp_path / "r")
+    assert name in str(caught.value)
     assert name in (tmp_path / "r" / "failures.jsonl").read_text()
-    assert verify(folder).is_ok
+    assert not (tmp_path / "r" / "dataset").exists()
+    assert not (tmp_path / "r" / "manifest.json").exists()
+    damaged.write_bytes(data)
+    assert rows_of(build(copy, tmp_path / "r")) == rows_of(built)
 
 
 def rewrite_captions(root: Path, change) -> None:
@@ -638,7 +660,7 @@ DAMAGES = {
     "record of odd numbers": lambda d: edit_record(d, lambda r: r["numbers"]["captions"].update(frames_with="7")),
     "number of another caption": lambda d: edit_record(d, lambda r: r["numbers"]["captions"]["example"].clear()),
     "number": lambda d: edit_record(d, lambda r: r["numbers"].update(frames=7)),
-    "sum": lambda d: edit_record(d, lambda r: r["history"]["flights"].update(inspected=99)),
+    "sum": lambda d: edit_record(d, lambda r: r["history"]["flights"].update(found=99)),
     "flight": lambda d: edit_record(d, lambda r: r["flights"].pop()),
     "frames": lambda d: edit_record(d, lambda r: r["flights"][0].update(frames_available=500)),
     "rows": lambda d: edit_record(d, lambda r: r["shards"][0].update(rows=5)),

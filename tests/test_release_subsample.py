@@ -1,4 +1,4 @@
-"""Stride selection: evenly spread, both ends, never padded."""
+"""Which frames are released: runs that are spread evenly, whole windows, never padded."""
 
 from __future__ import annotations
 
@@ -7,57 +7,79 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from release.subsample import select_frames
+from release.subsample import is_whole, select_frames
+
+WINDOW = 5
+
+
+def runs_of(chosen: np.ndarray) -> list[int]:
+    """Lengths of the runs of consecutive frames."""
+    return [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
+
+
+@given(st.integers(0, 3000), st.integers(1, 800), st.integers(1, 12))
+def test_so_many_frames_in_order(num_points, num_frames, window):
+    chosen = select_frames(num_points, num_frames, window)
+    assert len(chosen) == min(num_points, num_frames)
+    assert (np.diff(chosen) >= 1).all()
+    assert not len(chosen) or (chosen[0] >= 0 and chosen[-1] < num_points)
+    if num_frames >= 2 * max(1, 6 * (window - 1)) and num_points:  # two runs or more
+        assert (chosen[0], chosen[-1]) == (0, num_points - 1)
+
+
+@given(st.integers(300, 3000), st.integers(1, 800), st.integers(1, 12))
+def test_runs_and_the_gaps_between_them_differ_by_one_at_most(num_points, num_frames, window):
+    chosen = select_frames(num_points, num_frames, window)
+    gaps = np.diff(chosen)[np.diff(chosen) > 1]
+    if len(gaps) and num_points - num_frames >= len(gaps) + 1 and gaps.min() > 2:  # no two runs have grown together
+        lengths = runs_of(chosen)
+        assert max(lengths) - min(lengths) <= 1
+        assert gaps.max() - gaps.min() <= 1
 
 
 @given(st.integers(0, 3000), st.integers(1, 800))
-def test_selection_is_even_and_has_both_ends(num_points, num_frames):
-    chosen = select_frames(num_points, num_frames)
-    assert len(chosen) == min(num_points, num_frames)
-    gaps = np.diff(chosen)
-    assert (gaps >= 1).all()
-    if len(gaps):
-        assert gaps.max() - gaps.min() <= 1
-    if num_points:
-        assert chosen[0] == 0
-    if num_points and num_frames > 1:
-        assert chosen[-1] == num_points - 1
+def test_a_window_of_one_frame_gives_the_even_stride_of_the_paper(num_points, num_frames):
+    chosen = select_frames(num_points, num_frames, 1)
+    if 1 < num_frames < num_points:
+        assert chosen.tolist() == [k * (num_points - 1) // (num_frames - 1) for k in range(num_frames)]
+
+
+@given(st.integers(618, 770))
+def test_at_the_papers_lengths_five_sixths_of_the_windows_are_whole(num_points):
+    """An even stride leaves none, which is what this selection is for."""
+    chosen = select_frames(num_points, 400, WINDOW).tolist()
+    selected = set(chosen)
+    assert len(chosen) == 400
+    assert sum(is_whole(range(i - WINDOW + 1, i + 1), selected) for i in chosen) == 336
+    assert len(runs_of(np.array(chosen))) == 16
+    strided = set(select_frames(num_points, 400, 1).tolist())
+    assert not any(is_whole(range(i - WINDOW + 1, i + 1), strided) for i in strided) or num_points < 620
 
 
 @given(st.integers(1, 400), st.integers(400, 800))
 def test_a_short_flight_is_kept_whole(num_points, num_frames):
-    assert select_frames(num_points, num_frames).tolist() == list(range(num_points))
-
-
-@given(st.integers(2, 500), st.integers(2, 500))
-def test_selecting_twice_changes_nothing(num_points, num_frames):
-    once = select_frames(num_points, num_frames)
-    assert once[select_frames(len(once), num_frames)].tolist() == once.tolist()
+    assert select_frames(num_points, num_frames, WINDOW).tolist() == list(range(num_points))
+    assert select_frames(num_points, None, WINDOW).tolist() == list(range(num_points))
 
 
 @pytest.mark.parametrize(
-    ("num_points", "num_frames", "expected"),
+    ("num_points", "num_frames", "window", "expected"),
     [
-        (10, 4, [0, 3, 6, 9]),
-        (5, 3, [0, 2, 4]),
-        (6, 4, [0, 1, 3, 5]),
-        (7, 1, [0]),
-        (0, 3, []),
-        (3, 3, [0, 1, 2]),
+        (10, 4, 1, [0, 3, 6, 9]),
+        (5, 3, 1, [0, 2, 4]),
+        (7, 1, 1, [3]),
+        (0, 3, 5, []),
+        (3, 3, 5, [0, 1, 2]),
+        (12, 8, 5, [2, 3, 4, 5, 6, 7, 8, 9]),  # one run, in the middle
+        (20, 12, 2, [0, 1, 2, 3, 4, 5, 14, 15, 16, 17, 18, 19]),  # two runs of six
+        (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
     ],
 )
-def test_by_hand(num_points, num_frames, expected):
-    assert select_frames(num_points, num_frames).tolist() == expected
+def test_by_hand(num_points, num_frames, window, expected):
+    assert select_frames(num_points, num_frames, window).tolist() == expected
 
 
-def test_the_papers_lengths_give_400_frames():
-    for num_points in (618, 700, 770):
-        chosen = select_frames(num_points, 400)
-        assert len(chosen) == 400
-        assert set(np.diff(chosen)) == {1, 2}
-
-
-@pytest.mark.parametrize(("num_points", "num_frames"), [(-1, 3), (5, 0)])
-def test_bad_arguments(num_points, num_frames):
+@pytest.mark.parametrize(("num_points", "num_frames", "window"), [(-1, 3, 5), (5, 0, 5), (5, 3, 0)])
+def test_bad_arguments(num_points, num_frames, window):
     with pytest.raises(ValueError, match="cannot choose"):
-        select_frames(num_points, num_frames)
+        select_frames(num_points, num_frames, window)

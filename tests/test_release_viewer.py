@@ -304,7 +304,7 @@ def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
 @pytest.mark.slow
 def test_filters_and_the_address_agree(tab, page):
     tab.open(page)
-    assert set(values_of(tab, "verdict")) == {"CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT"}
+    assert set(values_of(tab, "verdict")) == {"ABSTAIN", "CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT"}
     assert set(values_of(tab, "town")) == {"Town01", "Town02"}
     assert set(values_of(tab, "evidence")) == {"contradicted", "not judged"}
     set_filter(tab, "verdict", "HARD_CONFLICT")

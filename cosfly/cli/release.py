@@ -19,12 +19,18 @@ def release_build(
         list[Path] | None, typer.Argument(help="Run folders, as `cosfly run` makes them; all go into one release.")
     ] = None,
     captions: Annotated[
-        list[Path] | None, typer.Option(help="captions.jsonl of a tree; repeat the three for several.")
+        list[Path] | None, typer.Option(help="captions.jsonl of a tree; repeat with --data for several.")
     ] = None,
-    inspected: Annotated[list[Path] | None, typer.Option("--inspect", help="inspect.json of a tree.")] = None,
+    inspected: Annotated[
+        list[Path] | None,
+        typer.Option("--inspect", help="inspect.json of a tree, one for each or none: then all flights are released."),
+    ] = None,
     data: Annotated[
         list[Path] | None,
-        typer.Option(help="Playback tree; by default that of the run folder one stands in."),
+        typer.Option(help="Playback tree, also of others; by default that of the run folder one stands in."),
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="N|all", help="Frames of each flight, in evenly spread runs; or all of them.")
     ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
@@ -40,14 +46,26 @@ def release_build(
     sources = [Source.of_run(folder) for folder in runs or []]
     if captions or inspected or data or not sources:
         trees = data or [options.data_folder(None)]
-        if not len(trees) == len(captions or []) == len(inspected or []):
-            raise typer.BadParameter("give --data, --captions and --inspect, one of each for a tree, or run folders")
-        sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspected or [], strict=True)]
-    cfg = options.resolve(config, overrides, {"workers": workers})
+        inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
+        if not len(trees) == len(captions or []) == len(inspections):
+            raise typer.BadParameter(
+                "give --data and --captions, and --inspect or none, one of each for a tree; or run folders"
+            )
+        sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
+    cfg = options.resolve(config, [*(overrides or []), *_frames_setting(frames)], {"workers": workers})
     options.set_aside(out, repair)
-    options.verify_first(verify, *(p for s in sources for p in (s.data, s.captions, s.inspect)), out)
+    options.verify_first(verify, *(path for source in sources for path in source.files.values()), out)
     given = options.manner(cfg, resume)
     options.tell_product(package.run(cfg.release, sources, out, **given), out, cfg)
+
+
+def _frames_setting(frames: str | None) -> list[str]:
+    """Give `--frames` as a setting."""
+    if frames is None:
+        return []
+    if frames != "all" and not frames.isdecimal():
+        raise typer.BadParameter(f"--frames takes a number or all, not {frames!r}")
+    return [f"release.num_frames={'null' if frames == 'all' else frames}"]
 
 
 @app.command("verify")

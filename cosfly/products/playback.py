@@ -42,6 +42,8 @@ from cosfly.store import write_json
 ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
+# What the record of a flight's presets may be called: the paper names it, no public file shows it.
+WEATHER_KEYS = {"weather": ("weather", "preset", "name"), "time_of_day": ("time_of_day", "tod")}
 TWIN_TOLERANCE_S = 1e-3
 # Whither a person walks: the way from so many frames before to so many after; who goes less than so far stands.
 HEADING_FRAMES, STANDS_M = 2, 0.1
@@ -125,6 +127,17 @@ class Flight:
     def pace(self) -> str:
         """The pace of the walk that it follows."""
         return pace_of(self.source, str(self.folder))
+
+    @property
+    def weather(self) -> dict[str, str | None]:
+        """The presets of weather and time of day that the file names; None where it has no such record, as without injection."""
+        told = (
+            {"weather": self.raw["weather"]}
+            if isinstance(self.raw.get("weather"), str)
+            else object_of(self.raw, "weather")
+        )
+        named = {own: (told.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
+        return {own: next((one for one in found if isinstance(one, str)), None) for own, found in named.items()}
 
     @property
     def keeps_sight(self) -> np.ndarray:

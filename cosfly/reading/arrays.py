@@ -58,6 +58,11 @@ def array_header(path: Path, *, what: str = "array", tree: Path | None = None) -
         return _header(file, path, what)
 
 
+def parse_array_header(data: bytes, where: str | Path, *, what: str = "array") -> ArrayHeader:
+    """Read the header of the bytes of a `.npy` file; raises as `array_header`."""
+    return _header(io.BytesIO(data), where, what)
+
+
 def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
     """Read a `.npy` file of a known type and number of dimensions.
 

@@ -82,6 +82,20 @@ def read_bytes(
         return file.read(size)
 
 
+def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str = CHECK_PATH) -> bytes:
+    """Read `size` bytes from byte `first` on of a file that the user named; raises as `read_bytes`, and where it ends before."""
+    if size > limits().file_mb * MB:
+        raise over_limit("file_mb", path, f"{size / MB:,.0f} MB", " MB")
+    with open_file(path, what=what, fix=fix) as file, disk_errors(path, what, fix):
+        file.seek(first)
+        data = file.read(size)
+    if len(data) != size:
+        raise InputError(
+            f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes", fix=fix
+        )
+    return data
+
+
 def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> str:
     """Read a whole file of UTF-8 text; raises as `read_bytes`, and for other text."""
     return decoded(read_bytes(path, what=what, fix=fix, tree=tree), path)

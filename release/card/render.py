@@ -17,8 +17,8 @@ from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED, Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
-from release.columns import CAPTION_LISTS, PICTURES, schema
-from release.record import CaptionNumbers, FramesBy, History, Numbers, ReleaseRecord
+from release.columns import PICTURES, schema
+from release.record import CaptionNumbers, FramesBy, History, Numbers, ReleaseRecord, shard_pattern
 
 FILE_TEXT: dict[FrameFile, str] = {
     "rgb": "`image`: colour, PNG",
@@ -55,7 +55,9 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "flights_table": _spreads(numbers),
         "visible": f"{_share(numbers.frames_target_visible, frames)} of the frames",
         "perturbed": f"{numbers.frames_perturbed:,} ({_share(numbers.frames_perturbed, frames)})",
-        "num_frames": str(settings.num_frames),
+        "num_frames": "all" if settings.num_frames is None else str(settings.num_frames),
+        "splits_table": _splits(record),
+        "split_rule": for_markdown(record.splits.rule),
         "frame_rule": for_markdown(record.frame_selection),
         "short_flights": str(numbers.flights_shorter_than_num_frames),
         "captions_with": f"{captions.frames_with:,}",
@@ -111,9 +113,28 @@ def _front_matter(record: ReleaseRecord) -> str:
         "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
-        "configs": [{"config_name": "default", "data_files": [{"split": "train", "path": "data/train-*.parquet"}]}],
+        "configs": [{"config_name": "default", "data_files": _data_files(record)}],
     }
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
+
+
+def _data_files(record: ReleaseRecord) -> list[dict[str, str]]:
+    """Give the pattern of each split's shards. It names the content: by it the library's cache tells one release from another."""
+    return [{"split": split, "path": shard_pattern(split, record.content_digest)} for split in record.splits.splits]
+
+
+def _splits(record: ReleaseRecord) -> str:
+    rows = [
+        (
+            split,
+            *(
+                f"{n:,}"
+                for n in (own.frames, own.captions, own.flights, own.trajectories, len(own.walks), len(own.towns))
+            ),
+        )
+        for split, own in record.splits.splits.items()
+    ]
+    return _table(("split", "frames", "captions", "flights", "trajectories", "walks", "towns"), rows)
 
 
 def _maps(record: ReleaseRecord) -> list[str]:
@@ -182,15 +203,18 @@ def _both_languages(cells: dict[str, str]) -> list[tuple[str, ...]]:
 
 def _funnel(history: History) -> str:
     planned, flights, captions = history.trajectories, history.flights, history.captions
-    rows = [("trajectories planned", planned.planned)]
-    rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned.dropped.items()]
-    rows += [("trajectories not rendered", planned.not_rendered), ("trajectories rendered", planned.rendered)]
-    rows += [("flights inspected", flights.inspected)]
+    rows: list[tuple[str, int]] = []
+    if planned is not None:
+        rows += [("trajectories planned", planned.planned)]
+        rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned.dropped.items()]
+        rows += [("trajectories not rendered", planned.not_rendered), ("trajectories rendered", planned.rendered)]
+    rows += [("flights found", flights.found), ("of these inspected", flights.inspected)]
     rows += [(f"flights left out: {reason}", count) for reason, count in flights.left_out.items()]
     rows += [("flights released", flights.released), ("captions made", captions.read)]
     rows += [(f"captions dropped: {reason}", count) for reason, count in captions.dropped.items()]
     rows += [
         ("captions accepted, frame not selected", captions.frame_not_selected),
+        ("captions accepted, window not whole", captions.window_not_whole),
         ("captions accepted, flight left out", captions.flight_left_out),
         ("captions released", captions.released),
     ]
@@ -206,8 +230,8 @@ def _columns(files: list[FrameFile]) -> str:
         elif kind.startswith("struct"):
             kind = "texts " if member.type[0].type == "string" else "numbers "
             kind += ", ".join(child.name for child in member.type)
-        elif member.name in CAPTION_LISTS:
-            kind = "list of int32"
+        elif kind.startswith("list"):
+            kind = f"list of {member.type.value_type}"
         rows.append((_Code(member.name), kind))
     return _table(("column", "type"), rows)
 

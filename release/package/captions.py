@@ -1,46 +1,194 @@
-"""Which captions go into a release: the accepted ones, by flight and frame, and an account of all."""
+"""Which captions go into a release: the accepted ones, by flight, and an account of all. Only places in the file are kept in memory."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.products.captions import FIELDS, Caption, read_captions
+from cosfly.products.captions import ACTIONS, FIELDS, Caption, caption_lines
 from cosfly.products.places import town_folder
-from release.columns import PICTURE_PX, WINDOW, ReleasedCaption
+from cosfly.products.playback import sample_id
+from cosfly.reading.documents import parse_document, parse_json, validation_errors
+from cosfly.reading.files import read_span
+from cosfly.store import dump_json
+from release.columns import (
+    CAPTION_COUNTS,
+    CAPTION_PROMPTS,
+    CAPTION_STATES,
+    LANGUAGES,
+    PICTURE_PX,
+    STATES,
+    WINDOW,
+    ReleasedCaption,
+)
+from release.package.publishable import published_name
 
-ByFlight = dict[
-    tuple[str, str, str], dict[int, ReleasedCaption]
-]  # town's folder, trajectory, variant -> frame -> caption
+FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
+Span = tuple[int, int]  # first byte and size of lines that stand one after the other
+MOST_SPAN_BYTES = 4_000_000  # of which the captions are in memory at once
 
 
-def load_captions(path: Path) -> tuple[ByFlight, Counter[str]]:
-    """Read the captions, without their prompts: the accepted ones, and how many were dropped for which reason.
+@dataclass
+class FlightCaptions:
+    """The accepted captions of a flight: where they stand, and which frames have one (one byte a frame)."""
 
-    Raises:
-        InputError: a frame has two accepted captions, or an accepted one lacks a language or disagrees with itself.
-    """
-    by_flight: ByFlight = {}
-    dropped = Counter[str]()
-    for caption in read_captions(path):
+    path: Path
+    has_caption: bytearray
+    spans: list[Span] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return sum(self.has_caption)
+
+    def add(self, first: int, size: int) -> None:
+        if self.spans and sum(self.spans[-1]) == first and self.spans[-1][1] + size <= MOST_SPAN_BYTES:
+            first, size = self.spans[-1][0], self.spans.pop()[1] + size
+        self.spans.append((first, size))
+
+    def read(self) -> Iterator[Caption]:
+        """Yield them as they stand; raises InputError where they cannot be read any more."""
+        for first, size in self.spans:
+            for line in read_span(self.path, first, size, what="captions").splitlines():
+                value = parse_document(line, self.path, what="line")
+                with validation_errors(self.path):
+                    yield Caption.model_validate(value)
+
+
+@dataclass
+class CaptionAccount:
+    """What all captions of a source say of where they come from."""
+
+    dropped: Counter[str] = field(default_factory=Counter)  # reason -> captions
+    accepted: int = 0
+    of_no_flight: int = 0  # accepted, of flights that are left out
+    window_frames: int = 1  # the longest window, from its first frame to its last
+    teachers: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # kind, model, settings as JSON
+    repairs: Counter[str] = field(default_factory=Counter)  # rung -> accepted captions that it made
+    tokens: Counter[str] = field(default_factory=Counter)
+    asks: int = 0
+
+    def add(self, caption: Caption) -> None:
+        settings = dump_json(caption.teacher.settings.model_dump(mode="json"))
+        self.teachers[caption.teacher.kind, published_name(caption.teacher.model), settings] += 1
+        self.tokens.update(caption.usage.model_dump())
+        self.asks += caption.attempts
         if caption.status != "accepted":
-            dropped[caption.drop_reason or "no reason given"] += 1
+            self.dropped[caption.drop_reason or "no reason given"] += 1
+            return
+        self.accepted += 1
+        self.window_frames = max(self.window_frames, max(caption.window) - min(caption.window) + 1)
+        if caption.repair is not None and caption.repair.outcome == "repaired":
+            self.repairs[caption.repair.rung or caption.repair.strategy] += 1
+
+    def __add__(self, other: CaptionAccount) -> CaptionAccount:
+        return CaptionAccount(
+            self.dropped + other.dropped,
+            self.accepted + other.accepted,
+            self.of_no_flight + other.of_no_flight,
+            max(self.window_frames, other.window_frames),
+            self.teachers + other.teachers,
+            self.repairs + other.repairs,
+            self.tokens + other.tokens,
+            self.asks + other.asks,
+        )
+
+
+def index_captions(
+    path: Path, lengths: dict[FlightKey, int], others: set[FlightKey], tell: Callable[[str, InputError], None]
+) -> tuple[dict[FlightKey, FlightCaptions], CaptionAccount]:
+    """Go over the captions once and note where those of each flight stand.
+
+    Args:
+        lengths: of the flights that are released, their frames; others: the flights of the tree that are left out.
+        tell: takes what is wrong with a caption, under its sample id.
+    Raises:
+        InputError: a line is no caption.
+    """
+    found = {key: FlightCaptions(path, bytearray(length)) for key, length in lengths.items()}
+    account, first = CaptionAccount(), 0
+    for line, caption in caption_lines(path):
+        size = len(line.encode())
+        begin, first = first, first + size
+        where = f"{path}: {caption.sample_id}"
+        key = (town_folder(caption.town), caption.trajectory, caption.variant)
+        problem = _no_place(caption, key, lengths, others, where)
+        if problem is None and caption.status == "accepted":
+            problem = _no_caption(caption, where)
+            if problem is None and key in found and found[key].has_caption[caption.frame_index]:
+                problem = InputError("a frame has two accepted captions", where=where)
+        if problem is not None:
+            tell(caption.sample_id, problem)
             continue
-        frames = by_flight.setdefault((town_folder(caption.town), caption.trajectory, caption.variant), {})
-        if caption.frame_index in frames:
-            raise InputError("a frame has two accepted captions", where=path, got=caption.sample_id)
-        frames[caption.frame_index] = _released(caption, f"{path}: {caption.sample_id}")
-    return by_flight, dropped
+        account.add(caption)
+        if caption.status == "accepted":
+            if key in found:
+                found[key].has_caption[caption.frame_index] = 1
+                found[key].add(begin, size)
+            else:
+                account.of_no_flight += 1
+    return found, account
 
 
-def _released(caption: Caption, where: str) -> ReleasedCaption:
+def _no_place(
+    caption: Caption, key: FlightKey, lengths: dict[FlightKey, int], others: set[FlightKey], where: str
+) -> InputError | None:
+    """Say why a caption is of no frame of the tree, None if it is of one."""
+    if key not in lengths and key not in others:
+        return InputError(
+            "a caption of a flight that is not there", where=where, got="/".join(key),
+            expected="a flight of the tree that is released", fix="give the captions that were made from this tree",
+        )  # fmt: skip
+    if not caption.sample_id.endswith(sample_id(f"{caption.trajectory}_{caption.variant}", caption.frame_index)):
+        return InputError(
+            "the id of a caption is not that of its frame", where=where, got=f"frame {caption.frame_index}"
+        )
+    if not 0 <= caption.frame_index < lengths.get(key, caption.frame_index + 1):
+        expected = f"0 to {lengths[key] - 1}" if key in lengths else "0 or more"
+        return InputError(
+            "a caption belongs to no frame", where=where, got=f"frame {caption.frame_index}", expected=expected
+        )
+    return None
+
+
+def _no_caption(caption: Caption, where: str) -> InputError | None:
+    """Say why an accepted caption cannot be released, None if it can."""
     if caption.en is None or caption.zh is None:
         fix = "release captions in both languages; English alone can be reported and train students"
-        raise InputError("an accepted caption lacks a language", where=where, fix=fix)
-    if caption.en.flight_decision != caption.zh.flight_decision:
-        got = f"{caption.en.flight_decision} and {caption.zh.flight_decision}"
-        raise InputError("the two languages decide differently", where=where, got=got)
+        return InputError("an accepted caption lacks a language", where=where, fix=fix)
+    decision = caption.en.flight_decision
+    if decision != caption.zh.flight_decision:
+        got = f"{decision} and {caption.zh.flight_decision}"
+        return InputError("the two languages decide differently", where=where, got=got)
+    for name, action in (("en.flight_decision", decision), ("label", caption.label)):
+        if action is not None and action not in ACTIONS:
+            return InputError("not an action of the closed set", where=f"{where}: {name}", got=action)
+    if caption.verdict == "CONSISTENT" and decision != caption.label:
+        return InputError(
+            "a decision is called consistent with another label", where=where, got=f"{decision}, {caption.label}"
+        )
+    window = caption.window
+    if not window or window[0] < 0 or window[-1] != caption.frame_index or window != sorted(set(window)):
+        expected = f"frames in order of time, the last one {caption.frame_index}"
+        return InputError("not the window of a caption", where=where, got=str(window)[:80], expected=expected)
+    if any(index <= caption.frame_index for index in caption.future):
+        return InputError("the future of a caption has begun", where=where, got=str(caption.future)[:80])
+    if any(language not in caption.prompt for language in LANGUAGES):
+        return InputError("an accepted caption lacks a prompt", where=where, got=", ".join(caption.prompt))
+    return None
+
+
+def released(caption: Caption) -> ReleasedCaption:
+    """Give what a row holds of an accepted caption."""
+    assert caption.en is not None
+    assert caption.zh is not None
+    states = caption.checks.sentences or {}
+    counts = [
+        states[language].count(state) if language in states else None for language in LANGUAGES for state in STATES
+    ]
+    prompts = [text for name in LANGUAGES for text in (caption.prompt[name].system, caption.prompt[name].user)]
     return {
         WINDOW: caption.window,
         PICTURE_PX: list(caption.picture_px),
@@ -50,10 +198,18 @@ def _released(caption: Caption, where: str) -> ReleasedCaption:
         "verdict": caption.verdict,
         "repair_strategy": caption.repair.strategy if caption.repair else None,
         "teacher_kind": caption.teacher.kind,
-        "teacher_model": caption.teacher.model,
+        "teacher_model": published_name(caption.teacher.model),
         "writing": caption.writing,
         "proved_en": caption.coverage("en"),
         "proved_zh": caption.coverage("zh"),
+        **dict(zip(CAPTION_COUNTS, counts, strict=True)),
+        **{name: states.get(language) for name, language in zip(CAPTION_STATES, LANGUAGES, strict=True)},
         **{f"caption_en_{name}": getattr(caption.en, name) for name in FIELDS},
         **{f"caption_zh_{name}": getattr(caption.zh, name) for name in FIELDS},
+        **dict(zip(CAPTION_PROMPTS, prompts, strict=True)),
     }
+
+
+def teacher_settings(text: str) -> dict:
+    """Read the settings of CaptionAccount.teachers."""
+    return parse_json(text)

@@ -1,4 +1,4 @@
-"""What goes into a release: the runs it is made of, their flights, maps, licence and captions, and what each flight is called."""
+"""What goes into a release: the runs it is made of, their flights, maps and licence, and what each flight is called."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel, read_inspection
 from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
+from cosfly.products.playback import find_flights
 from cosfly.products.town import read_town_map
-from cosfly.provenance import fingerprint, warn_unbound, was_made_of
+from cosfly.provenance import fingerprint, is_bound, was_made_of
 from cosfly.reading.files import check_stays_below
-from release.columns import ReleasedCaption
-from release.package.captions import ByFlight, load_captions
+from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
 Track = Literal["clean", "perturbed"]
@@ -23,12 +23,18 @@ Track = Literal["clean", "perturbed"]
 
 @dataclass(frozen=True)
 class Source:
-    """One run's part of a release: its name, playback tree, captions and inspection."""
+    """One run's part of a release: its name, playback tree, captions, and inspection where there is one."""
 
     run: str
     data: Path
     captions: Path
-    inspect: Path
+    inspect: Path | None = None
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Role -> what stands there."""
+        files = {"data": self.data, "captions": self.captions}
+        return files if self.inspect is None else {**files, "inspect": self.inspect}
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:
@@ -48,89 +54,109 @@ class Source:
         return cls.of_files(folder / "render", captions, inspected)
 
     @classmethod
-    def of_files(cls, data: Path, captions: Path, inspect: Path) -> Source:
+    def of_files(cls, data: Path, captions: Path, inspect: Path | None = None) -> Source:
         """Name a run by the folder that its tree stands in."""
         return cls(folder_name(data.absolute().parent.name), data, captions, inspect)
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """A flight to release: where it stands, what it is called, and its captions by frame.
+def input_names(sources: list[Source]) -> list[dict[str, str]]:
+    """Give of each source role -> name among the stage's inputs: of several with a number in front."""
+    return [
+        {role: f"{number}.{role}" if len(sources) > 1 else role for role in source.files}
+        for number, source in enumerate(sources, 1)
+    ]
 
-    sha256: of its files as they were inspected; None where the inspection does not say, or saw the tree in its older form.
+
+@dataclass(frozen=True)
+class Candidate:
+    """A flight that a source has: where it stands and what it is called.
+
+    left_out: why the inspection leaves it out, None where it does not. sha256: of its files as they were inspected; None where no
+    inspection says, or it saw the tree in its older form.
     """
 
+    source: int
     place: Place
     folder: Path
-    sha256: str | None
     flight_id: str
-    captions: dict[int, ReleasedCaption]
+    left_out: str | None = None
+    sha256: str | None = None
 
     @property
     def name(self) -> str:
         """Its name in the release's records."""
         return "/".join((self.place.run, self.place.town, self.place.trajectory, self.place.variant))
 
+    @property
+    def trajectory(self) -> str:
+        """What it shares with its twin."""
+        return "/".join((self.place.run, self.place.town, self.place.trajectory))
+
+    @property
+    def key(self) -> FlightKey:
+        """What its captions call it."""
+        return town_folder(self.place.town), self.place.trajectory, self.place.variant
+
 
 @dataclass(frozen=True)
 class Material:
-    """All that a release is made of, and the account of what is left out."""
+    """All flights of the sources, and what the inspections say of the way there. num_inspected: flights."""
 
-    chosen: list[Chosen]
-    left_out: dict[str, int]
-    inspected: int
-    trajectories: TrajectoryFunnel
-    captions: list[ByFlight]
-    dropped: Counter[str]
-    maps: list[ReleasedMap]
+    candidates: list[Candidate]
+    num_inspected: int
+    trajectories: TrajectoryFunnel | None
 
 
-def gather(sources: list[Source], tracks: tuple[Track, ...], *, include_review: bool) -> Material:
-    """Read inspections, captions and maps of the runs, and choose their flights.
+def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool) -> Material:
+    """Read the inspections of the runs, and list their flights; of a tree without one all.
 
     Raises:
-        InputError: a file cannot be read, or two flights cannot be told apart.
+        InputError: a file cannot be read, two flights cannot be told apart, or nobody says of which tree the captions were made.
     """
-    inspections = [read_inspection(source.inspect) for source in sources]
     wanted = ("accepted", "review") if include_review else ("accepted",)
-    places = [[_place(source, f) for f in one.flights] for source, one in zip(sources, inspections, strict=True)]
-    ids = flight_ids([place for group in places for place in group])
-    chosen, by_source, maps = list[Chosen](), list[ByFlight](), list[ReleasedMap]()
-    left_out, dropped = Counter[str](), Counter[str]()
-    for source, inspection, group in zip(sources, inspections, places, strict=True):
-        warn_unbound([source.captions, source.inspect])
+    found: list[tuple[int, Place, Path, str | None, str | None]] = []
+    inspections: list[Inspection] = []
+    for number, source in enumerate(sources):
+        if not accept_unbound and not is_bound(source.captions):
+            raise InputError(
+                "no record says of which tree these captions were made", where=source.captions,
+                expected="stage.json of the stage that made them beside the captions",
+                fix="give them where `cosfly caption` wrote them; if you know that they are of this tree, --set release.unbound=accept",
+            )  # fmt: skip
+        if source.inspect is None:
+            for folder in find_flights(source.data):
+                found.append((number, _place(source, folder.relative_to(source.data)), folder, None, None))
+            continue
+        inspection = read_inspection(source.inspect)
+        inspections.append(inspection)
         saw_older = was_made_of(source.inspect, "data") not in (None, fingerprint(source.data))
-        captions, dropped_here = load_captions(source.captions)
-        by_source.append(captions)
-        dropped += dropped_here
-        for flight, place in zip(inspection.flights, group, strict=True):
-            if flight.result not in wanted:
-                left_out[f"{flight.result}: {flight.reason}"] += 1
-            elif flight.track not in tracks:
-                left_out[f"track {flight.track} not wanted"] += 1
-            else:
-                folder = stand(source.data, flight.folder)
-                own = captions.get((town_folder(flight.town), flight.trajectory, flight.variant), {})
-                sha256 = None if saw_older else flight.sha256
-                chosen.append(Chosen(place, folder, sha256, ids[place], own))
-                shown = ReleasedMap(town=place.town, **dict(read_town_map(folder.parent.parent)))
-                if shown not in maps:
-                    maps.append(shown)
-    return Material(
-        chosen,
-        dict(sorted(left_out.items())),
-        sum(len(inspection.flights) for inspection in inspections),
-        _sum_of(inspections),
-        by_source,
-        dropped,
-        sorted(maps, key=lambda shown: (shown.town, shown.name)),
-    )
+        for flight in inspection.flights:
+            left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
+            folder = stand(source.data, flight.folder)
+            sha256 = None if saw_older else flight.sha256
+            found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256))
+    ids = flight_ids([place for _, place, *_ in found])
+    candidates = [
+        Candidate(number, place, folder, ids[place], left_out, sha256)
+        for number, place, folder, left_out, sha256 in found
+    ]
+    num_inspected = sum(len(inspection.flights) for inspection in inspections)
+    return Material(candidates, num_inspected, _sum_of(inspections) if inspections else None)
 
 
-def _place(source: Source, flight: FlightInspection) -> Place:
+def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
+    """Give the maps that flights show, each once.
+
+    Raises:
+        InputError: a map's file cannot be read.
+    """
+    towns = {(flight.place.town, flight.folder.parent.parent) for flight in candidates}
+    shown = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
+    return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
+
+
+def _inspected_place(source: Source, flight: FlightInspection, folder: Path) -> Place:
     """Tell a flight's place from where it stands now: its tree may have been converted since the inspection.
-
-    Folders above the town, in a tree of several, count as part of the run's name.
 
     Raises:
         InputError: the record of one flight has the folder of another.
@@ -141,8 +167,14 @@ def _place(source: Source, flight: FlightInspection) -> Place:
             "the record of one flight has the folder of another", where=source.inspect, got=flight.folder,
             expected=f"a folder that ends in {flight.trajectory}/{flight.variant}", fix="run cosfly inspect again",
         )  # fmt: skip
-    town = stand(source.data, flight.folder).parent.parent.name
-    return Place("_".join((source.run, *Path(flight.folder).parts[:-3])), town, flight.trajectory, flight.variant)
+    found = _place(source, Path(flight.folder))
+    return Place(found.run, folder.parent.parent.name, flight.trajectory, flight.variant)
+
+
+def _place(source: Source, folder: Path) -> Place:
+    """Tell a place by a flight's folder in its tree. Folders above the town, in a tree of several, count as part of the run's name."""
+    town, trajectory, variant = ("", "", *folder.parts)[-3:]
+    return Place("_".join((source.run, *folder.parts[:-3])), town, trajectory, variant)
 
 
 def _sum_of(inspections: list[Inspection]) -> TrajectoryFunnel:

@@ -1,54 +1,68 @@
-"""`cosfly release build`: accepted flights and captions to a folder that `datasets.load_dataset` opens.
+"""`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
-Reads the playback tree, `captions.jsonl` and `inspect.json` of one run or several; writes `dataset/` (parquet shards, README.md, release.json,
-checksums.sha256), which is what gets published. Around it stand the stage's own records, which hold local paths and do not.
+Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md, release.json,
+checksums.sha256), which is what gets published: all of it, or nothing. Around it stand the stage's own records, which hold local paths and do not.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from dataclasses import replace
+from collections import Counter, defaultdict
 from pathlib import Path
-from typing import IO, Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 import cosfly
 from cosfly.config import Config
-from cosfly.errors import InputError, VerifyError
+from cosfly.errors import CosflyError, InputError, VerifyError
 from cosfly.products.boxes import LicenceId
-from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
-from cosfly.products.playback import read_flight
-from cosfly.provenance import digest_of, folder_digests
+from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.provenance import read_stage_record
 from cosfly.reading.files import sha256_file
-from cosfly.reading.tables import num_rows, row_groups
-from cosfly.runner import Finished, Item, Outcome, Watch, Work, advance, run_items
-from cosfly.stage_folder import Resume, StageFolder, Tally, result_of
-from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes, write_checksums
+from cosfly.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
+from cosfly.store import CHECKSUMS, atomic_folder, write_bytes, write_checksums
 from release import columns
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
-from release.package.sources import Chosen, Material, Source, Track, choose_licence, gather
+from release.columns import SPLIT_NAMES, SplitName
+from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
+from release.package.depth import depth_record
+from release.package.origin import provenance_of
+from release.package.plan import PlannedShard, selected_bytes, shards_of
+from release.package.shards import ShardPlan, Written, write_shard
+from release.package.sources import Material, Source, Track, choose_licence, gather, input_names, maps_of
+from release.package.survey import Placing, Surveyed, check_alike, keep_pairs, place_flights, survey
 from release.record import (
     CaptionHistory,
+    DepthCodingName,
     FlightHistory,
     History,
+    Pairs,
     ReleasedFlight,
     ReleasedMap,
     ReleaseRecord,
     Settings,
     Shard,
+    SplitBy,
+    SplitNumbers,
+    Splits,
+    content_digest,
+    shard_path,
     write_record,
 )
-from release.subsample import RULE, select_frames
+from release.subsample import RULE
+from release.verify.verify import verify
 
 MB = 1024 * 1024
 DATASET, PARTS = "dataset", "parts"
-ANEW = "put the file back, or inspect and caption the tree as it is now"
+NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
+SPLIT_RULE = (
+    "whole walks (a walk: flights of one town, in any of its builds, whose person is at the same places at the same seconds), or whole towns; ranked "
+    "by sha256 of the seed and the name, the first to test, the next to validation, the rest to train, one at least for each split that has a share; "
+    "fewer than splits fill train, then validation"
+)
 
 
 class ReleaseConfig(Config):
@@ -59,15 +73,36 @@ class ReleaseConfig(Config):
         None, description="licence of the data set, as the hub spells it (cc-by-4.0); null: its maps', if they agree"
     )
     credits: str = Field("", description="who else must be named; the maps' own licences and credits always are")
-    num_frames: int = Field(
-        400, ge=1, description="frames per flight by stride selection; shorter flights are kept whole, never padded"
+    num_frames: int | None = Field(
+        400,
+        ge=1,
+        description="frames per flight, in evenly spread runs that keep captions' windows whole; shorter flights are whole, never padded; null: all",
     )
     tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
-    include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
-    modalities: tuple[FrameFile, ...] = Field(
-        tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth (lossless float32), instance"
+    pairs: Pairs = Field(
+        "both",
+        description="both: of two wanted tracks neither flight without the other; any: also flights whose twin is left out",
     )
-    shard_mb: int = Field(500, ge=1, description="size that a parquet file should not pass by more than one flight, MB")
+    include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
+    unbound: str = Field(
+        "refuse",
+        pattern="^(refuse|accept)$",
+        description="captions of which no record says from which tree they were made: refuse or accept",
+    )
+    split_by: SplitBy = Field("walk", description="what two splits may not share: a walk, or a town in all its builds")
+    validation_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
+    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
+    split_seed: int = Field(0, ge=0, description="seed of the division into splits")
+    modalities: tuple[FrameFile, ...] = Field(
+        tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth, instance"
+    )
+    depth: DepthCodingName = Field(
+        "float32",
+        description="float32: lossless; float16, or millimetre_png (16 bits, up to 65.5 m): smaller, the error is measured and stands in the record",
+    )
+    shard_mb: int = Field(
+        500, ge=1, description="size that a parquet file should not pass by more than one flight, MB before compression"
+    )
     row_group_mb: int = Field(
         64, ge=1, description="size of a row group before compression, MB; viewers load one at a time"
     )
@@ -79,168 +114,146 @@ class ReleaseConfig(Config):
             raise ValueError("an entry is listed twice")
         return values
 
+    @model_validator(mode="after")
+    def _fractions_leave_something(self) -> ReleaseConfig:
+        if self.validation_fraction + self.test_fraction >= 1.0:
+            raise ValueError("validation_fraction + test_fraction must stay below 1, or nothing is left to train on")
+        return self
 
-# --- one flight -------------------------------------------------------------------------------------------------------
-
-
-def part_name(item_id: str) -> str:
-    return item_id.replace("/", "__") + ".parquet"
-
-
-class Packaged(BaseModel):
-    """What was packaged of a flight: counts of frames and captions, and the size of its part."""
-
-    frames: int
-    frames_available: int
-    captions: int
-    captions_not_selected: int
-    bytes: int
+    @property
+    def fractions(self) -> dict[SplitName, float]:
+        train = round(1.0 - self.validation_fraction - self.test_fraction, 9)
+        return {"train": train, "validation": self.validation_fraction, "test": self.test_fraction}
 
 
-def write_part(path: Path, chosen: Chosen, cfg: ReleaseConfig) -> Packaged:
-    """Write one flight's selected frames as parquet, in row groups; give its counts.
+# --- what is wrong with the material ----------------------------------------------------------------------------------
+
+
+class _Findings:
+    """What is wrong with the material: all of it is looked for before the stage gives up."""
+
+    def __init__(self, stage: StageFolder) -> None:
+        self._stage, self.failures = stage, list[Failed]()
+
+    def tell(self, item_id: str, error: CosflyError) -> None:
+        self.failures.append(Failed(id=item_id, code=error.code, message=str(error)))
+
+    def check(self) -> None:
+        """Refuse to go on if anything is wrong.
+
+        Raises:
+            InputError, VerifyError: names the first findings; `failures.jsonl` has all.
+        """
+        if not self.failures:
+            return
+        path = self._stage.path / "failures.jsonl"
+        write_failures(path, self.failures)
+        listed = [failure.message for failure in self.failures[:NUM_NAMED]]
+        more = f" | and {len(self.failures) - NUM_NAMED} more, see {path}" if len(self.failures) > NUM_NAMED else ""
+        kind = VerifyError if all(failure.code == VerifyError.code for failure in self.failures) else InputError
+        raise kind(
+            f"nothing is released: {len(self.failures)} things are wrong with the material", where=self._stage.path,
+            got=" | ".join(listed) + more, fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
+        )  # fmt: skip
+
+
+# --- the material -----------------------------------------------------------------------------------------------------
+
+
+class _Plan(BaseModel):
+    """All that is decided before the first byte is written."""
+
+    model_config = {"arbitrary_types_allowed": True}
+
+    flights: list[tuple[Surveyed, FlightCaptions, int, int]]
+    placings: dict[str, Placing]
+    shards: list[PlannedShard]
+    account: CaptionAccount
+    material: Material
+    left_out: Counter[str]
+    window_frames: int
+
+
+def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> _Plan:
+    """Look at all of the material, and decide what goes where.
 
     Raises:
-        InputError: the flight or a file of it cannot be read, or a caption belongs to no frame of it.
-        VerifyError: a file is not the one that was inspected.
+        InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight.
     """
-    folder, captions = chosen.folder, chosen.captions
-    digests = _digests(chosen)
-    flight = replace(read_flight(folder), run=chosen.place.run, given_id=chosen.flight_id)
-    beyond = [index for index in captions if not 0 <= index < len(flight)]
-    if beyond:
-        expected = f"0 to {len(flight) - 1}: make the captions again from this tree"
-        raise InputError("a caption belongs to no frame", where=folder, got=f"frame {beyond[0]}", expected=expected)
-    selected = select_frames(len(flight), cfg.num_frames).tolist()
-    schema = columns.schema(cfg.modalities)
-    rows = (_checked(columns.row(flight, i, cfg.modalities, captions.get(i)), folder, digests, cfg) for i in selected)
-    with atomic_file(path) as file, open_writer(file, schema) as writer:
-        for batch in _batches(rows, cfg):
-            writer.write_table(pa.Table.from_pylist(batch, schema=schema), row_group_size=len(batch))
-    num_captions = sum(i in captions for i in selected)
-    return Packaged(
-        frames=len(selected),
-        frames_available=len(flight),
-        captions=num_captions,
-        captions_not_selected=len(captions) - num_captions,
-        bytes=path.stat().st_size,
-    )
-
-
-def _digests(chosen: Chosen) -> dict[str, str]:
-    """Give the sha256 of each file of a flight, once it is clear that they are those that were inspected.
-
-    Raises:
-        VerifyError: they are not.
-    """
-    digests = folder_digests(chosen.folder)
-    if chosen.sha256 not in (None, digest_of(digests)):
-        got, expected = digest_of(digests), f"{chosen.sha256}, as in the inspection"
-        raise VerifyError(
-            "the flight is not the one that was inspected", where=chosen.folder, got=got, expected=expected, fix=ANEW
+    findings = _Findings(stage)
+    material = gather(sources, include_review=cfg.include_review, accept_unbound=cfg.unbound == "accept")
+    flights, walks, left_out = survey(material.candidates, cfg.tracks, findings.tell)
+    flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, findings.tell)
+    left_out = left_out + without_twin
+    check_alike(flights, findings.tell)
+    captions, account = _index(sources, material, flights, findings)
+    findings.check()
+    if not flights:
+        tally = Tally(input=len(material.candidates), dropped=left_out)
+        raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
+    sized = [
+        (
+            flight,
+            captions[flight.name],
+            *selected_bytes(flight, cfg.modalities, cfg.num_frames, account.window_frames, findings.tell),
         )
-    name = "trajectory.json"
-    _compare(chosen.folder / name, sha256_file(chosen.folder / name), digests.get(name))
-    return digests
-
-
-def _compare(path: Path, got: str, expected: str | None) -> None:
-    if got != expected:
-        raise VerifyError("a file is not the one that was inspected", where=path, got=got, expected=expected, fix=ANEW)
-
-
-def _checked(row: dict[str, Any], folder: Path, digests: dict[str, str], cfg: ReleaseConfig) -> dict[str, Any]:
-    """Give a row whose pictures are those of the digests."""
-    for file in cfg.modalities:
-        name = f"{frame_name(row['frame_index'])}/{FILE_NAMES[file]}"
-        _compare(folder / name, sha256_bytes(columns.picture_bytes(row, file)), digests.get(name))
-    return row
-
-
-def _batches(rows: Iterator[dict[str, Any]], cfg: ReleaseConfig) -> Iterator[list[dict[str, Any]]]:
-    """Cut rows into groups of about `row_group_mb`."""
-    batch: list[dict[str, Any]] = []
-    num_bytes = 0
-    for row in rows:
-        advance()
-        batch.append(row)
-        for file in cfg.modalities:
-            num_bytes += len(columns.picture_bytes(row, file))
-        if num_bytes >= cfg.row_group_mb * MB:
-            yield batch
-            batch, num_bytes = [], 0
-    if batch:
-        yield batch
-
-
-def open_writer(file: Path | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
-    """Open a parquet file whose bytes depend on the rows alone.
-
-    PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
-    repeat their first bytes.
-    """
-    leaves: list[str] = []  # parquet's paths of the primitive columns
-    for member in schema:
-        inner = [child.name for child in member.type] if pa.types.is_struct(member.type) else []
-        inner = ["list.element"] if pa.types.is_list(member.type) else inner
-        leaves += [f"{member.name}.{name}" for name in inner] or [member.name]
-    compression = {name: "none" if name.endswith(".bytes") else "zstd" for name in leaves}
-    small = [name for name in leaves if name != "depth" and not name.endswith(".bytes")]
-    repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
-    return pq.ParquetWriter(
-        file, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6"
+        for flight in flights
+    ]
+    findings.check()
+    placings = place_flights(flights, walks, cfg.split_by, cfg.fractions, cfg.split_seed)
+    return _Plan(
+        flights=sized,
+        placings=placings,
+        shards=shards_of(sized, placings, cfg.shard_mb * MB),
+        account=account,
+        material=material,
+        left_out=left_out,
+        window_frames=account.window_frames,
     )
 
 
-# --- the shards -------------------------------------------------------------------------------------------------------
+def _index(
+    sources: list[Source], material: Material, flights: list[Surveyed], findings: _Findings
+) -> tuple[dict[str, FlightCaptions], CaptionAccount]:
+    """Find the captions of each flight, by its name."""
+    total, found = CaptionAccount(), dict[str, FlightCaptions]()
+    for number, source in enumerate(sources):
+        own = _by_key([flight for flight in flights if flight.candidate.source == number])
+        others: set[FlightKey] = {one.key for one in material.candidates if one.source == number} - own.keys()
+        lengths = {key: min(flight.num_frames for flight in group) for key, group in own.items()}
+        captions, account = index_captions(source.captions, lengths, others, findings.tell)
+        for key, of_flight in captions.items():
+            if len(own[key]) > 1 and of_flight.count:
+                names = ", ".join(flight.name for flight in own[key])
+                what = "captions that may be of any of several flights"
+                findings.tell(
+                    names, InputError(what, where=source.captions, got=names, fix="release their trees apart")
+                )
+            found |= {flight.name: of_flight for flight in own[key]}
+        total = total + account
+    return found, total
 
 
-def plan_shards(sizes: list[int], target_bytes: int) -> list[list[int]]:
-    """Group consecutive parts: a shard is closed as soon as it reaches the target."""
-    groups: list[list[int]] = []
-    total = 0
-    for index, size in enumerate(sizes):
-        if not groups or total >= target_bytes:
-            groups.append([])
-            total = 0
-        groups[-1].append(index)
-        total += size
+def _by_key(flights: list[Surveyed]) -> dict[FlightKey, list[Surveyed]]:
+    """Group flights by what their captions call them: of a tree with several towns of one name more than one."""
+    groups: dict[FlightKey, list[Surveyed]] = defaultdict(list)
+    for flight in flights:
+        groups[flight.candidate.key].append(flight)
     return groups
-
-
-def assemble_shards(parts: list[Path], folder: Path, cfg: ReleaseConfig) -> list[Path]:
-    """Copy the parts' row groups into `data/train-i-of-n.parquet`; memory holds one row group.
-
-    A part that fills a shard alone is linked, not copied.
-    """
-    groups = plan_shards([part.stat().st_size for part in parts], cfg.shard_mb * MB)
-    schema = columns.schema(cfg.modalities)
-    shards = []
-    (folder / "data").mkdir()
-    for number, group in enumerate(groups):
-        shard = folder / "data" / f"train-{number:05d}-of-{len(groups):05d}.parquet"
-        shards.append(shard)
-        if len(group) == 1:
-            try:
-                os.link(parts[group[0]], shard)
-            except OSError:  # the file system has no links
-                shutil.copyfile(parts[group[0]], shard)
-            continue
-        with open_writer(shard, schema) as writer:
-            for index in group:
-                for table in row_groups(parts[index], tree=parts[index].parent):
-                    writer.write_table(table, row_group_size=table.num_rows)
-    return shards
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def make_worker(cfg: ReleaseConfig, parts: Path) -> Work:
-    """Worker factory: give the function that packages one flight."""
+def part_path(parts: Path, name: str) -> Path:
+    return parts / f"{name}.parquet"
+
+
+def make_worker(plan: ShardPlan, parts: Path) -> Work:
+    """Worker factory: give the function that writes one shard."""
 
     def work(item: Item) -> Outcome:
-        return Outcome(write_part(parts / part_name(item.item_id), item.payload, cfg).model_dump())
+        return Outcome(write_shard(part_path(parts, item.item_id), item.payload, plan).model_dump())
 
     return work
 
@@ -254,108 +267,195 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the playback tree, the captions and the inspection of each run; write `dataset/` and give its path."""
+    """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and give its path.
+
+    Raises:
+        InputError, VerifyError: something is wrong with the material; nothing is published, and what was finished stays for the next run.
+    """
+    names = input_names(sources)
     inputs = {
-        f"{number}.{name}" if len(sources) > 1 else name: getattr(source, name)
-        for number, source in enumerate(sources, 1)
-        for name in ("data", "captions", "inspect")
+        name: source.files[role] for source, roles in zip(sources, names, strict=True) for role, name in roles.items()
     }
     stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0, resume=resume)
     dataset, parts = out / DATASET, out / PARTS
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)
         return dataset
-    material = gather(sources, cfg.tracks, include_review=cfg.include_review)
-    if not material.chosen:
-        tally = Tally(input=material.inspected, dropped=material.left_out)
-        raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
-    maps = [(shown.town, shown.licence) for shown in material.maps]
-    licence = choose_licence(cfg.licence, maps)  # before the work, not after it
-    items = [Item(chosen.name, chosen) for chosen in material.chosen]
-    finished = run_items(stage, items, make_worker, (cfg, parts), workers=workers, watch=watch, label="release")
-    results = {record.id: result_of(record, Packaged) for record in finished.kept}
-    if not results:
-        raise stage.nothing_kept(finished.tally)
-    _check_parts(parts, results)
-    history = account(material, finished)
+    shutil.rmtree(
+        dataset, ignore_errors=True
+    )  # of another attempt: until this one is whole, there is nothing to publish
+    plan = make_plan(cfg, sources, stage)
+    maps = maps_of([flight.candidate for flight, *_ in plan.flights])
+    licence = choose_licence(
+        cfg.licence, [(shown.town, shown.licence) for shown in maps]
+    )  # before the work, not after it
+    written = _write_parts(cfg, plan, stage, parts, workers, watch)
+    history = account_for(plan, written)
     with atomic_folder(dataset) as folder:
-        shards = assemble_shards([parts / part_name(item_id) for item_id in results], folder, cfg)
-        write_records(folder, make_record(shards, results, history, licence, material.maps, cfg))
+        shards = name_shards(plan.shards, written, parts, folder)
+        record = make_record(cfg, sources, plan, written, shards, history, licence, maps, folder, out)
+        write_records(folder, record)
+        _check_release(folder)
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
-    stage.finish(outputs, finished.tally, history=history.model_dump(mode="json"))
-    if not finished.tally.failed:  # or the next run, which does the failed flights again, would miss the others' parts
-        shutil.rmtree(parts, ignore_errors=True)
+    tally = Tally(input=history.flights.found, kept=history.flights.released, dropped=plan.left_out)
+    stage.finish(outputs, tally, history=history.model_dump(mode="json"))
+    shutil.rmtree(parts, ignore_errors=True)
     return dataset
 
 
-def _check_parts(parts: Path, results: dict[str, Packaged]) -> None:
-    for item_id, result in results.items():
-        path = parts / part_name(item_id)
-        if not path.is_file() or path.stat().st_size != result.bytes:
-            expected, fix = f"{result.bytes} bytes", f"remove {parts.parent} and run again"
-            what = "a part that was finished before is missing or has another size"
-            raise VerifyError(what, where=path, expected=expected, fix=fix)
+def _write_parts(
+    cfg: ReleaseConfig, plan: _Plan, stage: StageFolder, parts: Path, workers: int, watch: Watch
+) -> list[Written]:
+    """Write all shards that are not written yet.
 
-
-def account(material: Material, finished: Finished) -> History:
-    """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
-    results = [result_of(record, Packaged) for record in finished.kept]
-    gone = material.left_out | {f"failed: {code}": count for code, count in finished.tally.failed.items()}
-    accepted = sum(len(frames) for captions in material.captions for frames in captions.values())
-    released = sum(result.captions for result in results)
-    not_selected = sum(result.captions_not_selected for result in results)
-    history = History(
-        trajectories=material.trajectories,
-        flights=FlightHistory(inspected=material.inspected, released=len(results), left_out=gone),
-        captions=CaptionHistory(
-            read=accepted + material.dropped.total(),
-            dropped=dict(sorted(material.dropped.items())),
-            accepted=accepted,
-            released=released,
-            frame_not_selected=not_selected,
-            flight_left_out=accepted - released - not_selected,
-        ),
+    Raises:
+        InputError, VerifyError: a flight cannot be released.
+    """
+    how = ShardPlan(
+        num_frames=cfg.num_frames,
+        window_frames=plan.window_frames,
+        files=cfg.modalities,
+        depth=cfg.depth,
+        row_group_bytes=cfg.row_group_mb * MB,
     )
-    assert history.flights.inspected == len(results) + sum(gone.values()), history
-    assert history.captions.flight_left_out >= 0, history
-    return history
+    items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
+    finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release")
+    findings = _Findings(stage)
+    findings.failures += [record for record in finished.records if isinstance(record, Failed)]
+    findings.check()
+    written = [result_of(record, Written) for record in finished.kept]
+    for shard, result in zip(plan.shards, written, strict=True):
+        path = part_path(parts, shard.name)
+        if not path.is_file() or path.stat().st_size != result.bytes:
+            expected, fix = f"{result.bytes} bytes", f"remove {stage.path} and run again"
+            what = "a shard that was finished before is missing or has another size"
+            raise VerifyError(what, where=path, expected=expected, fix=fix)
+    return written
+
+
+def name_shards(planned: list[PlannedShard], written: list[Written], parts: Path, folder: Path) -> list[Shard]:
+    """Put the parts under their names in the release: linked, so that no byte moves and a kill costs nothing."""
+    digest = content_digest((shard.split, result.sha256) for shard, result in zip(planned, written, strict=True))
+    counts, numbers = Counter(shard.split for shard in planned), Counter[str]()
+    (folder / "data").mkdir()
+    shards = []
+    for shard, result in zip(planned, written, strict=True):
+        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
+        numbers[shard.split] += 1
+        part = part_path(parts, shard.name)
+        try:
+            os.link(part, folder / path)
+        except OSError:  # the file system has no links
+            shutil.copyfile(part, folder / path)
+        shards.append(Shard(path=path, split=shard.split, rows=result.rows, bytes=result.bytes, sha256=result.sha256))
+    return shards
+
+
+def _check_release(folder: Path) -> None:
+    """See that a release is one, before it has its name.
+
+    Raises:
+        VerifyError: names what is wrong.
+    """
+    report = verify(folder, pixels="none")
+    if not report.is_ok:
+        raise VerifyError("what was built does not verify, so it is not published", where=folder, got=str(report))
+
+
+# --- the records ------------------------------------------------------------------------------------------------------
+
+
+def account_for(plan: _Plan, written: list[Written]) -> History:
+    """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
+    flights = [flight for result in written for flight in result.flights]
+    account = plan.account
+    captions = CaptionHistory(
+        read=account.accepted + account.dropped.total(),
+        dropped=dict(sorted(account.dropped.items())),
+        accepted=account.accepted,
+        released=sum(flight.captions for flight in flights),
+        frame_not_selected=sum(flight.frame_not_selected for flight in flights),
+        window_not_whole=sum(flight.window_not_whole for flight in flights),
+        flight_left_out=account.of_no_flight,
+    )
+    parts = captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out
+    assert captions.accepted == parts, captions
+    found = FlightHistory(
+        found=len(plan.material.candidates),
+        inspected=plan.material.num_inspected,
+        released=len(flights),
+        left_out=dict(sorted(plan.left_out.items())),
+    )
+    assert found.found == len(flights) + plan.left_out.total(), found
+    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
+
+
+def splits_of(cfg: ReleaseConfig, plan: _Plan, written: list[Written]) -> Splits:
+    """Give what the record says of its splits."""
+    surveyed = {flight.name: flight for flight, *_ in plan.flights}
+    numbers: dict[SplitName, SplitNumbers] = {}
+    for split in SPLIT_NAMES:
+        own = [f for result in written for f in result.flights if plan.placings[f.name].split == split]
+        if own:
+            numbers[split] = SplitNumbers(
+                frames=sum(flight.frames for flight in own),
+                captions=sum(flight.captions for flight in own),
+                flights=len(own),
+                trajectories=len({surveyed[flight.name].candidate.trajectory for flight in own}),
+                walks=sorted({plan.placings[flight.name].walk for flight in own}),
+                towns=sorted({surveyed[flight.name].candidate.place.town for flight in own}),
+            )
+    return Splits(by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions, splits=numbers)
 
 
 def make_record(
-    shards: list[Path],
-    results: dict[str, Packaged],
+    cfg: ReleaseConfig,
+    sources: list[Source],
+    plan: _Plan,
+    written: list[Written],
+    shards: list[Shard],
     history: History,
     licence: str,
     maps: list[ReleasedMap],
-    cfg: ReleaseConfig,
+    folder: Path,
+    out: Path,
 ) -> ReleaseRecord:
     """Give what release.json says of its shards."""
-    listed = [
-        Shard(
-            path=f"data/{shard.name}",
-            rows=num_rows(shard),
-            bytes=shard.stat().st_size,
-            sha256=sha256_file(shard),
-        )
-        for shard in shards
-    ]
     return ReleaseRecord(
         name=cfg.name,
         licence=licence,
         credits=cfg.credits,
         maps=maps,
         made_by=f"cosfly {cosfly.__version__}",
-        settings=Settings(num_frames=cfg.num_frames, tracks=list(cfg.tracks), modalities=list(cfg.modalities)),
+        settings=Settings(
+            num_frames=cfg.num_frames,
+            window_frames=plan.window_frames,
+            tracks=list(cfg.tracks),
+            pairs=cfg.pairs,
+            modalities=list(cfg.modalities),
+        ),
         frame_selection=RULE,
+        depth=depth_record(cfg.depth, [result.depth for result in written]) if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
-        numbers=compute_numbers(shards, cfg.num_frames),
+        splits=splits_of(cfg, plan, written),
+        numbers=compute_numbers([folder / shard.path for shard in shards], cfg.num_frames),
         history=history,
+        provenance=provenance_of(sources, read_stage_record(out).inputs, plan.account),
         flights=[
-            ReleasedFlight(flight=item_id, frames=result.frames, frames_available=result.frames_available)
-            for item_id, result in results.items()
+            ReleasedFlight(
+                flight=flight.name,
+                frames=flight.frames,
+                frames_available=flight.frames_available,
+                split=plan.placings[flight.name].split,
+                walk=plan.placings[flight.name].walk,
+                pair=plan.placings[flight.name].pair,
+            )
+            for result in written
+            for flight in result.flights
         ],
-        shards=listed,
+        content_digest=content_digest((shard.split, shard.sha256) for shard in shards),
+        shards=shards,
     )
 
 

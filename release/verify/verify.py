@@ -26,7 +26,7 @@ from cosfly.store import CHECKSUMS, inside, read_checksums
 from release import columns
 from release.card.numbers import compute_numbers, read_rows
 from release.card.render import render_card
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_LISTS, CAPTION_SHARES, PICTURES, PLACE, POINT
+from release.columns import CAPTION_COLUMNS, CAPTION_FIELDS, CAPTION_LISTS, PICTURES, PLACE, POINT
 from release.record import ReleaseRecord, read_record
 from release.subsample import select_frames
 
@@ -178,17 +178,20 @@ def _check_numbers(paths: list[Path], record: ReleaseRecord, report: Report) -> 
 def _check_sums(record: ReleaseRecord, report: Report) -> None:
     """What the shards cannot tell must at least add up."""
     planned, flights, captions = record.history.trajectories, record.history.flights, record.history.captions
-    sums = (
-        ("trajectories.planned", planned.planned,
-         sum(planned.dropped.values()) + planned.not_rendered + planned.rendered),
-        ("trajectories.rendered", planned.rendered, planned.accepted + planned.review + planned.rejected),
-        ("flights.inspected", flights.inspected, flights.released + sum(flights.left_out.values())),
+    sums = [
+        ("flights.found", flights.found, flights.released + sum(flights.left_out.values())),
         ("flights.released", flights.released, record.numbers.flights),
         ("captions.read", captions.read, captions.accepted + sum(captions.dropped.values())),
         ("captions.accepted", captions.accepted,
-         captions.released + captions.frame_not_selected + captions.flight_left_out),
+         captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out),
         ("captions.released", captions.released, record.numbers.captions.frames_with),
-    )  # fmt: skip
+    ]  # fmt: skip
+    if planned is not None:
+        sums += (
+            ("trajectories.planned", planned.planned,
+             sum(planned.dropped.values()) + planned.not_rendered + planned.rendered),
+            ("trajectories.rendered", planned.rendered, planned.accepted + planned.review + planned.rejected),
+        )  # fmt: skip
     for name, whole, parts in sums:
         if whole != parts:
             report.error("sum", f"release.json: history.{name}", whole, f"{parts}, the sum of its parts")
@@ -239,7 +242,9 @@ def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> Non
         if flight not in flights:
             continue
         entry = flights[flight]
-        expected_indices = select_frames(entry.frames_available, record.settings.num_frames).tolist()
+        expected_indices = select_frames(
+            entry.frames_available, record.settings.num_frames, record.settings.window_frames
+        ).tolist()
         if indices != expected_indices or len(indices) != entry.frames:
             got = f"{len(indices)} frames, first {indices[:3]}"
             report.error("frames", flight, got, f"{len(expected_indices)} frames by the rule of release.json")
@@ -251,9 +256,7 @@ def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> Non
 def _check_caption(row: dict[str, Any], where: str, report: Report) -> None:
     """A row has a whole caption or none; its decision is of the closed set and the same in both languages."""
     if not row["has_caption"]:
-        present = [
-            name for name in (*CAPTION_FIELDS, *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_LISTS) if row[name] is not None
-        ]
+        present = [name for name in CAPTION_COLUMNS if row[name] is not None]
         if present:
             report.error("caption", f"{where}: {present[0]}", "a value", "null: has_caption is false")
         return

@@ -1,0 +1,220 @@
+"""Every flight read once, before anything is written: what it is, what it cannot be, and how flights divide into pairs and splits."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cosfly.console import progress_bar
+from cosfly.errors import InputError
+from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
+from cosfly.products.playback import Flight, read_flight
+from cosfly.splits import Course, Split, assign_splits, town_family, walks_of
+from release.columns import SplitName
+from release.package.sources import Candidate, Track
+from release.record import Pairs, SplitBy
+
+NAME_OF: dict[Split, SplitName] = {
+    "train": "train", "val": "validation", "test": "test",
+}  # fmt: skip
+MOST_NAMED = 3  # flights of each kind in a message
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """A flight that is released, as far as all of it must be known at once."""
+
+    candidate: Candidate
+    track: Track
+    num_frames: int
+    size_px: tuple[int, int]  # width, height
+    version: str  # schema and version of `trajectory.json`
+
+    @property
+    def name(self) -> str:
+        return self.candidate.name
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where a flight belongs: its walk, its split, and the name of its twin."""
+
+    walk: str
+    split: SplitName
+    pair: str | None
+
+
+Tell = Callable[[str, InputError], None]
+ALIKE: dict[str, Callable[[Surveyed], str]] = {
+    "size of pictures": lambda flight: "{} x {} px".format(*flight.size_px),
+    "version of trajectory.json": lambda flight: flight.version,
+}
+
+
+def survey(
+    candidates: list[Candidate], tracks: tuple[Track, ...], tell: Tell
+) -> tuple[list[Surveyed], dict[str, str], Counter[str]]:
+    """Read the flights that no inspection leaves out.
+
+    Args:
+        tell: takes what is wrong with a flight, under its name.
+    Returns:
+        flights of the wanted tracks; trajectory -> walk; why others are left out.
+    """
+    found: list[Surveyed] = []
+    left_out = Counter(one.left_out for one in candidates if one.left_out is not None)
+    wanted = [one for one in candidates if one.left_out is None]
+
+    def courses() -> Iterator[Course]:
+        with progress_bar("release: flights read", total=len(wanted)) as advance:
+            for candidate in wanted:
+                advance(1)
+                try:
+                    flight = open_flight(candidate)
+                    _check_frames(flight)
+                except InputError as error:
+                    tell(candidate.name, error)
+                    continue
+                track: Track = "clean" if flight.is_original else "perturbed"
+                if track not in tracks:
+                    left_out[f"track {track} not wanted"] += 1
+                    continue
+                camera = flight.camera
+                version = f"{flight.raw.get('schema')} {flight.raw.get('schema_version')}"
+                found.append(Surveyed(candidate, track, len(flight), (camera.width_px, camera.height_px), version))
+                yield Course(
+                    candidate.trajectory,
+                    candidate.place.town,
+                    flight.time_s,
+                    flight.targets_m - flight.target_offsets_m,
+                )
+
+    walks = walks_of(courses())
+    return found, walks, left_out
+
+
+def open_flight(candidate: Candidate) -> Flight:
+    """Read a candidate under the name that it has in the release.
+
+    Trees of ours are held to all of it, those of others to what the public layout demands of every reader.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    flight = read_flight(candidate.folder, strict=False)
+    if flight.is_ours and flight.issues:
+        flight = read_flight(candidate.folder)  # says what is wrong
+    return replace(flight, run=candidate.place.run, given_id=candidate.flight_id)
+
+
+def look_of(flight: Flight, i: int) -> np.ndarray | None:
+    """Give sun and air of a frame, (4,), None where there is no annotation or it does not say."""
+    folder = flight.frame_folder(i)
+    if not (folder / "meta.json").is_file():
+        return None
+    meta = read_meta(folder)
+    if meta.index != i:
+        raise InputError("the annotation is of another frame", where=folder / "meta.json", got=f"index {meta.index}")
+    return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
+
+
+def _check_frames(flight: Flight) -> None:
+    """See that a flight has a picture folder for each point, and for none beside them.
+
+    Raises:
+        InputError: it has not.
+    """
+    assert flight.folder is not None
+    folder = flight.folder / FRAMES_DIR
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    missing = [i for i in range(len(flight)) if frame_name(i).rpartition("/")[2] not in names]
+    if missing:
+        raise InputError(
+            "frames are missing", where=folder, got=f"{len(missing)} of {len(flight)}, the first {missing[0]}",
+            expected="a folder for each point of trajectory.json", fix="render them again, or have the inspection reject the flight",
+        )  # fmt: skip
+
+
+def keep_pairs(
+    flights: list[Surveyed], pairs: Pairs, tracks: tuple[Track, ...], tell: Tell
+) -> tuple[list[Surveyed], Counter[str]]:
+    """Leave out flights whose twin is not released, where both tracks are wanted and the flight's run has both.
+
+    Args:
+        tell: takes twins that are not of the same frames.
+    Returns:
+        the others, and why those are left out.
+    """
+    groups: dict[str, dict[str, Surveyed]] = defaultdict(dict)
+    for flight in flights:
+        if flight.track in groups[flight.candidate.trajectory]:
+            expected = "one flight of each track in a trajectory"
+            tell(
+                flight.name,
+                InputError(
+                    "two flights of one track", where=flight.candidate.folder, got=flight.track, expected=expected
+                ),
+            )
+        groups[flight.candidate.trajectory][flight.track] = flight
+    for group in groups.values():
+        lengths = {flight.num_frames for flight in group.values()}
+        if len(lengths) > 1:
+            got = ", ".join(f"{track} {flight.num_frames}" for track, flight in sorted(group.items()))
+            tell(next(iter(group.values())).name, InputError("twins of different lengths", got=f"{got} frames"))
+    if pairs == "any" or len(tracks) < 2:
+        return flights, Counter()
+    has_both = {
+        number
+        for number in {f.candidate.source for f in flights}
+        if len({f.track for f in flights if f.candidate.source == number}) > 1
+    }
+    kept, left_out = list[Surveyed](), Counter[str]()
+    for flight in flights:
+        if len(groups[flight.candidate.trajectory]) == 2 or flight.candidate.source not in has_both:
+            kept.append(flight)
+        else:
+            left_out["its twin is not released"] += 1
+    return kept, left_out
+
+
+def check_alike(flights: list[Surveyed], tell: Tell) -> None:
+    """See that all flights have pictures of one size and files of one version; `tell` takes what differs."""
+    for what, value_of in ALIKE.items():
+        groups: dict[str, list[str]] = defaultdict(list)
+        for flight in flights:
+            groups[value_of(flight)].append(flight.name)
+        if len(groups) > 1:
+            parts = (
+                f"{value}: {len(names)} flights, as {', '.join(names[:MOST_NAMED])}"
+                for value, names in sorted(groups.items())
+            )
+            error = InputError(
+                f"flights of more than one {what}",
+                got="; ".join(parts),
+                expected="the same for all flights of a release",
+            )
+            tell(min(groups.values(), key=len)[0], error)
+
+
+def place_flights(
+    flights: list[Surveyed], walks: dict[str, str], by: SplitBy, fractions: dict[SplitName, float], seed: int
+) -> dict[str, Placing]:
+    """Hand out whole walks, or whole towns, to splits: flight -> where it belongs. Too few of them fill train first, then validation."""
+    group_of = {
+        f.name: walks[f.candidate.trajectory] if by == "walk" else town_family(f.candidate.place.town) for f in flights
+    }
+    shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
+    splits = assign_splits(group_of.values(), shares, seed, too_few="fill", what=f"{by}s")
+    by_track = {(f.candidate.trajectory, f.track): f.name for f in flights}
+    other: dict[Track, Track] = {"clean": "perturbed", "perturbed": "clean"}
+    return {
+        f.name: Placing(
+            walks[f.candidate.trajectory],
+            NAME_OF[splits[group_of[f.name]]],
+            by_track.get((f.candidate.trajectory, other[f.track])),
+        )
+        for f in flights
+    }
