@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.logging import RichHandler
@@ -68,8 +68,14 @@ def set_levels(level: int) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
+class Advance(Protocol):
+    """Tells a bar that so much more is done, and what else is worth telling, which stands beside it until there is news."""
+
+    def __call__(self, count: int, told: str = "") -> None: ...
+
+
 @contextlib.contextmanager
-def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Callable[[int], None]]:
+def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advance]:
     """Show progress: a bar on a terminal, a log line every few seconds elsewhere; `total` None is not known. Yields advance(count)."""
     if console.is_terminal:
         columns = (
@@ -81,15 +87,20 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Calla
         )
         with Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task(label, total=total, completed=done)
-            yield lambda count: progress.advance(task, count)
+
+            def move(count: int, told: str = "") -> None:
+                progress.update(task, advance=count, description=f"{label}  {told}" if told else None)
+
+            yield move
         return
     position, last_s = done, time.monotonic()
 
-    def advance(count: int) -> None:
+    def advance(count: int, told: str = "") -> None:
         nonlocal position, last_s
         position += count
         if time.monotonic() - last_s >= SECONDS_BETWEEN_LINES:
             last_s = time.monotonic()
-            log.info("%s: %d%s", label, position, "" if total is None else f" of {total}")
+            of_all = "" if total is None else f" of {total}"
+            log.info("%s: %d%s%s", label, position, of_all, f", {told}" if told else "")
 
     yield advance

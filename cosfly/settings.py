@@ -25,7 +25,7 @@ from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.samples import PrepareConfig
-from distill.training.stage import TrainConfig
+from distill.training.settings import TrainConfig
 from release.package.stage import ReleaseConfig
 
 TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")

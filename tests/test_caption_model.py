@@ -15,7 +15,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from cosfly.errors import NothingKept
 from cosfly.products.captions import parse_answer, read_captions
-from distill.student.model import make_tiny_student
+from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
 
 if TYPE_CHECKING:

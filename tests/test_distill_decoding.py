@@ -17,7 +17,8 @@ from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 from distill.student import decoding  # noqa: E402
 from distill.student.decoding import Decoded, decode, image_features  # noqa: E402
 from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
-from distill.student.model import IMAGE_TOKEN, Student, load_student, make_tiny_student  # noqa: E402
+from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
+from distill.student.random_student import make_tiny_student  # noqa: E402
 
 MOST = 40  # tokens of an answer
 

@@ -30,8 +30,9 @@ from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.schema import open_split, resolve_trees  # noqa: E402
 from distill.student.checkpoint import ADAPTER_FACTS, adapter_facts, base_digests  # noqa: E402
 from distill.student.encoding import encode, prompt_batch  # noqa: E402
-from distill.student.model import Student, load_student, make_tiny_student  # noqa: E402
-from distill.training.stage import TARGET_MODULES  # noqa: E402
+from distill.student.model import Student, load_student  # noqa: E402
+from distill.student.random_student import make_tiny_student  # noqa: E402
+from distill.training.settings import TARGET_MODULES  # noqa: E402
 from specimens import make_playback_tree  # noqa: E402
 
 PIXELS = 64 * 64

@@ -19,7 +19,7 @@ ModelOption = Annotated[Path, typer.Option(help="Folder of the student's base mo
 @app.command("tiny-student")
 def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
     """Make a tiny, randomly initialised student, to try the way without weights."""
-    from distill.student.model import make_tiny_student
+    from distill.student.random_student import make_tiny_student
 
     typer.echo(make_tiny_student(out, seed))
 
@@ -61,7 +61,13 @@ def distill_prepare(
 @app.command("train")
 def distill_train(
     dataset: DatasetOption,
-    model: ModelOption,
+    student: Annotated[
+        str,
+        typer.Option(
+            help="Who learns: a model folder, the name of a repository as Qwen/Qwen3.5-2B, or, of random weights, tiny, tiny:small, "
+            "tiny:medium, random."
+        ),
+    ],
     out: options.Out,
     data: options.Trees = None,
     config: options.ConfigFile = None,
@@ -70,12 +76,12 @@ def distill_train(
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
-    """Train LoRA adapters; continues from its last checkpoint."""
+    """Train a student, LoRA or in full, in one process or many (torchrun); continues from its last checkpoint."""
     from distill.training import stage as train
 
     cfg, trees = options.resolve(config, overrides, {"seed": seed}), options.data_folders(data)
     options.verify_first(verify, dataset, *trees, out)
-    typer.echo(train.run(cfg.distill.train, dataset, trees, model, out, seed=cfg.seed, resume=resume))
+    typer.echo(train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=resume))
 
 
 @app.command("infer")

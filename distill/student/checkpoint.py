@@ -1,12 +1,14 @@
-"""What training leaves on disk: checkpoints to continue from, and adapters that say what they belong to.
+"""What training leaves on disk: checkpoints to continue from, adapters that say what they belong to, and whole models.
 
-Only safetensors and `torch.load(weights_only=True)`: nothing that a file could run.
+Tensors stand in safetensors, the rest in JSON: nothing that a file could run.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,26 +16,68 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_json, read_json, read_object, validation_errors
+from cosfly.reading.documents import parse_json, read_json, read_model, validation_errors
 from cosfly.reading.files import read_lines, sha256_file
-from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json
+from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_model
 from distill.student.model import Student, weight_files
 
 log = logging.getLogger(__name__)
 
 ADAPTER_FACTS = "cosfly_adapter.json"
+WEIGHTS, MOMENTS, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+CHECKPOINT_SCHEMA, VERSION = "cosfly.checkpoint", "2.0"
 
 
-def save_checkpoint(folder: Path, student: Student, optimizer: Any, step: int) -> None:
-    """Write adapter, optimizer state and step into `folder`, whole or not at all."""
-    import torch
+class Progress(BaseModel):
+    """How far a training is: what its checkpoint says beside the weights.
 
+    best_step: of the best validation, 0 before the first; stale: validations since then. unreadable: samples that were left out.
+    """
+
+    step: int = 0
+    best_step: int = 0
+    best_score: tuple[float, float] | None = None  # the larger, the better
+    stale: int = 0
+    has_ended: bool = False
+    unreadable: dict[str, str] = {}
+
+
+def learning_weights(student: Student) -> dict[str, Any]:
+    """Give what learns, by name: the matrices of an adapter, or the weights."""
+    return {name: p for name, p in student.model.named_parameters() if p.requires_grad}
+
+
+def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Progress) -> None:
+    """Write weights, optimizer state and progress into `folder`, whole or not at all.
+
+    Raises:
+        StorageError: the disk is full.
+    """
+    weights = learning_weights(student)
+    moments = {
+        f"{name}/{key}": value
+        for name, parameter in weights.items()
+        for key, value in optimizer.state.get(parameter, {}).items()
+    }
     with atomic_folder(folder) as partial:
-        student.model.save_pretrained(partial / "adapter")  # safetensors
-        torch.save(optimizer.state_dict(), partial / "optimizer.pt")
-        write_json(partial / "state.json", {"schema": "cosfly.checkpoint", "schema_version": "1.0", "step": step})
+        _save_tensors(partial / WEIGHTS, weights)
+        _save_tensors(partial / MOMENTS, moments)
+        write_model(partial / STATE, progress, schema=CHECKPOINT_SCHEMA, version=VERSION)
         files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
         write_checksums(partial, {str(path.relative_to(partial)): sha256_file(path) for path in files})
+
+
+def _save_tensors(path: Path, tensors: dict[str, Any]) -> None:
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    try:
+        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path)
+    except SafetensorError as error:  # the library's own name of what the system said
+        found = re.search(r"os error (\d+)", str(error))
+        if found is None:
+            raise
+        raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
@@ -49,21 +93,61 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def load_checkpoint(folder: Path, student: Student, optimizer: Any) -> int:
-    """Put a checkpoint's adapter and optimizer state into place and give its step."""
+def read_progress(folder: Path) -> Progress:
+    """Read how far a checkpoint is."""
+    return read_model(
+        folder / STATE, Progress, schema=CHECKPOINT_SCHEMA, version=VERSION, what="checkpoint", tree=folder
+    )
+
+
+def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Progress:
+    """Put a checkpoint's weights, and the optimizer's state where one is given, into place.
+
+    Raises:
+        InputError: it is of another student.
+    """
     import torch
-    from peft import set_peft_model_state_dict
     from safetensors.torch import load_file
 
-    set_peft_model_state_dict(student.model, load_file(folder / "adapter" / "adapter_model.safetensors"))
-    optimizer.load_state_dict(torch.load(folder / "optimizer.pt", weights_only=True, map_location=student.device))
-    return int(read_object(folder / "state.json", what="checkpoint")["step"])  # its checksums were compared
+    weights, found = learning_weights(student), load_file(folder / WEIGHTS)  # its checksums were compared
+    shapes, wanted = ({n: tuple(t.shape) for n, t in tensors.items()} for tensors in (found, weights))
+    if shapes != wanted:
+        name = next(iter({n for n in shapes.keys() | wanted.keys() if shapes.get(n) != wanted.get(n)}))
+        raise InputError(
+            "the checkpoint is of another student",
+            where=folder,
+            got=f"{name}: {shapes.get(name)}",
+            expected=f"{wanted.get(name)}",
+        )
+    with torch.no_grad():
+        for name, parameter in weights.items():
+            parameter.copy_(found[name])
+    if optimizer is not None:
+        moments: dict[str, dict[str, Any]] = {}
+        for key, value in load_file(folder / MOMENTS).items():
+            name, _, moment = key.rpartition("/")
+            moments.setdefault(name, {})[moment] = value
+        order = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        names = {id(parameter): name for name, parameter in weights.items()}
+        state = {i: moments[names[id(p)]] for i, p in enumerate(order) if names[id(p)] in moments}
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    return read_progress(folder)
 
 
-def drop_old_checkpoints(folder: Path, keep: int) -> None:
-    """Remove all but the newest checkpoints."""
+def drop_old_checkpoints(folder: Path, keep: int, best_step: int) -> None:
+    """Remove all but the newest checkpoints and the best."""
+    best = checkpoint_path(folder, best_step)
     for path in sorted(folder.glob("step_*"))[:-keep]:
-        shutil.rmtree(path)
+        if path != best:
+            leaving = path.with_name(
+                f".{path.name}.{os.getpid()}.partial"
+            )  # a kill in the middle leaves no half of one
+            os.replace(path, leaving)
+            shutil.rmtree(leaving)
+
+
+def checkpoint_path(folder: Path, step: int) -> Path:
+    return folder / f"step_{step:08d}"
 
 
 def cut_log(path: Path, num_steps: int) -> None:
@@ -107,6 +191,20 @@ def adapter_facts(student: Student, max_pixels: int, model: Path) -> dict[str, A
         "device": student.device,
         "versions": {"torch": torch.__version__, "transformers": transformers.__version__, "peft": peft.__version__},
     }
+
+
+def write_model_folder(student: Student, folder: Path, base: Path) -> None:
+    """Write a whole model that transformers and vLLM load: weights, and whatever else its base has, with the processor as it was used.
+
+    Args:
+        student: a model without an adapter beside its weights.
+    """
+    for path in sorted(base.iterdir()):
+        if path.is_file() and path.suffix in (".json", ".jinja", ".txt") and "safetensors" not in path.name:
+            shutil.copyfile(path, folder / path.name)
+    student.model.to(student.dtype).save_pretrained(folder)
+    student.tokenizer.save_pretrained(folder)
+    student.image_processor.save_pretrained(folder)
 
 
 def base_digests(model: Path) -> dict[str, str]:

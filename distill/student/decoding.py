@@ -143,7 +143,7 @@ class _Batch:
         import torch
         from transformers import StaticCache
 
-        self._head, self._core = _head(student), _core(student)
+        self._head, self._core, self._dtype = _head(student), _core(student), student.dtype
         self.rows = list(range(len(rows)))
         self._is_live = [True] * len(rows)
         inputs = prompt_batch(student, rows)
@@ -151,7 +151,7 @@ class _Batch:
         self._num_prompt, self._room = ids.shape[1], ids.shape[1] + max_tokens
         if features is None:
             features = _features(self._core, inputs["pixel_values"], grids)
-        embedded = self._core.get_input_embeddings()(ids)
+        embedded = self._core.get_input_embeddings()(ids).to(student.dtype)
         if features is not None:
             is_image = (ids == student.image_token_id)[..., None]
             embedded = embedded.masked_scatter(is_image, features.to(embedded.dtype))
@@ -211,7 +211,7 @@ class _Batch:
     def step(self) -> None:
         """Read the tokens taken last and compute the logits of the next."""
         self._mask.index_fill_(3, self._place, True)
-        embedded = self._core.get_input_embeddings()(self._tokens)
+        embedded = self._core.get_input_embeddings()(self._tokens).to(self._dtype)
         self.logits = self._logits(self._run(embedded, self._positions, self._mask, None))
         self._place.add_(1)
         self._positions.add_(1)

@@ -6,8 +6,9 @@ keeps the loss on the answer is exact by construction.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +21,23 @@ from cosfly.reading.arrays import array_header, picture_size
 from cosfly.store import inside
 from cosfly.student_chat import IMAGE_PART, chat_messages
 from distill.schema import Sample
-from distill.student.model import IMAGE_TOKEN, Student
+from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 
+END_OF_ANSWER = (
+    f"{END_OF_TURN}\n"  # what a chat template writes after an answer; the end of the turn is taught, the line is not
+)
 IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy
 
 
 @dataclass(frozen=True)
 class Encoded:
     """One sample as arrays: prompt_ids, answer_ids (n,) int64, the end token included in the answer; patches of all images
-    (p, d) float32 and their grids (k, 3) int64."""
+    (p, d) float32, None where a cache has their features, and their grids (k, 3) int64."""
 
     key: str
     prompt_ids: np.ndarray
     answer_ids: np.ndarray
-    pixel_values: np.ndarray
+    pixel_values: np.ndarray | None
     image_grids: np.ndarray
     weight: float
 
@@ -80,8 +84,9 @@ def image_size(path: Path) -> tuple[int, int]:
 # --- tokens -----------------------------------------------------------------------------------------------------------
 
 
-def _prompt_ids(student: Student, sample: Sample, tokens_per_image: Sequence[int]) -> np.ndarray:
-    text = student.tokenizer.apply_chat_template(
+def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence[int]) -> str:
+    """Give the prompt as the chat template writes it, without thinking, each picture's mark repeated for its tokens."""
+    text = processor.tokenizer.apply_chat_template(
         messages_of(sample), tokenize=False, add_generation_prompt=True, enable_thinking=False
     )
     pieces = text.split(IMAGE_TOKEN)
@@ -93,63 +98,109 @@ def _prompt_ids(student: Student, sample: Sample, tokens_per_image: Sequence[int
             expected=f"{len(tokens_per_image)}",
             fix=f"the prompt text may not hold {IMAGE_TOKEN}",
         )
-    expanded = pieces[0] + "".join(
+    return pieces[0] + "".join(
         IMAGE_TOKEN * count + piece for count, piece in zip(tokens_per_image, pieces[1:], strict=True)
     )
-    return np.array(student.tokenizer(expanded, add_special_tokens=False)["input_ids"], dtype=np.int64)
 
 
-def _answer_ids(student: Student, sample: Sample) -> np.ndarray:
-    ids = student.tokenizer(sample.answer, add_special_tokens=False)["input_ids"]
-    return np.array([*ids, student.end_token_id], dtype=np.int64)
+def chat_text(processor: Processor, sample: Sample) -> str:
+    """Give the whole chat, the answer in it, as the chat template writes it: what prompt, answer and end must add up to."""
+    answered = [*messages_of(sample), {"role": "assistant", "content": sample.answer}]
+    return processor.tokenizer.apply_chat_template(answered, tokenize=False, enable_thinking=False)
 
 
-def count_tokens(student: Student, sample: Sample) -> tuple[int, int]:
-    """Give the real numbers of (prompt, answer) tokens, images included, without loading a pixel."""
-    processor = student.image_processor
-    width_px, height_px = sample.picture_px
-    count = processor.get_number_of_image_patches(height_px, width_px, {}) // processor.merge_size**2
-    return len(_prompt_ids(student, sample, [count] * len(sample.images))), len(_answer_ids(student, sample))
+def special_token_in(processor: Processor, sample: Sample) -> str | None:
+    """Name a token of the chat's own that stands in a text of the sample: in an answer it would teach an early end, in a prompt
+    it would be a picture or a turn."""
+    texts = (sample.prompt.system, sample.prompt.user, sample.answer)
+    return next((t for t in processor.chat_tokens if any(t in text for text in texts)), None)
 
 
-def encode(student: Student, sample: Sample, trees: Mapping[str, Path]) -> Encoded:
-    """Make the arrays of one sample.
+def _answer_ids(processor: Processor, sample: Sample) -> np.ndarray:
+    ids = processor.tokenizer(sample.answer, add_special_tokens=False)["input_ids"]
+    return np.array([*ids, processor.end_token_id], dtype=np.int64)
+
+
+def picture_grid(processor: Processor, size_px: tuple[int, int]) -> tuple[int, int, int]:
+    """Give the grid of patches (1, rows, columns) that a picture of (width, height) px becomes."""
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
+
+    images, (width_px, height_px) = processor.image_processor, size_px
+    bounds = {"min_pixels": images.size["shortest_edge"], "max_pixels": images.size["longest_edge"]}
+    rows_px, columns_px = smart_resize(height_px, width_px, images.patch_size * images.merge_size, **bounds)
+    return 1, rows_px // images.patch_size, columns_px // images.patch_size
+
+
+def encode_text(processor: Processor, sample: Sample) -> Encoded:
+    """Make the arrays of one sample without looking at a pixel."""
+    grid = picture_grid(processor, sample.picture_px)
+    count = math.prod(grid) // processor.image_processor.merge_size**2
+    text = prompt_text(processor, sample, [count] * len(sample.images))
+    return Encoded(
+        key=sample.key,
+        prompt_ids=np.array(processor.tokenizer(text, add_special_tokens=False)["input_ids"], dtype=np.int64),
+        answer_ids=_answer_ids(processor, sample),
+        pixel_values=None,
+        image_grids=np.array([grid] * len(sample.images), dtype=np.int64).reshape(-1, 3),
+        weight=sample.weight,
+    )
+
+
+def patches_of(processor: Processor, pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Cut pictures, each (h, w, 3) uint8, into the patches that the vision tower takes: (p, d) float32, those of all in a row."""
+    if not pictures:
+        return np.zeros((0, 1), np.float32)
+    images = [Image.fromarray(picture) for picture in pictures]
+    return np.asarray(processor.image_processor(images, return_tensors="np")["pixel_values"], dtype=np.float32)
+
+
+def encode(processor: Processor, sample: Sample, trees: Mapping[str, Path]) -> Encoded:
+    """Make the arrays of one sample, its pictures among them.
 
     Raises:
         InputError: a picture of its playback tree cannot be read.
     """
-    images = [Image.fromarray(picture) for picture in load_pictures(sample, trees)]
-    vision = student.image_processor(images, return_tensors="np")
-    grids = np.asarray(vision["image_grid_thw"], dtype=np.int64)
-    counts = (grids.prod(axis=1) // student.image_processor.merge_size**2).tolist()
-    return Encoded(
-        key=sample.key,
-        prompt_ids=_prompt_ids(student, sample, counts),
-        answer_ids=_answer_ids(student, sample),
-        pixel_values=np.asarray(vision["pixel_values"], dtype=np.float32),
-        image_grids=grids,
-        weight=sample.weight,
-    )
+    pictures = load_pictures(sample, trees)
+    return replace(encode_text(processor, sample), pixel_values=patches_of(processor, pictures))
+
+
+def positions_of(processor: Processor, ids: np.ndarray, grids: np.ndarray) -> np.ndarray:
+    """Give the rotary positions of a row's tokens, (3, n) int64: time, height, width.
+
+    Text counts on by one in all three. A picture's tokens share the time at which it begins and count its rows and columns from there;
+    what follows begins after the longer side.
+    """
+    merge, positions, next_position, start = processor.image_processor.merge_size, [], 0, 0
+    marks = np.flatnonzero(ids == processor.image_token_id)
+    for _, rows, columns in (grids // [1, merge, merge]).tolist():
+        first, marks = int(marks[0]), marks[rows * columns :]
+        text = np.arange(next_position, next_position + first - start)
+        begin = next_position + len(text)
+        height, width = np.divmod(np.arange(rows * columns), columns)
+        positions += [np.tile(text, (3, 1)), begin + np.stack([np.zeros_like(height), height, width])]
+        next_position, start = begin + max(rows, columns), first + rows * columns
+    positions.append(np.tile(np.arange(next_position, next_position + len(ids) - start), (3, 1)))
+    return np.concatenate(positions, axis=1)
 
 
 # --- batches ----------------------------------------------------------------------------------------------------------
 
 
-def training_batch(student: Student, rows: Sequence[Encoded]) -> tuple[dict[str, Any], Any, Any]:
-    """Pad samples on the right: (model inputs, labels (b, n) with IGNORED outside the answers, weights (b,))."""
-    import torch
+def padded(student: Student, rows: Sequence[Encoded]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pad samples on the right: (tokens (b, n), labels (b, n) with IGNORED outside the answers, rotary positions (3, b, n)).
 
+    Causal layers, of either kind of attention, never see what stands on the right, so no mask is needed.
+    """
     length = max(len(row) for row in rows)
     ids = np.full((len(rows), length), student.pad_token_id, dtype=np.int64)
     labels = np.full((len(rows), length), IGNORED, dtype=np.int64)
-    mask = np.zeros((len(rows), length), dtype=np.int64)
+    positions = np.zeros((3, len(rows), length), dtype=np.int64)
     for i, row in enumerate(rows):
-        start = len(row.prompt_ids)
-        ids[i, : len(row)] = np.concatenate([row.prompt_ids, row.answer_ids])
-        labels[i, start : len(row)] = row.answer_ids
-        mask[i, : len(row)] = 1
-    weights = torch.tensor([row.weight for row in rows], dtype=torch.float32, device=student.device)
-    return _inputs(student, rows, ids, mask), torch.from_numpy(labels).to(student.device), weights
+        tokens = np.concatenate([row.prompt_ids, row.answer_ids])
+        ids[i, : len(row)] = tokens
+        labels[i, len(row.prompt_ids) : len(row)] = row.answer_ids
+        positions[:, i, : len(row)] = positions_of(student, tokens, row.image_grids)
+    return ids, labels, positions
 
 
 def prompt_batch(student: Student, rows: Sequence[Encoded]) -> dict[str, Any]:
@@ -170,9 +221,15 @@ def _inputs(student: Student, rows: Sequence[Encoded], ids: np.ndarray, mask: np
         "input_ids": ids,
         "attention_mask": mask,
         "mm_token_type_ids": (ids == student.image_token_id).astype(np.int64),  # 1 marks image tokens
-        "pixel_values": np.concatenate([row.pixel_values for row in rows]),
+        "pixel_values": patches_of_rows(rows),
         "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
     }
     tensors = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
-    tensors["pixel_values"] = tensors["pixel_values"].to(student.model.dtype)
+    tensors["pixel_values"] = tensors["pixel_values"].to(student.dtype)
     return tensors
+
+
+def patches_of_rows(rows: Sequence[Encoded]) -> np.ndarray:
+    """Put the patches of the pictures of all rows below each other: (p, d) float32."""
+    found = [row.pixel_values for row in rows if row.pixel_values is not None and len(row.pixel_values)]
+    return np.concatenate(found) if found else np.zeros((0, 1), np.float32)

@@ -1,30 +1,33 @@
-"""The student: a Qwen3.5 vision-language model from a local folder, its tokenizer and its image processor.
+"""The student: a vision-language model of Qwen3.5's structure (3.5, 3.6, 3.8), its tokenizer and its image processor.
 
 The processor is put together here from the tokenizer and the Pillow image processor, because the ready-made one needs
-torchvision and, without it, silently shrinks to the tokenizer. Nothing is ever downloaded.
+torchvision and, without it, silently shrinks to the tokenizer. Only `student_folder` reaches for a network, and only when it is
+given the name of a repository.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-import json
-from collections.abc import Iterable
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.chance import rng_for
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
-from cosfly.products.captions import ACTIONS, FIELDS
 from cosfly.reading.documents import read_json
-from cosfly.store import atomic_folder
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"
 END_OF_TURN = "<|im_end|>"
 IMAGE_TOKEN = "<|image_pad|>"
+# What the chat templates of Qwen3.5, 3.6 and 3.8 write, and a student must know as one token each.
+NEEDED_TOKENS = ("<|im_start|>", END_OF_TURN, "<|vision_start|>", "<|vision_end|>", IMAGE_TOKEN)
+HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
+MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt"]  # of a repository; none of them is code
 Device = Literal["auto", "cpu", "cuda"]
+Dtype = Literal["auto", "float32", "bfloat16"]
 
 
 def require(*packages: str) -> None:
@@ -47,13 +50,11 @@ def quiet_transformers() -> None:
 
 
 @dataclass
-class Student:
-    """A loaded student. `model` is a transformers model, or a peft model round one."""
+class Processor:
+    """What makes numbers of texts and pictures; without the model, so worker processes can have it."""
 
-    model: Any
     tokenizer: Any
     image_processor: Any
-    device: str
 
     @cached_property
     def end_token_id(self) -> int:
@@ -63,10 +64,69 @@ class Student:
     def image_token_id(self) -> int:
         return int(self.tokenizer.convert_tokens_to_ids(IMAGE_TOKEN))
 
+    @cached_property
+    def chat_tokens(self) -> tuple[str, ...]:
+        """What texts may not hold: tokens that are no text, but turns, pictures, thoughts and calls."""
+        return tuple(sorted({token.content for token in self.tokenizer.added_tokens_decoder.values()}))
+
     @property
     def pad_token_id(self) -> int:
         found = self.tokenizer.pad_token_id
         return self.end_token_id if found is None else int(found)
+
+
+@dataclass
+class Student(Processor):
+    """A loaded student. `model` is a transformers model, or a peft model round one; `dtype` is what it computes in, which weights
+    that are trained may exceed."""
+
+    model: Any
+    device: str
+    dtype: Any
+
+    @property
+    def core(self) -> Any:
+        """The transformers model itself, with the layers of an adapter in it where there is one."""
+        return self.model.get_base_model() if hasattr(self.model, "get_base_model") else self.model
+
+    @property
+    def tower(self) -> Any:
+        """The vision tower."""
+        return self.core.model.visual
+
+    def computing(self) -> contextlib.AbstractContextManager:
+        """Compute in `dtype`, whatever the weights are kept in; in float32 there is nothing to convert."""
+        import torch
+
+        if self.dtype == torch.float32:
+            return contextlib.nullcontext()
+        return torch.autocast(self.device, self.dtype)
+
+
+def student_folder(name: str) -> Path:
+    """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the hub's cache.
+
+    Raises:
+        InputError: there is no such folder, or the repository cannot be had.
+    """
+    if Path(name).is_dir() or not HUB_NAME.fullmatch(name) or name.startswith("."):
+        return Path(name)
+    require("torch", "transformers", "peft")
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(name, allow_patterns=MODEL_FILES))
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # of the hub's client: no network, no such repository, no permission
+        raise InputError(
+            "no such folder, and the repository of that name cannot be loaded",
+            where="--student",
+            got=f"{name}: {type(error).__name__}: {error}"[:300],
+            fix="check name and network, or download it elsewhere and give its folder",
+        ) from error
 
 
 def weight_files(folder: Path) -> dict[str, Path]:
@@ -82,7 +142,7 @@ def weight_files(folder: Path) -> dict[str, Path]:
             "not a student that cosfly knows",
             where=f"{folder / 'config.json'}: model_type",
             got=repr(found),
-            expected=f"{MODEL_TYPE!r}, for instance Qwen3.5-2B, or a folder made by cosfly distill tiny-student",
+            expected=f"{MODEL_TYPE!r}, for instance Qwen3.5-2B, 3.6 or 3.8, or a folder made by cosfly distill tiny-student",
         )
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
@@ -106,13 +166,32 @@ def pick_device(wanted: Device) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
 
 
-def load_student(folder: Path, *, device: Device = "auto", max_pixels: int, adapter: Path | None = None) -> Student:
-    """Load a model folder, bfloat16 on an accelerator and float32 on a CPU, with an adapter if one is given.
+def compute_dtype(wanted: Dtype, device: str) -> Any:
+    """Give torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told otherwise."""
+    import torch
+
+    if wanted == "auto":
+        return torch.bfloat16 if device == "cuda" else torch.float32
+    return getattr(torch, wanted)
+
+
+def load_student(
+    folder: Path,
+    *,
+    device: Device = "auto",
+    dtype: Dtype = "auto",
+    max_pixels: int,
+    adapter: Path | None = None,
+    is_trained: bool = False,
+) -> Student:
+    """Load a model folder, with an adapter if one is given.
 
     Args:
+        dtype: what it computes in; auto is bfloat16 on an accelerator and float32 on a CPU.
         max_pixels: images with more pixels are scaled down, sides to multiples of the patch.
+        is_trained: keep the weights in float32 in any case, for an optimizer.
     Raises:
-        InputError: the folder does not hold a whole Qwen3.5 model, or the adapter does not fit it.
+        InputError: the folder does not hold a whole model of Qwen3.5's structure, or the adapter does not fit it.
         EnvironmentMissing: torch, transformers or peft is missing.
     """
     require("torch", "transformers", "peft")
@@ -124,12 +203,12 @@ def load_student(folder: Path, *, device: Device = "auto", max_pixels: int, adap
     from transformers import AutoModelForImageTextToText
 
     device_name = pick_device(device)
-    dtype = torch.bfloat16 if device_name == "cuda" else torch.float32
+    computed = compute_dtype(dtype, device_name)
     tokenizer, image_processor = load_processor(folder, max_pixels)
     model: Any
     try:
         model = AutoModelForImageTextToText.from_pretrained(
-            folder, dtype=dtype, local_files_only=True, use_safetensors=True
+            folder, dtype=torch.float32 if is_trained else computed, local_files_only=True, use_safetensors=True
         )
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
@@ -142,7 +221,36 @@ def load_student(folder: Path, *, device: Device = "auto", max_pixels: int, adap
             model = PeftModel.from_pretrained(model, adapter)
     except (OSError, RuntimeError, ValueError, SafetensorError) as error:
         raise InputError("the student does not load", where=adapter or folder, got=str(error)[:300]) from error
-    return Student(model.to(device_name), tokenizer, image_processor, device_name)
+    student = Student(tokenizer, image_processor, model, device_name, computed)
+    check_tokens_fit(student, folder)
+    try:
+        model.to(device_name)
+    except torch.OutOfMemoryError as error:
+        raise EnvironmentMissing(
+            "the weights do not fit into the accelerator's memory", where=folder, got=str(error)[:120]
+        ) from error
+    return student
+
+
+def check_tokens_fit(student: Student, folder: Path) -> None:
+    """Check that tokenizer and weights are of one model.
+
+    Raises:
+        InputError: the tokenizer knows more tokens than the model, or another one for pictures.
+    """
+    known, room = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
+    if known > room:
+        raise InputError(
+            "the tokenizer knows more tokens than the model", where=folder, got=f"{known}", expected=f"<= {room}"
+        )
+    wanted = student.core.config.image_token_id
+    if student.image_token_id != wanted:
+        raise InputError(
+            f"the tokenizer and the model call {IMAGE_TOKEN} differently",
+            where=folder,
+            got=f"token {student.image_token_id}",
+            expected=f"token {wanted} (image_token_id in config.json)",
+        )
 
 
 def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
@@ -163,156 +271,15 @@ def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
     if not tokenizer.chat_template:
         raise InputError("the tokenizer has no chat template", where=folder, expected="chat_template.jinja")
     known = tokenizer.get_vocab()
-    for token in (END_OF_TURN, IMAGE_TOKEN):
-        if token not in known:
-            raise InputError("the tokenizer lacks a token", where=folder, expected=token)
-    smallest = min(int(image_processor.size["shortest_edge"]), max_pixels)  # areas in pixels, in spite of the names
+    missing = [token for token in NEEDED_TOKENS if token not in known]
+    if missing:
+        raise InputError(
+            "the tokenizer lacks tokens that a chat with pictures needs", where=folder, expected=", ".join(missing)
+        )
     side_px = image_processor.patch_size * image_processor.merge_size
     if max_pixels < side_px**2:
         raise ConfigError("too small for one patch", where="max_pixels", got=max_pixels, expected=f">= {side_px**2}")
-    image_processor.size = {"shortest_edge": smallest, "longest_edge": max_pixels}
+    own = image_processor.size  # areas in pixels, in spite of the names
+    largest = min(int(own["longest_edge"]), max_pixels)
+    image_processor.size = {"shortest_edge": min(int(own["shortest_edge"]), largest), "longest_edge": largest}
     return tokenizer, image_processor
-
-
-# --- a student without weights ----------------------------------------------------------------------------------------
-
-_CHAT_TEMPLATE = (
-    "{%- for m in messages %}{{ '<|im_start|>' + m.role + '\n' }}"
-    "{%- if m.content is string %}{{ m.content }}"
-    "{%- else %}{%- for c in m.content %}"
-    "{%- if c.type == 'image' %}{{ '<|vision_start|><|image_pad|><|vision_end|>' }}{%- else %}{{ c.text }}{%- endif %}"
-    "{%- endfor %}{%- endif %}{{ '<|im_end|>\n' }}{%- endfor %}"
-    "{%- if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{%- endif %}"
-)
-_SPECIAL_TOKENS = (
-    "<|endoftext|>", "<|im_start|>", END_OF_TURN, "<|vision_start|>", "<|vision_end|>", IMAGE_TOKEN, "<|video_pad|>",
-)  # fmt: skip
-# Enough text for a small vocabulary whose longer pieces are words of drone captions.
-_TOKENIZER_TEXT = (
-    '{"critical_components":"the pedestrian is visible in the image at a distance of metres ahead of the drone",',
-    '"reasoning_trace":"the target turns left so the drone should turn left to keep it in the centre of the view",',
-    '{"critical_components":"目标行人在画面中央，无人机保持距离，左侧有建筑物","reasoning_trace":"行人向右转弯，因此无人机应右转跟随",',
-    "frame position velocity visibility true false drone target world depth camera yaw pitch roll five frames JSON object",
-)
-
-
-def make_tiny_student(folder: Path, seed: int = 0) -> Path:
-    """Write a randomly initialised Qwen3.5 student of about 0.3 million parameters, so that all of distillation runs anywhere.
-
-    It has the architecture of the real ones (three linear-attention layers to one of full attention, a vision tower, a
-    byte-level tokenizer trained on a few lines), knows nothing, and overfits a handful of captions within minutes on a CPU.
-
-    Returns:
-        `folder`, with config.json, model.safetensors, tokenizer and preprocessor files.
-    Raises:
-        InputError: the folder exists and is not empty.
-        EnvironmentMissing: torch or transformers is missing.
-    """
-    require("torch", "transformers")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError("the folder is not empty", where=folder, fix="choose another --out")
-    import torch
-    from transformers import Qwen3_5ForConditionalGeneration
-    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-
-    quiet_transformers()
-    tokenizer = _tiny_tokenizer((*_TOKENIZER_TEXT, " ".join(FIELDS), " ".join(ACTIONS)))
-    image_processor = Qwen2VLImageProcessorPil(
-        patch_size=16,
-        merge_size=2,
-        temporal_patch_size=2,
-        image_mean=[0.5] * 3,
-        image_std=[0.5] * 3,
-        size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280},  # areas in pixels
-    )
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng_for(seed, "distill.tiny_student", "weights").integers(2**31)))
-        model = Qwen3_5ForConditionalGeneration(_tiny_config(tokenizer))
-        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding| = 8 * 1, hence the
-        # loss by about 0.29 nats; twice the length lets a student be sure of an answer.
-        with torch.no_grad():
-            model.model.language_model.embed_tokens.weight.mul_(2.0)
-    with atomic_folder(folder) as partial:
-        model.save_pretrained(partial)
-        tokenizer.save_pretrained(partial)
-        image_processor.save_pretrained(partial)
-    return folder
-
-
-def _tiny_tokenizer(lines: Iterable[str]) -> Any:
-    from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
-    from transformers.models.qwen3_5.tokenization_qwen3_5 import PRETOKENIZE_REGEX, Qwen3_5Tokenizer
-
-    bpe = Tokenizer(models.BPE())
-    bpe.normalizer = normalizers.NFC()
-    bpe.decoder = decoders.ByteLevel()
-    bpe.pre_tokenizer = pre_tokenizers.Sequence(
-        [
-            pre_tokenizers.Split(Regex(PRETOKENIZE_REGEX), "isolated"),
-            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
-        ]
-    )
-    trainer = trainers.BpeTrainer(
-        vocab_size=800, initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()), show_progress=False
-    )
-    bpe.train_from_iterator(lines, trainer)
-    state: dict[str, Any] = json.loads(bpe.to_str())["model"]
-    tokenizer = Qwen3_5Tokenizer(
-        vocab=state["vocab"],
-        merges=[tuple(merge) for merge in state["merges"]],  # type: ignore[misc]  # pairs, as the library wants them
-        eos_token=END_OF_TURN,
-        pad_token=_SPECIAL_TOKENS[0],
-        model_max_length=32768,
-    )
-    tokenizer.add_special_tokens({"extra_special_tokens": list(_SPECIAL_TOKENS[1:])})
-    tokenizer.chat_template = _CHAT_TEMPLATE
-    return tokenizer
-
-
-def _tiny_config(tokenizer: Any) -> Any:
-    from transformers import Qwen3_5Config
-
-    ids = {token: tokenizer.convert_tokens_to_ids(token) for token in _SPECIAL_TOKENS}
-    rope = {
-        "rope_type": "default",
-        "rope_theta": 1e4,
-        "partial_rotary_factor": 0.5,
-        "mrope_section": [2, 1, 1],
-        "mrope_interleaved": True,
-    }
-    text = {
-        "vocab_size": len(tokenizer),
-        "hidden_size": 64,
-        "intermediate_size": 128,
-        "num_hidden_layers": 4,
-        "num_attention_heads": 4,
-        "num_key_value_heads": 2,
-        "head_dim": 16,
-        "linear_key_head_dim": 16,
-        "linear_value_head_dim": 16,
-        "linear_num_key_heads": 2,
-        "linear_num_value_heads": 4,
-        "layer_types": ["linear_attention"] * 3 + ["full_attention"],
-        "tie_word_embeddings": True,
-        "initializer_range": 0.125,  # 1 / sqrt(hidden size); the usual 0.02 is for wide models
-        "rope_parameters": rope,
-        "eos_token_id": ids[END_OF_TURN],
-        "pad_token_id": ids["<|endoftext|>"],
-    }
-    vision = {
-        "depth": 2,
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_heads": 2,
-        "out_hidden_size": 64,
-        "num_position_embeddings": 64,
-    }
-    return Qwen3_5Config(
-        text_config=text,
-        vision_config=vision,
-        image_token_id=ids[IMAGE_TOKEN],
-        video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"],
-        vision_end_token_id=ids["<|vision_end|>"],
-        tie_word_embeddings=True,
-    )

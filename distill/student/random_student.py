@@ -1,0 +1,206 @@
+"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on a data set.
+
+So all of distillation runs anywhere, and experiments can ask what a student learns that knows nothing before.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from cosfly.chance import rng_for
+from cosfly.config import Config
+from cosfly.errors import InputError
+from cosfly.products.captions import ACTIONS, FIELDS
+from cosfly.store import atomic_folder
+from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
+
+TINY, RANDOM = "tiny", "random"  # what `--student` may say beside folders and names of repositories
+_CHAT_TEMPLATE = (
+    "{%- for m in messages %}{{ '<|im_start|>' + m.role + '\n' }}"
+    "{%- if m.content is string %}{{ m.content }}"
+    "{%- else %}{%- for c in m.content %}"
+    "{%- if c.type == 'image' %}{{ '<|vision_start|><|image_pad|><|vision_end|>' }}{%- else %}{{ c.text }}{%- endif %}"
+    "{%- endfor %}{%- endif %}{{ '<|im_end|>\n' }}{%- endfor %}"
+    "{%- if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{%- endif %}"
+)
+_SPECIAL_TOKENS = (
+    "<|endoftext|>", "<|im_start|>", END_OF_TURN, "<|vision_start|>", "<|vision_end|>", IMAGE_TOKEN, "<|video_pad|>",
+)  # fmt: skip
+# Enough text for a small vocabulary whose longer pieces are words of drone captions.
+_TOKENIZER_TEXT = (
+    '{"critical_components":"the pedestrian is visible in the image at a distance of metres ahead of the drone",',
+    '"reasoning_trace":"the target turns left so the drone should turn left to keep it in the centre of the view",',
+    '{"critical_components":"目标行人在画面中央，无人机保持距离，左侧有建筑物","reasoning_trace":"行人向右转弯，因此无人机应右转跟随",',
+    "frame position velocity visibility true false drone target world depth camera yaw pitch roll five frames JSON object",
+    " ".join(FIELDS),
+    " ".join(ACTIONS),
+)
+HEAD_WIDTH = 16  # of the attention heads of small students; wide ones have Qwen3.5's
+WIDE_HEAD_WIDTH = 128
+WIDE = 512
+
+
+class RandomStudent(Config):
+    """Settings of a student of random weights."""
+
+    width: int = Field(64, ge=32, multiple_of=32, description="width of the language model")
+    layers: int = Field(
+        4, ge=4, multiple_of=4, description="its layers; three of four have linear attention, as in Qwen3.5"
+    )
+    vision_width: int = Field(32, ge=32, multiple_of=32, description="width of the vision tower")
+    vision_layers: int = Field(2, ge=1, description="layers of the vision tower")
+    vocabulary: int = Field(800, ge=300, description="tokens of the tokenizer, before the special ones")
+
+
+PRESETS = {
+    TINY: RandomStudent(),
+    f"{TINY}:small": RandomStudent(width=256, layers=8, vision_width=128, vision_layers=4, vocabulary=4096),
+    f"{TINY}:medium": RandomStudent(width=512, layers=12, vision_width=256, vision_layers=8, vocabulary=8192),
+}
+
+
+def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
+    """Give the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any other name.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    if name == RANDOM:
+        return given
+    if name.startswith(f"{TINY}:") and name not in PRESETS:
+        raise InputError("no such student", where="--student", got=name, expected=", ".join([*PRESETS, RANDOM]))
+    return PRESETS.get(name)
+
+
+def make_tiny_student(folder: Path, seed: int = 0) -> Path:
+    """Write a student of about 0.3 million parameters that overfits a handful of captions within minutes on a CPU."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError("the folder is not empty", where=folder, fix="choose another --out")
+    return make_random_student(folder, PRESETS[TINY], seed)
+
+
+def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iterable[str] = ()) -> Path:
+    """Write a randomly initialised student: three layers of linear attention to one of full attention, a vision tower.
+
+    Args:
+        texts: what its byte-level tokenizer is trained on, beside a few lines of our own.
+    Returns:
+        `folder`, with config.json, model.safetensors, tokenizer and preprocessor files.
+    Raises:
+        EnvironmentMissing: torch or transformers is missing.
+    """
+    require("torch", "transformers")
+    import torch
+    from transformers import Qwen3_5ForConditionalGeneration
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+    quiet_transformers()
+    tokenizer = _tokenizer((*_TOKENIZER_TEXT, *texts), cfg.vocabulary)
+    image_processor = Qwen2VLImageProcessorPil(
+        patch_size=16,
+        merge_size=2,
+        temporal_patch_size=2,
+        image_mean=[0.5] * 3,
+        image_std=[0.5] * 3,
+        size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280},  # areas in pixels
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng_for(seed, "distill.tiny_student", "weights").integers(2**31)))
+        model = Qwen3_5ForConditionalGeneration(model_config(cfg, tokenizer))
+        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding| = sqrt(width) * 1,
+        # hence the loss by about 0.29 nats in the smallest; twice the length lets a student be sure of an answer.
+        with torch.no_grad():
+            model.model.language_model.embed_tokens.weight.mul_(2.0)
+    with atomic_folder(folder) as partial:
+        model.save_pretrained(partial)
+        tokenizer.save_pretrained(partial)
+        image_processor.save_pretrained(partial)
+    return folder
+
+
+def _tokenizer(lines: Iterable[str], vocabulary: int) -> Any:
+    from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
+    from transformers.models.qwen3_5.tokenization_qwen3_5 import PRETOKENIZE_REGEX, Qwen3_5Tokenizer
+
+    bpe = Tokenizer(models.BPE())
+    bpe.normalizer = normalizers.NFC()
+    bpe.decoder = decoders.ByteLevel()
+    bpe.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Split(Regex(PRETOKENIZE_REGEX), "isolated"),
+            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
+        ]
+    )
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocabulary, initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()), show_progress=False
+    )
+    bpe.train_from_iterator(lines, trainer)
+    state: dict[str, Any] = json.loads(bpe.to_str())["model"]
+    tokenizer = Qwen3_5Tokenizer(
+        vocab=state["vocab"],
+        merges=[tuple(merge) for merge in state["merges"]],  # type: ignore[misc]  # pairs, as the library wants them
+        eos_token=END_OF_TURN,
+        pad_token=_SPECIAL_TOKENS[0],
+        model_max_length=32768,
+    )
+    tokenizer.add_special_tokens({"extra_special_tokens": list(_SPECIAL_TOKENS[1:])})
+    tokenizer.chat_template = _CHAT_TEMPLATE
+    return tokenizer
+
+
+def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
+    """Give the library's configuration of a student: heads and rotary sections as wide as its width allows."""
+    from transformers import Qwen3_5Config
+
+    ids = {token: tokenizer.convert_tokens_to_ids(token) for token in _SPECIAL_TOKENS}
+    head = WIDE_HEAD_WIDTH if cfg.width >= WIDE else HEAD_WIDTH
+    heads = max(2, cfg.width // head)
+    section = head // 16  # of half of the rotary half of a head: a quarter each for height and width, the rest for time
+    rope = {
+        "rope_type": "default",
+        "rope_theta": 1e4,
+        "partial_rotary_factor": 0.5,
+        "mrope_section": [head // 4 - 2 * section, section, section],
+        "mrope_interleaved": True,
+    }
+    text = {
+        "vocab_size": len(tokenizer),
+        "hidden_size": cfg.width,
+        "intermediate_size": 2 * cfg.width,
+        "num_hidden_layers": cfg.layers,
+        "num_attention_heads": heads,
+        "num_key_value_heads": heads // 2,
+        "head_dim": head,
+        "linear_key_head_dim": head,
+        "linear_value_head_dim": head,
+        "linear_num_key_heads": heads // 2,
+        "linear_num_value_heads": heads,
+        "layer_types": (["linear_attention"] * 3 + ["full_attention"]) * (cfg.layers // 4),
+        "tie_word_embeddings": True,
+        "initializer_range": cfg.width**-0.5,  # the usual 0.02 is for wide models
+        "rope_parameters": rope,
+        "eos_token_id": ids[END_OF_TURN],
+        "pad_token_id": ids["<|endoftext|>"],
+    }
+    vision = {
+        "depth": cfg.vision_layers,
+        "hidden_size": cfg.vision_width,
+        "intermediate_size": 2 * cfg.vision_width,
+        "num_heads": max(2, cfg.vision_width // 64),
+        "out_hidden_size": cfg.width,
+        "num_position_embeddings": 64,
+    }
+    return Qwen3_5Config(
+        text_config=text,
+        vision_config=vision,
+        image_token_id=ids[IMAGE_TOKEN],
+        video_token_id=ids["<|video_pad|>"],
+        vision_start_token_id=ids["<|vision_start|>"],
+        vision_end_token_id=ids["<|vision_end|>"],
+        tie_word_embeddings=True,
+    )

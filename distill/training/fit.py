@@ -1,0 +1,252 @@
+"""The loop: steps, validations, checkpoints, and what is told of them.
+
+Every random choice derives from (seed, epoch) or (seed, step, process), so a run that was killed and continued takes the same steps as
+one that was not; the checkpoint needs no generator state.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cosfly.chance import rng_for
+from cosfly.console import progress_bar
+from cosfly.errors import ConfigError, InputError
+from cosfly.store import dump_json, storage_errors
+from distill.schema import Sample
+from distill.student.checkpoint import (
+    Progress,
+    checkpoint_path,
+    cut_log,
+    drop_old_checkpoints,
+    learning_weights,
+    load_checkpoint,
+    newest_checkpoint,
+    save_checkpoint,
+)
+from distill.student.model import Student
+from distill.training.census import Census
+from distill.training.loading import Ready, Supply
+from distill.training.loss import answer_loss
+from distill.training.memory import used_gb
+from distill.training.ranks import Ranks
+from distill.training.settings import TrainConfig
+from distill.training.steps import STAGE, Steps, is_validated, learning_rate_at, share_of
+from distill.training.validation import Validation, validate
+
+log = logging.getLogger(__name__)
+
+LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
+
+
+@dataclass
+class Lesson:
+    """A student, what it learns from, and what it is asked about. Positions in `census` name samples of `samples`."""
+
+    student: Student
+    samples: Sequence[Sample]
+    census: Census
+    validation_samples: Sequence[Sample]
+    validation_census: Census
+    supply: Supply
+    cfg: TrainConfig
+    ranks: Ranks
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.steps = Steps.make(self.cfg, len(self.census), self.seed)
+        self._position_of = {int(index): position for position, index in enumerate(self.census.indices)}
+
+    def validate(self) -> Validation | None:
+        if not len(self.validation_census):
+            return None
+        return validate(
+            self.student, self.validation_samples, self.validation_census, self.supply, self.cfg, self.ranks
+        )
+
+    def steps_from(self, first: int) -> Iterator[Ready]:
+        """Yield this process's rows of each step from one on, longest first."""
+        lengths, ranks = self.census.tokens, self.ranks
+        shares = (
+            (step, self.census.indices[share_of(self.steps.samples_of(step), lengths, ranks.rank, ranks.size)].tolist())
+            for step in range(first, self.steps.num_steps)
+        )
+        return self.supply.steps(self.samples, lambda index: self.census.pictures_of(self._position_of[index]), shares)
+
+
+@contextlib.contextmanager
+def seeded(student: Student, seed: int, item_id: str) -> Iterator[None]:
+    """Let torch's generators start from (seed, item), and be as before after it."""
+    import torch
+
+    devices = [torch.cuda.current_device()] if student.device == "cuda" else []
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(int(rng_for(seed, STAGE, item_id).integers(2**31)))
+        yield
+
+
+def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
+    import torch
+
+    parameters = list(learning_weights(student).values())
+    is_fused = student.device == "cuda"
+    return torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=cfg.weight_decay, fused=is_fused)
+
+
+def train_step(lesson: Lesson, optimizer: Any, ready: Ready, rate: float) -> dict[str, Any]:
+    """Take one optimizer step over what all processes have ready, `batch_size` samples at a time.
+
+    Returns:
+        loss (nats an answer token, weighted), gradient_norm, answer_tokens, tokens, samples: of all processes.
+    Raises:
+        ConfigError: loss or gradient are not finite. InputError: no sample of the step could be read.
+    """
+    import torch
+
+    cfg, student, rows = lesson.cfg, lesson.student, ready.rows
+    student.model.train()
+    parameters = list(learning_weights(student).values())
+    own_nats = 0.0
+    for start in range(0, len(rows), cfg.batch_size):
+        batch = rows[start : start + cfg.batch_size]
+        features = lesson.supply.features.of([picture for row in batch for picture in row.pictures])
+        nats, _ = answer_loss(student, [row.encoded for row in batch], features, cfg.logit_chunk)
+        nats.backward()
+        own_nats += float(nats.detach())
+    own = [row.encoded for row in rows]
+    own_weight = sum(len(row.answer_ids) * row.weight for row in own)
+    own_counts = [float(sum(len(row.answer_ids) for row in own)), float(sum(map(len, own))), float(len(own))]
+    lesson.ranks.add_gradients(parameters)
+    total, weight, answers, tokens, samples = lesson.ranks.total([own_nats, own_weight, *own_counts])
+    if not weight:
+        raise InputError("no sample of a step could be read", where=STAGE, fix="mend the pictures that the log names")
+    for parameter in parameters:
+        if parameter.grad is not None:
+            parameter.grad /= weight
+    norm = float(torch.nn.utils.clip_grad_norm_(parameters, cfg.max_gradient_norm or math.inf))
+    if not math.isfinite(total) or not math.isfinite(norm):
+        raise ConfigError(
+            "the loss or its gradient is not finite",
+            where="learning_rate",
+            got=f"{cfg.learning_rate}",
+            fix="lower learning_rate and choose another --out; the last checkpoint stays usable",
+        )
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+    counts = {"answer_tokens": int(answers), "tokens": int(tokens), "samples": int(samples)}
+    return {"loss": total / weight, "gradient_norm": norm, **counts}
+
+
+def fit(lesson: Lesson, out: Path) -> Progress:
+    """Train, from the newest checkpoint of `out` if there is one, and leave the student with the weights that are the product.
+
+    Writes `log.jsonl` and `checkpoints/` in `out`.
+    """
+    ranks, cfg, folder = lesson.ranks, lesson.cfg, out / CHECKPOINTS
+    optimizer = make_optimizer(lesson.student, cfg)
+    newest = ranks.first_does(lambda: newest_checkpoint(folder))
+    progress = load_checkpoint(newest, lesson.student, optimizer) if newest else Progress()
+    if progress.step:
+        log.info("%s: continuing after step %d of %d", STAGE, progress.step, lesson.steps.num_steps)
+    ranks.first_does(partial(cut_log, out / LOG, progress.step if newest else -1))
+    with contextlib.ExitStack() as stack:
+        note = stack.enter_context(_notebook(out / LOG)) if ranks.is_first else _keep_nothing
+        if newest is None and (found := lesson.validate()) is not None:
+            note({"step": 0, "validation": found.model_dump()})
+            log.info("%s: before the first step: %s", STAGE, found)
+        if not progress.has_ended:
+            progress = _run_steps(lesson, optimizer, progress, out, note)
+    best = checkpoint_path(folder, progress.best_step)
+    if cfg.keep == "best" and progress.best_step not in (0, progress.step):
+        load_checkpoint(best, lesson.student)
+        log.info("%s: the weights after step %d are kept, whose validation was the best", STAGE, progress.best_step)
+    return progress
+
+
+def _run_steps(
+    lesson: Lesson, optimizer: Any, progress: Progress, out: Path, note: Callable[[dict[str, Any]], None]
+) -> Progress:
+    cfg, ranks, num_steps, folder = lesson.cfg, lesson.ranks, lesson.steps.num_steps, out / CHECKPOINTS
+    begun_s, first = time.monotonic(), progress.step
+    step_begun_s = begun_s
+    with progress_bar(STAGE, total=num_steps, done=first) as advance:
+        for ready in lesson.steps_from(first):
+            step, rate = ready.step, learning_rate_at(cfg, ready.step, num_steps)
+            with seeded(lesson.student, lesson.seed, f"step_{step}_{ranks.rank}"):
+                facts = train_step(lesson, optimizer, ready, rate)
+            done, now_s = step + 1, time.monotonic()
+            speed = _speed(lesson, facts, now_s - step_begun_s, (now_s - begun_s) / (done - first) * (num_steps - done))
+            record = {"step": done, "epoch": step // lesson.steps.steps_per_epoch, "learning_rate": rate, **facts}
+            note({**record, "speed": speed})
+            left_out = {key: why for part in ranks.gathered(ready.left_out) for key, why in part.items()}
+            for key in left_out.keys() - progress.unreadable.keys():
+                log.warning("%s is left out: %s", key, left_out[key])
+            progress = progress.model_copy(update={"step": done, "unreadable": progress.unreadable | left_out})
+            is_asked = is_validated(cfg, lesson.steps, done)
+            if is_asked and (found := lesson.validate()) is not None:
+                note({"step": done, "validation": found.model_dump()})
+                progress = judged(progress, found, cfg.patience)
+                log.info("%s: after step %d: %s", STAGE, done, found)
+            is_last = done == num_steps or progress.has_ended
+            if is_last or is_asked or done % cfg.save_every_steps == 0:
+                ranks.first_does(partial(_save, lesson.student, optimizer, progress, folder, cfg))
+            advance(1, f"loss {facts['loss']:.4f}, {speed['tokens_per_s']:.0f} tokens/s, {speed['memory_gb']:.1f} GB")
+            if is_last:
+                break
+            step_begun_s = time.monotonic()
+    return progress
+
+
+def judged(progress: Progress, found: Validation, patience: int) -> Progress:
+    """Take a validation into account: is it the best, and has there been none better for too long."""
+    if progress.best_score is None or found.score > progress.best_score:
+        return progress.model_copy(update={"best_step": progress.step, "best_score": found.score, "stale": 0})
+    stale = progress.stale + 1
+    has_ended = bool(patience) and stale >= patience
+    if has_ended:
+        log.info(
+            "%s: %d validations in a row were not better than that after step %d", STAGE, stale, progress.best_step
+        )
+    return progress.model_copy(update={"stale": stale, "has_ended": has_ended})
+
+
+def _save(student: Student, optimizer: Any, progress: Progress, folder: Path, cfg: TrainConfig) -> None:
+    save_checkpoint(checkpoint_path(folder, progress.step), student, optimizer, progress)
+    drop_old_checkpoints(folder, cfg.keep_checkpoints, progress.best_step)
+
+
+def _speed(lesson: Lesson, facts: dict[str, Any], seconds: float, left_s: float) -> dict[str, float]:
+    """Give what a step took: seconds with the wait for its data, rates over all processes, memory of this one."""
+    return {
+        "seconds": round(seconds, 4),
+        "waited_share": round(min(1.0, lesson.supply.waited_s / max(seconds, 1e-9)), 4),
+        "tokens_per_s": round(facts["tokens"] / max(seconds, 1e-9), 1),
+        "samples_per_s": round(facts["samples"] / max(seconds, 1e-9), 3),
+        "memory_gb": round(used_gb(lesson.student.device), 3),
+        "left_s": round(left_s, 1),
+    }
+
+
+@contextlib.contextmanager
+def _notebook(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Give a function that appends a record to the log."""
+    with storage_errors(path), open(path, "a", encoding="utf-8") as file:
+
+        def note(record: dict[str, Any]) -> None:
+            file.write(dump_json(record) + "\n")
+            file.flush()
+
+        yield note
+
+
+def _keep_nothing(_: dict[str, Any]) -> None:
+    """What processes but the first do with records."""

@@ -1,0 +1,128 @@
+"""The loss: negative log-likelihood of answer tokens, without a table of logits for all of them at once.
+
+With a vocabulary of 248,320 the logits of one token take a megabyte, and plain training keeps three such tables for every token of a
+batch. Here they exist for a chunk of answer tokens at a time: loss and gradient of the chunk are computed together, and only what has
+the width of the network is kept (the idea of fused linear cross-entropy, as in Hsu et al. 2024, Liger Kernel).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from cosfly.errors import ConfigError
+from distill.student.encoding import IGNORED, Encoded, padded
+from distill.student.model import Student
+
+
+@cache
+def _chunked_loss() -> Any:
+    """Give the function of autograd; made on first use, because torch is imported where it is used."""
+    import torch
+
+    class ChunkedLoss(torch.autograd.Function):
+        """nats (n,) of targets under softmax(hidden @ head.T), and weight @ nats, which alone has a gradient."""
+
+        @staticmethod
+        def forward(
+            ctx: Any, hidden: Any, head: Any, targets: Any, weights: Any, chunk: int, dtype: Any
+        ) -> tuple[Any, Any]:
+            wants_hidden, wants_head = ctx.needs_input_grad[:2]
+            head_used = head.to(dtype)
+            nats = torch.empty(len(targets), dtype=torch.float32, device=hidden.device)
+            hidden_gradient = torch.empty_like(hidden) if wants_hidden else None
+            head_gradient = torch.zeros_like(head, dtype=torch.float32) if wants_head else None
+            for start in range(0, len(targets), chunk):
+                part = slice(start, start + chunk)
+                used = hidden[part].to(dtype)
+                logits = (used @ head_used.T).float()
+                normalizers = torch.logsumexp(logits, dim=-1)
+                rows = torch.arange(len(logits), device=logits.device)
+                nats[part] = normalizers - logits[rows, targets[part]]
+                if not (wants_hidden or wants_head):
+                    continue
+                gradient = logits.sub_(normalizers[:, None]).exp_()  # softmax, in the place of the logits
+                gradient[rows, targets[part]] -= 1.0
+                gradient = gradient.mul_(weights[part, None]).to(dtype)
+                if hidden_gradient is not None:
+                    hidden_gradient[part] = (gradient @ head_used).to(hidden.dtype)
+                if head_gradient is not None:
+                    head_gradient += (gradient.T @ used).float()
+            ctx.save_for_backward(hidden_gradient, head_gradient)
+            ctx.head_dtype = head.dtype
+            ctx.mark_non_differentiable(nats)
+            return (weights * nats).sum(), nats
+
+        @staticmethod
+        def backward(ctx: Any, total_gradient: Any, _: Any) -> tuple[Any, ...]:
+            hidden_gradient, head_gradient = ctx.saved_tensors
+            for_hidden = None if hidden_gradient is None else hidden_gradient * total_gradient
+            for_head = None if head_gradient is None else (head_gradient * total_gradient).to(ctx.head_dtype)
+            return for_hidden, for_head, None, None, None, None
+
+    return ChunkedLoss
+
+
+def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: int, dtype: Any) -> tuple[Any, Any]:
+    """Compute the weighted negative log-likelihood of tokens.
+
+    Args:
+        hidden: (n, width), what the network says before its head. head: (vocabulary, width).
+        targets: (n,) int64, the tokens. weights: (n,) float32.
+        chunk: tokens whose logits exist at a time. dtype: what the products are computed in; the rest is float32.
+    Returns:
+        weights @ nats, which can be differentiated by hidden and head; and the nats (n,), which cannot.
+    """
+    total, nats = _chunked_loss().apply(hidden, head, targets, weights, chunk, dtype)
+    return total, nats.detach()
+
+
+def output_head(student: Student) -> Any:
+    """Give the weights of the head, (vocabulary, width).
+
+    Raises:
+        ConfigError: it is adapted, which the loss here would pass over.
+    """
+    import torch
+
+    head = student.core.get_output_embeddings()
+    if type(head) is not torch.nn.Linear or head.bias is not None:
+        raise ConfigError(
+            "the head cannot be adapted", where="target_modules", got=type(head).__name__, fix="leave lm_head out"
+        )
+    return head.weight
+
+
+def answer_loss(student: Student, rows: Sequence[Encoded], features: Any, chunk: int) -> tuple[Any, Any]:
+    """Run samples forward, padded on the right.
+
+    Args:
+        features: (image tokens of all rows, width), row after row.
+    Returns:
+        The sum over all answer tokens of weight times nats, differentiable; and (b,) the unweighted nats of each row.
+    """
+    import torch
+
+    ids, labels, positions = (torch.from_numpy(array).to(student.device) for array in padded(student, rows))
+    core = student.core
+    with student.computing():
+        embedded = core.get_input_embeddings()(ids).to(student.dtype)
+        marks = ids == student.image_token_id
+        if len(features):
+            embedded = embedded.masked_scatter(marks[..., None], features.to(student.dtype))
+        hidden = core.model.language_model(
+            inputs_embeds=embedded, position_ids=positions, attention_mask=None, use_cache=False
+        ).last_hidden_state
+    is_target = labels[:, 1:] != IGNORED  # what stands before i + 1 tells it
+    row_of = is_target.nonzero()[:, 0]
+    row_weights = torch.tensor([row.weight for row in rows], dtype=torch.float32, device=student.device)
+    total, nats = chunked_loss(
+        hidden[:, :-1][is_target],
+        output_head(student),
+        labels[:, 1:][is_target],
+        row_weights[row_of],
+        chunk=chunk,
+        dtype=student.dtype,
+    )
+    return total, torch.zeros(len(rows), device=student.device).index_add_(0, row_of, nats)

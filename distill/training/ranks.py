@@ -1,0 +1,166 @@
+"""The processes of one training, as `torchrun` and `accelerate launch` start them: each has its device and its share of every step.
+
+One process needs none of this, and gets a group of one that does nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import logging
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from cosfly.errors import ConfigError, CosflyError, EnvironmentMissing
+from distill.student.model import Device, pick_device
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+PATIENCE = datetime.timedelta(
+    minutes=30
+)  # for the slowest process: loading weights, counting tokens, answering in validation
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The group of processes, and this one's place in it."""
+
+    rank: int
+    size: int
+    device: str
+
+    @property
+    def is_first(self) -> bool:
+        return self.rank == 0
+
+    def total(self, values: list[float]) -> list[float]:
+        """Add up numbers over all processes."""
+        if self.size == 1:
+            return values
+        import torch
+
+        tensor = torch.tensor(values, dtype=torch.float64, device=self.device)
+        _collective(torch.distributed.all_reduce, tensor)
+        return tensor.tolist()
+
+    def add_gradients(self, parameters: list[Any]) -> None:
+        """Add up the gradients of all processes, in place."""
+        if self.size == 1:
+            return
+        import torch
+
+        for parameter in parameters:  # a process without a sample of this step has no gradients
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        for bucket in _buckets([parameter.grad for parameter in parameters]):
+            flat = torch.cat([gradient.reshape(-1) for gradient in bucket])
+            _collective(torch.distributed.all_reduce, flat)
+            for gradient, part in zip(bucket, flat.split([g.numel() for g in bucket]), strict=True):
+                gradient.copy_(part.view_as(gradient))
+
+    def gathered(self, value: T) -> list[T]:
+        """Give every process the values of all, in the order of their ranks."""
+        if self.size == 1:
+            return [value]
+        import torch
+
+        values: list[Any] = [None] * self.size
+        _collective(torch.distributed.all_gather_object, values, value)
+        return values
+
+    def first_does(self, action: Callable[[], T]) -> T:
+        """Let the first process do something and tell all the result; its error is everybody's error."""
+        if self.size == 1:
+            return action()
+        import torch
+
+        box: list[Any] = [None, None]
+        if self.is_first:
+            try:
+                box[0] = action()
+            except CosflyError as error:
+                box[1] = error
+        _collective(torch.distributed.broadcast_object_list, box)
+        if box[1] is not None:
+            raise box[1]
+        return box[0]
+
+    def wait_for_all(self) -> None:
+        self.gathered(None)
+
+
+BUCKET_NUMBERS = 50_000_000  # of gradients that are added up in one call
+
+
+def _buckets(gradients: list[Any]) -> Iterator[list[Any]]:
+    bucket: list[Any] = []
+    count = 0
+    for gradient in gradients:
+        if bucket and (count + gradient.numel() > BUCKET_NUMBERS or gradient.dtype != bucket[0].dtype):
+            yield bucket
+            bucket, count = [], 0
+        bucket.append(gradient)
+        count += gradient.numel()
+    if bucket:
+        yield bucket
+
+
+def _collective(call: Callable[..., Any], *arguments: Any) -> None:
+    """Do something with all processes.
+
+    Raises:
+        EnvironmentMissing: one of them has ended.
+    """
+    try:
+        call(*arguments)
+    except RuntimeError as error:  # what torch.distributed raises of a broken connection
+        raise EnvironmentMissing(
+            "another process of this training has ended",
+            got=str(error).splitlines()[0][:160],
+            fix="its own message says why; run the same command again: it goes on from the last checkpoint",
+        ) from error
+
+
+def _number(name: str, default: int) -> int:
+    text = os.environ.get(name, str(default))
+    if not text.isdecimal():
+        raise ConfigError("not a number", where=f"environment variable {name}", got=text[:40])
+    return int(text)
+
+
+@contextlib.contextmanager
+def joined(device: Device) -> Iterator[Ranks]:
+    """Join the processes that were started together (RANK, WORLD_SIZE, LOCAL_RANK), or be alone.
+
+    Raises:
+        EnvironmentMissing: there are fewer accelerators than processes on this machine.
+    """
+    import torch
+
+    name, size, rank, local = (
+        pick_device(device),
+        _number("WORLD_SIZE", 1),
+        _number("RANK", 0),
+        _number("LOCAL_RANK", 0),
+    )
+    if name == "cuda":
+        if local >= torch.cuda.device_count():
+            raise EnvironmentMissing(
+                "fewer accelerators than processes",
+                where=f"process {local} of this machine",
+                got=f"{torch.cuda.device_count()} accelerators",
+                fix="start at most as many processes (--nproc-per-node), or set distill.train.device=cpu",
+            )
+        torch.cuda.set_device(local)
+    if size == 1:
+        yield Ranks(0, 1, name)
+        return
+    torch.distributed.init_process_group("nccl" if name == "cuda" else "gloo", timeout=PATIENCE)
+    if rank:
+        logging.getLogger("distill").setLevel(logging.WARNING)  # what all would say, the first says
+    yield Ranks(rank, size, name)
+    # After an error nobody waits for anybody: this process ends, its connections break, and the launcher ends the others.
+    torch.distributed.destroy_process_group()

@@ -1,0 +1,132 @@
+"""Settings of `distill train`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from cosfly.config import Config, MayDiffer
+from distill.student.model import Device, Dtype
+from distill.student.random_student import RandomStudent
+
+# All linear layers of the language model. Three of four Qwen3.5 layers are linear attention, so q, k, v, o alone would leave
+# most of the network untouched; the vision tower stays frozen.
+TARGET_MODULES = (
+    r".*language_model\.layers\.\d+\.(self_attn\.(q|k|v|o)_proj"
+    r"|linear_attn\.(in_proj_qkv|in_proj_z|in_proj_a|in_proj_b|out_proj)"
+    r"|mlp\.(gate|up|down)_proj)"
+)
+
+
+class TrainConfig(Config):
+    """Settings of `distill train`. Those that are MayDiffer change how it is computed and, but for rounding, not what."""
+
+    formerly: ClassVar[dict[str, str]] = {
+        "accumulate": "samples_per_step says how many samples make an optimizer step, batch_size how many are computed together",
+    }
+
+    method: Literal["lora", "full"] = Field(
+        "lora", description="lora: matrices of low rank beside frozen weights; full: all weights of the language model"
+    )
+    train_vision: bool = Field(
+        False, description="with method full: the vision tower learns, too; nothing is cached then"
+    )
+    lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
+    lora_alpha: float = Field(32.0, gt=0, description="LoRA scale; the update is multiplied by alpha / rank")
+    lora_dropout: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="dropout in front of the LoRA matrices; 0: off. It keeps a copy of what each layer gets, and what is dropped depends "
+        "on batch_size and the number of processes",
+    )
+    target_modules: str = Field(
+        TARGET_MODULES, description="regular expression over the full names of the adapted layers"
+    )
+    epochs: int = Field(3, ge=1, description="passes over the training split")
+    max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: only by epochs")
+    samples_per_step: int = Field(
+        16, ge=1, description="samples of an optimizer step, over all processes and forward passes"
+    )
+    learning_rate: float = Field(1e-4, gt=0, description="peak learning rate of AdamW")
+    schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
+    warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
+    weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
+    max_gradient_norm: float = Field(1.0, ge=0, description="gradients are scaled down to this norm; 0: off")
+    max_pixels: int = Field(
+        0,
+        ge=0,
+        description="most pixels kept of a picture; 0: all. Fewer than it has, and pixel values of the texts fit it no more",
+    )
+    max_tokens: int = Field(
+        4096, ge=16, description="longest sample, images and answer included; a longer one is skipped and counted"
+    )
+    dtype: Dtype = Field(
+        "auto",
+        description="what is computed in; auto: bfloat16 on an accelerator, float32 on a CPU. Learning weights are float32",
+    )
+    random_student: RandomStudent = Field(RandomStudent(), description="the student of `--student random`")
+
+    validation_samples: int = Field(
+        64,
+        ge=0,
+        description="samples of val, drawn over all decisions and flights, for loss and decision accuracy; 0: none",
+    )
+    validate_every_steps: int = Field(0, ge=0, description="steps between validations; 0: at the end of each epoch")
+    validation_answers: bool = Field(
+        True, description="let the student answer them, for the decision accuracy; false: the loss alone"
+    )
+    max_new_tokens: int = Field(512, ge=1, description="longest answer in validation, tokens")
+    patience: int = Field(
+        3,
+        ge=0,
+        description="validations in a row without a better decision accuracy after which training ends; 0: never",
+    )
+    keep: Literal["best", "last"] = Field(
+        "best", description="which weights are the product: those of the best validation, or the last"
+    )
+
+    batch_size: MayDiffer[int] = Field(1, ge=1, description="samples in one forward pass of one process")
+    gradient_checkpointing: MayDiffer[bool] = Field(
+        False, description="recompute activations: less memory, about 30 percent slower"
+    )
+    logit_chunk: MayDiffer[int] = Field(
+        512,
+        ge=1,
+        description="answer tokens whose logits exist at a time: each takes 4 bytes times the vocabulary, three times",
+    )
+    feature_cache: MayDiffer[bool] = Field(True, description="keep what the frozen vision tower makes of pictures")
+    feature_memory_gb: MayDiffer[float] = Field(16.0, ge=0, description="features kept in memory, GB a process")
+    feature_disk_gb: MayDiffer[float] = Field(
+        100.0, ge=0, description="features kept on disk that memory has no room for, GB over all processes"
+    )
+    feature_folder: MayDiffer[Path | None] = Field(
+        None, description="where features stay for further runs; none: in the output folder until the training is done"
+    )
+    encode_batch: MayDiffer[int] = Field(
+        0, ge=0, description="pictures that the vision tower looks at together; 0: 1 on a CPU, 16 on an accelerator"
+    )
+    data_workers: MayDiffer[int] = Field(
+        -1, ge=-1, description="processes that read pictures, for each that trains; -1: one a core, at most 16; 0: none"
+    )
+    save_every_steps: MayDiffer[int] = Field(50, ge=1, description="steps between checkpoints")
+    keep_checkpoints: MayDiffer[int] = Field(2, ge=1, description="newest checkpoints that stay, beside the best")
+    device: MayDiffer[Device] = Field("auto", description="auto, cpu or cuda")
+
+    @field_validator("target_modules")
+    @classmethod
+    def _is_expression(cls, value: str) -> str:
+        try:
+            re.compile(value)
+        except re.error as error:
+            raise ValueError(f"not a regular expression: {error}") from None
+        return value
+
+    @model_validator(mode="after")
+    def _fits(self) -> TrainConfig:
+        if self.train_vision and self.method != "full":
+            raise ValueError("train_vision needs method=full: adapters leave the vision tower alone")
+        return self
