@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -137,6 +138,7 @@ REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first
     [
         ({"status": "dropped", "drop_reason": "hard_conflict"}, {}, "dropped_hard_conflict"),
         ({"repair": REPAIRED}, {"repaired": "exclude"}, "repaired"),
+        ({"repair": REPAIRED | {"rung": "anchored"}}, {"rungs": ("hint",)}, "repaired_by_anchored"),
         ({"zh": None}, {}, "no_zh"),
     ],
 )
@@ -187,6 +189,38 @@ def test_captions_of_unwanted_verdicts_and_noisy_labels_do_not_teach():
     noisy = make_caption("Town01", "trajectory_1", "aug_001", 4, label_from="perturbed")
     assert noisy.label is not None
     assert make_sample(noisy, "en", PrepareConfig()).label is None
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
+    """A caption with a prompt as `cosfly caption` makes it."""
+    from caption.run.stage import run as caption_run
+    from caption.schema import CaptionConfig
+    from cosfly.products.captions import read_captions
+
+    root = tmp_path_factory.mktemp("asked")
+    path = caption_run(CaptionConfig(), make_playback_tree(root / "tree", 1, 12, with_augmented=False), root / "caption")
+    return next(caption for caption in read_captions(path) if caption.status == "accepted")
+
+
+@pytest.mark.parametrize("language", ["en", "zh"])
+def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
+    both, text, pictures = (
+        make_sample(asked, language, PrepareConfig(modalities=views, text_state=state))
+        for views, state in ((("rgb",), True), ((), True), (("rgb",), False))
+    )
+    told = {"en": "No pictures are given.", "zh": "未提供图像。"}[language]
+    assert told in text.prompt.user
+    assert text.images == []
+    assert both.prompt.user.count("\n") == text.prompt.user.count("\n") == 7
+    line = pictures.prompt.user
+    assert "\n" not in line
+    assert line == both.prompt.user.partition("\n")[0]
+    # Of the measured values nothing is left: the numbers are those of frames, their distance in time, and pixels.
+    assert re.findall(r"\d+(?:\.\d+)?", line) == ["5", "0.5", "64", "36"]
+    assert pictures.images == both.images != []
+    with pytest.raises(ValidationError, match="nothing to answer from"):
+        PrepareConfig(modalities=(), text_state=False)
 
 
 # --- run --------------------------------------------------------------------------------------------------------------

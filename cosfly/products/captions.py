@@ -200,15 +200,20 @@ PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says
 
 
 class Prompt(BaseModel):
-    """A question in one language. That of a caption holds PICTURES_MARK: a teacher and a student see different pictures."""
+    """A question in one language. That of a caption holds PICTURES_MARK: a teacher and a student see different pictures.
+
+    The line with the mark says what frames there are; the lines after it hold what was measured on them, and the mission.
+    """
 
     model_config = ConfigDict(extra="forbid")
     system: str
     user: str
 
-    def told(self, pictures: str) -> Prompt:
-        """Give the question with the sentence about the pictures at its mark."""
-        return Prompt(system=self.system, user=self.user.replace(PICTURES_MARK, pictures))
+    def told(self, pictures: str, *, measured: bool = True) -> Prompt:
+        """Give the question with the sentence about the pictures at its mark, and if asked without what was measured."""
+        begin, mark, end = self.user.partition(PICTURES_MARK)
+        user = self.user if measured or not mark else begin + mark + end.partition("\n")[0]
+        return Prompt(system=self.system, user=user.replace(PICTURES_MARK, pictures))
 
 
 _Value = TypeVar("_Value")

@@ -14,6 +14,8 @@ from cosfly.splits import SPLITS, Split
 from cosfly.store import dump_json
 from distill.schema import Sample
 
+Rung = Literal["hint", "multi_sample", "anchored", "fix_label"]
+
 
 class PrepareConfig(Config):
     """Settings of `distill prepare`."""
@@ -22,7 +24,10 @@ class PrepareConfig(Config):
         ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
     )
     modalities: tuple[View, ...] = Field(
-        ("rgb",), min_length=1, description="pictures of each window frame, in this order: rgb, depth, segmentation"
+        ("rgb",), description="pictures of each window frame, in this order: rgb, depth, segmentation; none: text alone"
+    )
+    text_state: bool = Field(
+        True, description="the prompt holds what was measured on the frames, and the mission; false: pictures alone"
     )
     split_by: Literal["walk", "town"] = Field(
         "walk",
@@ -40,6 +45,10 @@ class PrepareConfig(Config):
         "would go unseen",
     )
     repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
+    rungs: tuple[Rung, ...] = Field(
+        ("hint", "multi_sample", "anchored", "fix_label"),
+        description="repaired captions are learnt that one of these asks mended",
+    )
     repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
     verdicts: tuple[Verdict, ...] = Field(
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
@@ -76,6 +85,8 @@ class PrepareConfig(Config):
     def _fractions_leave_something(self) -> PrepareConfig:
         if self.val_fraction + self.test_fraction >= 1.0:
             raise ValueError("val_fraction + test_fraction must stay below 1, or nothing is left to train on")
+        if not self.modalities and not self.text_state:
+            raise ValueError("without pictures and text_state there is nothing to answer from")
         if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
             raise ValueError("languages and modalities may name each entry once")
         return self
@@ -100,6 +111,8 @@ def make_sample(
         return f"dropped_{caption.drop_reason or 'unknown'}"
     if caption.repair is not None and cfg.repaired == "exclude":
         return "repaired"
+    if caption.repair is not None and caption.repair.rung not in (None, *cfg.rungs):
+        return f"repaired_by_{caption.repair.rung}"
     if caption.verdict not in cfg.verdicts:
         return f"verdict_{str(caption.verdict).lower()}"
     states = (caption.checks.sentences or {}).get(language, [])
@@ -135,7 +148,7 @@ def make_sample(
         views=pictures.views,
         picture_px=pictures.size_px,
         depth_range_m=pictures.depth_range_m,
-        prompt=caption.prompt[language].told(pictures.sentence(language)),
+        prompt=caption.prompt[language].told(pictures.sentence(language), measured=cfg.text_state),
         answer=answer,
         decision=parsed.coc.flight_decision,
         label=None if caption.label_from == "perturbed" else caption.label,  # that one holds noise
