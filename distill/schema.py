@@ -54,6 +54,7 @@ class Sample(BaseModel):
     answer: str  # JSON text of the three fields
     decision: str  # the answer's flight_decision
     label: str | None  # the decision that the future geometry calls for; None: it cannot tell
+    contradicted: tuple[str, ...] | None  # decisions that the future geometry rules out; None: not known
     proved: float | None  # share of the answer's sentences that the geometry proves; None: none was judged
     repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
     weight: float
@@ -165,6 +166,7 @@ COLUMNS = pa.schema([
     pa.field("system", pa.int32(), nullable=False),  # of the record's system prompts
     *(pa.field(name, pa.string(), nullable=False) for name in ("prompt", "answer", "decision")),
     pa.field("label", pa.string()),
+    pa.field("contradicted", pa.list_(pa.field("element", pa.string()))),
     pa.field("proved", pa.float64()),
     pa.field("repair", pa.string()),
     pa.field("weight", pa.float64(), nullable=False),

@@ -199,7 +199,9 @@ def asked(tmp_path_factory):
     from cosfly.products.captions import read_captions
 
     root = tmp_path_factory.mktemp("asked")
-    path = caption_run(CaptionConfig(), make_playback_tree(root / "tree", 1, 12, with_augmented=False), root / "caption")
+    path = caption_run(
+        CaptionConfig(), make_playback_tree(root / "tree", 1, 12, with_augmented=False), root / "caption"
+    )
     return next(caption for caption in read_captions(path) if caption.status == "accepted")
 
 

@@ -1,33 +1,37 @@
-"""distill/evaluation/stage.py: numbers that can be checked by hand, and BERTScore on a tiny local encoder."""
+"""distill/evaluation: numbers that can be checked by hand, intervals beside scipy's, and BERTScore on a tiny local encoder."""
 
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from specimens_distill import make_caption, write_set
+from typer.testing import CliRunner
 
+from cosfly.chat.answers import AnswerBook
+from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.predictions import Prediction
+from cosfly.journal import Journal
+from cosfly.products.captions import parse_answer, write_captions
+from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.store import dump_json
-from distill.evaluation.bertscore import others_of, score_texts
-from distill.evaluation.stage import (
-    NOT_COMPUTED,
-    UNPARSED,
-    EvaluateConfig,
-    majority,
-    measure,
-    pair_up,
-    run,
-    wilson_interval,
-)
-from distill.inference.stage import make_prediction
+from distill.evaluation import compare
+from distill.evaluation.bertscore import BertScoreConfig, Scorer
+from distill.evaluation.figures import differences_of, figures_of, macro_f1
+from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
+from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_report, text_of
+from distill.evaluation.scores import VERDICTS, Answer, Scores, read_scores, score_answers, write_scores
+from distill.evaluation.speed import speed_of
+from distill.evaluation.stage import EvaluateConfig, run
+from distill.inference.stage import failed_prediction, make_prediction
 from distill.prepare.samples import PrepareConfig, make_sample
-from distill.schema import Sample
+from distill.schema import Sample, open_split
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
@@ -63,46 +67,176 @@ def samples() -> list[Sample]:
     return found
 
 
+def pairs_of(samples, predictions=None):
+    return pair_up(samples, predictions or predictions_of(samples))
+
+
+def scores_of(samples, predictions=None, **more) -> Scores:
+    pairs = pairs_of(samples, predictions)
+    return score_answers([sample for sample, _ in pairs], [Answer.of(prediction) for _, prediction in pairs], **more)
+
+
+def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
+    return figures_of(scores, resamples=resamples, confidence=confidence, rng=np.random.default_rng(0))
+
+
 def test_measured_numbers_by_hand(samples):
-    found = measure(pair_up(samples, predictions_of(samples)), ["slow_down"] * 3 + ["hover"] * 2)
-    assert found["samples"] == 8
-    assert (found["parsed"]["right"], found["parsed"]["share"]) == (6, 0.75)
-    assert found["parsed_without_mending"]["share"] == 5 / 8
-    assert found["unparsed_reasons"] == {"broken_json": 1, "no_json_object": 1}
-    assert (found["accuracy"]["right"], found["accuracy"]["share"]) == (4, 0.5)
-    # Labels are there where the frame is no multiple of 3: frames 4 (right), 5, 7, 8 (wrong), 10, 11 (right).
-    assert (found["accuracy_on_labels"]["right"], found["accuracy_on_labels"]["of"]) == (3, 6)
-    assert found["floor_train_majority"]["decision"] == "slow_down"
-    assert found["floor_train_majority"]["share"] == 2 / 8
-    assert found["floor_split_majority"]["decision"] == "track_straight"
-    assert found["floor_split_majority"]["share"] == 4 / 8
-    assert {name: (share["right"], share["of"]) for name, share in found["by_decision"].items()} == {
-        "track_straight": (2, 4),
-        "yaw_left_to_follow": (1, 2),
-        "slow_down": (1, 2),
-    }
-    assert found["confusion"] == {
-        "track_straight": {"track_straight": 2, "slow_down": 1, UNPARSED: 1},
-        "yaw_left_to_follow": {"yaw_left_to_follow": 1, "track_straight": 1},
-        "slow_down": {"slow_down": 1, UNPARSED: 1},
+    found, by_decision = figures(scores_of(samples))
+    assert {name: figure.value for name, figure in found.items() if figure.value is not None} == pytest.approx(
+        {
+            "answered": 1.0,
+            "parsed": 6 / 8,
+            "parsed_unmended": 5 / 8,
+            "accuracy": 4 / 8,
+            "accuracy_parsed": 4 / 6,
+            # slow_down: 1 hit of 2 references, 2 answers; track_straight: 2 of 4, 3; yaw_left_to_follow: 1 of 2, 1.
+            "macro_f1": (2 * 1 / (2 + 2) + 2 * 2 / (4 + 3) + 2 * 1 / (2 + 1)) / 3,
+            "accuracy_on_labels": 3 / 6,  # frames 4, 10, 11 of 4, 5, 7, 8, 10, 11, which are no multiples of 3
+            "tokens": 9.0,
+        }
+    )
+    assert (found["accuracy"].count, found["accuracy_parsed"].count) == (8, 6)
+    assert {name: (figure.value, figure.count) for name, figure in by_decision.items()} == {
+        "track_straight": (2 / 4, 4),
+        "yaw_left_to_follow": (1 / 2, 2),
+        "slow_down": (1 / 2, 2),
     }
 
 
-def test_wilson_interval_known_values():
-    # 8 of 10 at 95 %: 0.4902 to 0.9433 (a textbook value)
-    assert wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert wilson_interval(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
-    assert wilson_interval(0, 0) is None
+def test_failures_are_no_wrong_answers(samples):
+    predictions = predictions_of(samples)
+    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture")  # was right
+    found, _ = figures(scores_of(samples, predictions))
+    assert (found["answered"].value, found["answered"].count) == (7 / 8, 8)
+    assert (found["accuracy"].value, found["accuracy"].count) == (3 / 7, 7)
+    assert found["parsed"].value == 5 / 7
+    report = measure({STUDENT: scores_of(samples, predictions)}, predictions, resamples=100, confidence=0.9, seed=0)
+    assert report.failed == {"failed_damaged_picture": 1}
+    assert report.unparsed == {"broken_json": 1, "no_json_object": 1}
 
 
-@given(num_all=st.integers(1, 500), part=st.floats(0, 1))
-def test_wilson_interval_holds_the_share_and_lies_in_the_unit_interval(num_all, part):
-    num_right = round(part * num_all)
-    low, high = wilson_interval(num_right, num_all)
-    assert 0 <= low <= num_right / num_all + 1e-12
-    assert num_right / num_all - 1e-12 <= high <= 1
-    mirrored = wilson_interval(num_all - num_right, num_all)
-    assert (1 - high, 1 - low) == pytest.approx(mirrored, abs=1e-9)
+def test_verdicts_are_those_of_the_true_future(samples):
+    futures = [("slow_down", ()), ("hover", ()), (None, ("track_straight",)), (None, ()), ("hover", ("hover",))] + [
+        (None, None)
+    ] * 3
+    told = [
+        sample.model_copy(update={"label": label, "contradicted": contradicted})
+        for sample, (label, contradicted) in zip(samples, futures, strict=True)
+    ]
+    scores = scores_of(told, predictions_of(samples))
+    # Answers: slow_down, slow_down, track_straight, then two that do not parse; of the last three nothing is known.
+    assert [VERDICTS[number] if number >= 0 else None for number in scores.verdict] == [
+        "CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", None, None, None, None, None,
+    ]  # fmt: skip
+    found, _ = figures(scores)
+    assert (found["consistent"].value, found["hard_conflict"].count) == (1 / 3, 3)
+
+
+def test_evidence_is_counted_over_sentences(samples):
+    judged = {samples[0].key: ["proved", "proved", "unread"], samples[1].key: ["contradicted"]}
+    found, _ = figures(scores_of(samples, judged=judged))
+    assert (found["proved"].value, found["contradicted"].value, found["unread"].value) == (2 / 4, 1 / 4, 1 / 4)
+    assert found["proved"].count == 4
+
+
+def test_macro_f1_agrees_with_counting():
+    rng = np.random.default_rng(3)
+    references, answers = rng.integers(0, 5, 200), rng.choice([0, 1, 2, 3, 4, 9, 17], 200)
+    confusion = np.zeros((17, 18))
+    np.add.at(confusion, (references, answers), 1)
+    expected = []
+    for decision in range(5):
+        hits = sum(r == a == decision for r, a in zip(references, answers, strict=True))
+        precision, recall = hits / max(1, (answers == decision).sum()), hits / (references == decision).sum()
+        expected.append(0.0 if not hits else 2 * precision * recall / (precision + recall))
+    assert macro_f1(confusion) == pytest.approx(np.mean(expected))
+    assert np.isnan(macro_f1(np.zeros((17, 18))))
+
+
+# --- intervals --------------------------------------------------------------------------------------------------------
+
+
+def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: float = 0.6) -> Scores:
+    """Scores of walks of some size, in which right answers come in clumps."""
+    sizes = rng.integers(2, 2 * size, num_walks)
+    walk = np.repeat([f"walk_{i}" for i in range(num_walks)], sizes).astype(object)
+    count = len(walk)
+    right = rng.random(count) < np.repeat(rng.beta(2 * skill, 2 * (1 - skill), num_walks), sizes)
+    reference = rng.integers(0, 3, count).astype(np.int8)
+    empty, known = np.full(count, np.nan), np.ones(count, dtype=bool)
+    none = np.full(count, -1, dtype=np.int8)
+    return Scores(
+        key=np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), walk=walk, language=np.full(count, "en", dtype=object),
+        reference=reference, answer=np.where(right, reference, 5).astype(np.int8), label=none, answered=known, unmended=known, verdict=none,
+        precision=empty, recall=empty, f1=empty, proved=empty, contradicted=empty, unread=empty, num_tokens=np.zeros(count, dtype=np.int64),
+    )  # fmt: skip
+
+
+def test_intervals_agree_with_the_bootstrap_of_scipy():
+    from scipy.stats import bootstrap
+
+    scores = made_up(60, np.random.default_rng(1))
+    right = scores.answer == scores.reference
+    walks = [right[scores.walk == name] for name in dict.fromkeys(scores.walk)]
+    sums, counts = np.array([walk.sum() for walk in walks]), np.array([len(walk) for walk in walks])
+    expected = bootstrap(
+        (sums, counts), lambda s, n, axis: s.sum(axis=axis) / n.sum(axis=axis), paired=True, method="percentile",
+        n_resamples=9999, confidence_level=0.9, rng=np.random.default_rng(2),
+    ).confidence_interval  # fmt: skip
+    found = figures(scores, 9999, 0.9)[0]["accuracy"]
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=4e-3)
+    assert found.value == right.mean()
+
+
+def test_intervals_over_walks_are_wider_than_over_windows():
+    scores = made_up(40, np.random.default_rng(4), size=30)
+    alone = replace(scores, walk=scores.key)
+    (clumped, _), (single, _) = figures(scores, 1000), figures(alone, 1000)
+    widths = [found["accuracy"].high - found["accuracy"].low for found in (clumped, single)]
+    assert widths[0] > 2 * widths[1]
+
+
+def test_one_walk_has_no_interval(samples):
+    found = figures(scores_of(samples))[0]["accuracy"]
+    assert (found.value, found.low, found.high) == (0.5, None, None)
+
+
+def test_paired_differences(samples):
+    rng = np.random.default_rng(5)
+    one = made_up(50, rng)
+    worse = replace(one, answer=np.where(rng.random(len(one)) < 0.3, 7, one.answer).astype(np.int8))
+    count, found = differences_of(one, worse, resamples=2000, confidence=0.95, rng=np.random.default_rng(0))
+    accuracy = found["accuracy"]
+    assert count == len(one)
+    assert accuracy.value == pytest.approx(
+        (one.answer == one.reference).mean() - (worse.answer == worse.reference).mean()
+    )
+    assert accuracy.low > 0
+    assert accuracy.p == 1 / 2000
+    # The same samples in another order, and a few of them: keys pair, not places.
+    order = rng.permutation(len(one))
+    assert differences_of(one, worse.at(order), resamples=2000, confidence=0.95, rng=np.random.default_rng(0)) == (
+        count,
+        found,
+    )
+    same = differences_of(one, one.at(order[:40]), resamples=200, confidence=0.95, rng=np.random.default_rng(0))
+    assert (same[0], same[1]["accuracy"].value, same[1]["accuracy"].p) == (40, 0.0, 1.0)
+    assert differences_of(one, replace(one, key=one.key + "x"), resamples=200, confidence=0.95, rng=rng)[0] == 0
+
+
+def test_scores_survive_the_disk(tmp_path, samples):
+    texts = np.random.default_rng(0).random((8, 3))
+    scores = scores_of(samples, texts=texts, judged={samples[0].key: ["proved"]})
+    write_scores(tmp_path / "scores.parquet", scores)
+    again = read_scores(tmp_path / "scores.parquet")
+    for name in Scores.__dataclass_fields__:
+        assert np.array_equal(
+            getattr(again, name), getattr(scores, name), equal_nan=name in ("proved", "contradicted", "unread")
+        ), name
+        assert getattr(again, name).dtype == getattr(scores, name).dtype
+
+
+# --- floors -----------------------------------------------------------------------------------------------------------
 
 
 def test_majority_and_ties():
@@ -111,29 +245,38 @@ def test_majority_and_ties():
     assert majority([]) is None
 
 
+@given(st.integers(2, 5000), st.integers(0, 10))
+@settings(max_examples=30)
+def test_shuffling_leaves_nothing_in_its_place(count, seed):
+    groups = shuffled_groups(count, np.random.default_rng(seed))
+    places = shuffled_places(groups)
+    assert sorted(places.tolist()) == list(range(count))
+    assert (places != np.arange(count)).all()
+    assert max(map(len, groups)) <= 2048
+
+
+def test_floors_by_hand(samples):
+    train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
+    answers = Floors(train, "en", 0).answers([coc_of(sample) for sample in samples])
+    decisions = {name: [answer.coc.flight_decision for answer in own] for name, own in answers.items()}
+    assert set(decisions["majority"]) == {"hover"}
+    assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
+    assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
+    assert list(Floors([], "en", 0).answers([coc_of(samples[0])])) == []
+
+
+def test_floors_are_predictions_that_a_verifier_can_judge(place):
+    paths = write_floors(place / "set", "test", place / "floors", 0)
+    assert [path.parent.name for path in paths] == ["shuffled", "constant"]
+    for path in paths:
+        found = read_predictions(path)
+        assert len(found) == 16
+        assert all(parse_answer(prediction.raw, prediction.language).coc == prediction.coc for prediction in found)
+
+
 def test_a_prediction_for_an_unknown_sample_is_refused(samples):
     with pytest.raises(InputError, match="does not have"):
         pair_up(samples[:-1], predictions_of(samples))
-
-
-@given(st.integers(2, 40), st.integers(0, 10))
-def test_shuffling_leaves_no_text_in_its_place(count, seed):
-    texts = [str(i) for i in range(count)]
-    shuffled = others_of(texts, np.random.default_rng(seed))
-    assert sorted(shuffled) == sorted(texts)
-    assert all(a != b for a, b in zip(texts, shuffled, strict=True))
-
-
-def test_empty_texts_score_zero_and_are_not_asked():
-    asked = []
-
-    def scorer(candidates, references):
-        asked.extend(candidates)
-        return np.ones((len(candidates), 3))
-
-    scores = score_texts(scorer, ["a", "", " ", "b"], ["x", "y", "z", ""])
-    assert scores[:, 0].tolist() == [1, 0, 0, 0]
-    assert asked == ["a"]
 
 
 # --- run --------------------------------------------------------------------------------------------------------------
@@ -141,36 +284,63 @@ def test_empty_texts_score_zero_and_are_not_asked():
 
 @pytest.fixture
 def place(tmp_path, samples) -> Path:
-    """A training set of two languages and the predictions of its test split."""
+    """A training set of two languages and two walks, and the predictions of its test split."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
+    both = [
+        sample.model_copy(update={"walk": f"walk_{k % 2}", "contradicted": ("ascend",)})
+        for k, sample in enumerate(both)
+    ]
     write_set(tmp_path / "set", {"train": both, "val": both, "test": both})
-    records = predictions_of(samples) + predictions_of(both[8:])
-    lines = [dump_json(record.model_dump(mode="json")) for record in records]
-    (tmp_path / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_predictions(tmp_path, predictions_of(both[:8]) + predictions_of(both[8:]))
     return tmp_path
 
 
+def write_predictions(place: Path, records: list[Prediction], name: str = "predictions.jsonl") -> None:
+    lines = [dump_json(record.model_dump(mode="json")) for record in records]
+    (place / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+CFG = EvaluateConfig(resamples=100)
+
+
 def test_without_a_model_the_report_says_so_and_gives_no_number(place):
-    path = run(EvaluateConfig(), place / "predictions.jsonl", place / "set", place / "out")
-    report = json.loads(path.read_text())
-    assert report["bertscore"] == NOT_COMPUTED
-    assert {measured["bertscore"] for measured in report["languages"].values()} == {NOT_COMPUTED}
-    assert report["languages"]["zh"]["parsed"]["share"] == 0.75
-    assert report["all"]["accuracy"] == {**report["all"]["accuracy"], "right": 8, "of": 16}
+    path = run(CFG, place / "predictions.jsonl", place / "set", place / "out")
+    report = read_report(path.parent)
+    assert report.metrics == {"en": None, "zh": None}
+    student = report.languages["zh"].who[STUDENT].figures
+    assert (student["parsed"].value, student["bertscore_f1"].value) == (0.75, None)
+    assert report.all.who[STUDENT].figures["accuracy"].value == 8 / 16
+    assert report.all.who["majority"].figures["accuracy"].value == 8 / 16
+    assert set(report.all.who) == {STUDENT, "majority", "shuffled", "constant"}
     page = (place / "out" / "evaluation.md").read_text()
-    assert "| answers that parse | 75.00% (6/8;" in page
-    assert "| BERTScore precision / recall / F1 | not computed: no model folder |" in page
-    assert "always track_straight" in page
-    again = run(EvaluateConfig(), place / "predictions.jsonl", place / "set", place / "again")
-    assert again.read_bytes() == path.read_bytes()
+    assert "BERTScore of en: not computed, no model folder" in page
+    assert re.search(r"\| answers that parse \| 75\.00% \(.*to.*\) \| 100\.00% \|", page)
+    html = (place / "out" / "evaluation.html").read_text()
+    assert html.count("<svg") == 6
+    assert not re.search(r"(src|href)=.http", html)
+    assert len(report.examples) == 12
+    again = run(CFG, place / "predictions.jsonl", place / "set", place / "again")
+    for name in ("report.json", "evaluation.md", "evaluation.html", "scores.parquet"):
+        assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
+
+
+def test_foreign_text_shows_as_text(place, samples):
+    records = read_predictions(place / "predictions.jsonl")
+    records[4] = records[4].model_copy(update={"raw": "<script>alert(1)</script>", "model": "<b>x</b>|y"})
+    write_predictions(place, records)
+    run(CFG, place / "predictions.jsonl", place / "set", place / "out")
+    html = (place / "out" / "evaluation.html").read_text()
+    assert "<script>" not in html
+    assert "<b>x</b>" not in html
+    assert "<b>x" not in (place / "out" / "evaluation.md").read_text()
 
 
 def test_samples_that_were_not_asked_are_counted_apart(place):
-    lines = (place / "predictions.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    (place / "few.jsonl").write_text("".join(lines[:4]), encoding="utf-8")
-    report = json.loads(run(EvaluateConfig(), place / "few.jsonl", place / "set", place / "out").read_text())
-    assert report["not_asked"] == 12
-    assert report["all"]["parsed"] == {**report["all"]["parsed"], "right": 3, "of": 4}  # three of the first four
+    write_predictions(place, read_predictions(place / "predictions.jsonl")[:4], "few.jsonl")
+    run(CFG, place / "few.jsonl", place / "set", place / "out")
+    report = read_report(place / "out")
+    assert report.not_asked == 12
+    assert report.all.who[STUDENT].figures["parsed"].value == 3 / 4
 
 
 @pytest.mark.parametrize("bad", ['{"sample_id": 1}\n', "no json\n", None])
@@ -178,7 +348,67 @@ def test_bad_predictions_name_file_and_line(place, bad):
     lines = (place / "predictions.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
     (place / "bad.jsonl").write_text(lines[0] + (bad or lines[0]), encoding="utf-8")
     with pytest.raises(InputError, match=r"bad\.jsonl:2"):
-        run(EvaluateConfig(), place / "bad.jsonl", place / "set", place / "out")
+        run(CFG, place / "bad.jsonl", place / "set", place / "out")
+
+
+def test_what_a_verifier_found_in_the_answers_is_read(place, samples):
+    caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved", "unread"]}})
+    student = caption.model_copy(update={"teacher": caption.teacher.model_copy(update={"kind": "student"})})
+    write_captions(place / "judged.jsonl", [student])
+    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged={"student": place / "judged.jsonl"})
+    figures = read_report(place / "out").all.who[STUDENT].figures
+    assert (figures["proved"].value, figures["proved"].count) == (0.5, 2)
+    write_captions(place / "rules.jsonl", [caption])
+    with pytest.raises(InputError, match="no captions of a student"):
+        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged={"student": place / "rules.jsonl"})
+
+
+def test_speed_comes_from_what_stands_beside_the_predictions(place):
+    assert speed_of(place / "predictions.jsonl", []).model_dump(exclude_none=True) == {}
+    journal = {"key": "k", "sample_id": "s", "purpose": "en", "text": "", "usage": {}}
+    with AnswerBook(place / "answers"):
+        pass
+    with Journal(place / "answers" / "flight.jsonl") as written:
+        for latency_s in (1.0, 3.0):
+            written.append(journal | {"latency_s": latency_s})
+    found = speed_of(place / "predictions.jsonl", read_predictions(place / "predictions.jsonl"))
+    assert found.latency_s == {"mean": 2.0, "median": 2.0, "p95": pytest.approx(2.9)}
+    assert found.mean_tokens == 9.0
+
+
+# --- several students -------------------------------------------------------------------------------------------------
+
+
+def test_students_side_by_side(place):
+    predictions = read_predictions(place / "predictions.jsonl")
+    samples = {sample.key: sample for sample in open_split(place / "set", "test")}
+    write_predictions(
+        place,
+        [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions],
+        "right.jsonl",
+    )
+    for name in ("predictions", "right"):
+        run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)
+    folders = [place / "students" / name for name in ("right", "predictions")]
+    words = [
+        "distill",
+        "report",
+        *map(str, folders),
+        "--out",
+        str(place / "table"),
+        "--set",
+        "distill.report.resamples=100",
+    ]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    page = (place / "table" / "comparison.md").read_text()
+    assert "| right | 100.00% " in page
+    assert "| floor: majority |" in page
+    assert "## right less predictions" in page
+    assert re.search(r"\| decision accuracy, all answers \| \+0\.5000 \|", page)
+    assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
+    with pytest.raises(InputError, match="one name"):
+        compare.run(compare.CompareConfig(), [folders[0], folders[0]], place / "x")
 
 
 # --- BERTScore --------------------------------------------------------------------------------------------------------
@@ -231,56 +461,86 @@ def encoder(tmp_path_factory) -> Path:
     return folder
 
 
-def evaluated(place: Path, encoder: Path, **settings: object) -> dict:
-    cfg = EvaluateConfig.model_validate({"bertscore": {"layer": 2, "device": "cpu", **settings}})
+def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Report:
+    bertscore = {"device": "cpu", **{k: v for k, v in settings.items() if k == "idf"}}
+    bertscore[language] = {"layer": 2, **{k: v for k, v in settings.items() if k != "idf"}}
+    cfg = EvaluateConfig.model_validate({"resamples": 100, "bertscore": bertscore})
     out = place / f"out_{len(list(place.iterdir()))}"
-    return json.loads(run(cfg, place / "predictions.jsonl", place / "set", out, bertscore_model=encoder).read_text())
+    run(cfg, place / "predictions.jsonl", place / "set", out, bertscore_models={language: encoder})
+    return read_report(out)
 
 
-def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encoder):
-    report = evaluated(place, encoder)
-    for language in ("en", "zh"):
-        scores = report["languages"][language]["bertscore"]
-        # Four of the six parsed answers are the reference itself, the other two differ in the decision alone.
-        assert 0.9 < scores["parsed_only"]["f1"] < 1.0
-        assert scores["f1"] == pytest.approx(scores["parsed_only"]["f1"] * 6 / 8)
-        assert scores["scored_zero"] == 2
-        assert scores["shuffled_floor"]["f1"] < scores["f1"]
-    facts = report["bertscore"]
-    assert (facts["layer"], facts["idf"], facts["rescaled"]) == (2, False, False)
-    assert set(facts["versions"]) == {"bert-score", "transformers", "torch"}
+@pytest.mark.parametrize("language", ["en", "zh"])
+def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encoder, language):
+    report = evaluated(place, encoder, language)
+    who = report.languages[language].who
+    scores = {name: own.figures for name, own in who.items()}
+    # Four of the six parsed answers are the reference itself, the other two differ in the decision alone.
+    parsed = scores[STUDENT]["bertscore_f1_parsed"].value
+    assert 0.9 < parsed < 1.0
+    assert scores[STUDENT]["bertscore_f1"].value == pytest.approx(parsed * 6 / 8)
+    assert scores["shuffled"]["bertscore_f1"].value < parsed
+    assert scores["constant"]["bertscore_f1"].value < parsed
+    assert scores["majority"]["bertscore_f1"].value is None
+    assert sum(report.languages[language].histogram_f1) == 6
+    metric = report.metrics[language]
+    assert (metric.layer, metric.idf, metric.baseline_sha256) == (2, False, None)
+    assert set(metric.versions) == {"bert-score", "transformers", "torch"}
+    assert {"model.safetensors", "config.json", "tokenizer.json"} <= set(metric.sha256)
+    other = {"en": "zh", "zh": "en"}[language]
+    assert report.metrics[other] is None
+    assert report.languages[other].who[STUDENT].figures["bertscore_f1"].value is None
 
 
-def test_perfect_predictions_score_one(place, encoder, samples):
-    records = [make_prediction(sample, "test", sample.answer, 9, True) for sample in samples]
-    lines = [dump_json(record.model_dump(mode="json")) for record in records]
-    (place / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    for idf in (False, True):
-        scores = evaluated(place, encoder, idf=idf)["languages"]["en"]["bertscore"]
-        for name in ("precision", "recall", "f1"):
-            assert scores[name] == pytest.approx(1.0, abs=1e-5)
-            assert scores["shuffled_floor"][name] < 0.999
+def test_each_language_has_its_layer():
+    cfg = EvaluateConfig().bertscore
+    assert (cfg.en.layer, cfg.zh.layer) == (17, 8)
 
 
-def test_languages_can_be_left_out(place, encoder):
-    report = evaluated(place, encoder, languages=["en"])
-    assert report["languages"]["zh"]["bertscore"] == "not computed: not in bertscore.languages"
-    assert report["languages"]["en"]["bertscore"]["f1"] > 0
+@pytest.mark.parametrize("idf", [False, True])
+def test_scores_are_those_of_the_library(encoder, idf):
+    """Texts of very different lengths, doubles, one longer than the model reads."""
+    import bert_score
+
+    texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]
+    texts += ["short one", "a " * 700, texts[0]]
+    candidates = [*texts[1:], texts[0]]
+    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}, "idf": idf, "device": "cpu", "batch_size": 4})
+    own = Scorer(cfg, "en", encoder, texts)
+    plain = bert_score.BERTScorer(model_type=str(encoder), num_layers=2, idf=idf, device="cpu", nthreads=1)
+    plain._tokenizer.model_max_length = 512
+    if idf:
+        plain.compute_idf(texts)
+    expected = np.stack([part.numpy() for part in plain.score(candidates, texts)], axis=1)
+    found = own.score(list(zip(candidates, texts, strict=True)))
+    assert np.abs(found - expected).max() < 1e-5
+    assert expected.std() > 0.01
+    assert own.metric.cut == 1
+    alone = own.score([(candidates[3], texts[3])])
+    assert np.abs(alone - found[3]).max() < 1e-5
+    assert own.score([("", texts[0]), (" ", "")]).tolist() == [[0, 0, 0], [0, 0, 0]]
+
+
+def test_an_encoder_without_chinese_is_named(place, encoder, caplog):
+    evaluated(place, encoder, "en")
+    assert "no Chinese" not in caplog.text
+    evaluated(place, encoder, "zh")
+    assert "its vocabulary has no Chinese" in caplog.text
 
 
 def test_rescaling_uses_the_baseline_file(place, encoder):
     (place / "baseline.tsv").write_text("LAYER,P,R,F\n0,0.1,0.1,0.1\n1,0.2,0.2,0.2\n2,0.5,0.5,0.5\n", encoding="utf-8")
-    plain = evaluated(place, encoder)["languages"]["en"]["bertscore"]["parsed_only"]["f1"]
-    scaled = evaluated(place, encoder, baseline=str(place / "baseline.tsv"))["languages"]["en"]["bertscore"][
-        "parsed_only"
-    ]["f1"]
+    plain, scaled = (
+        evaluated(place, encoder, **more).languages["en"].who[STUDENT].figures["bertscore_f1_parsed"].value
+        for more in ({}, {"baseline": str(place / "baseline.tsv")})
+    )
     assert scaled == pytest.approx((plain - 0.5) / (1 - 0.5), abs=1e-5)
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"layer": 17}, "fewer layers.*17.*<= 3"),
+        ({"layer": 17}, r"bertscore\.en\.layer: .*fewer layers.*17.*<= 3"),
         ({"baseline": "nowhere.tsv"}, "no such baseline file"),
     ],
 )

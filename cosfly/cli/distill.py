@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -127,13 +127,41 @@ def distill_merge(
     typer.echo(merge.run(cfg.distill.merge, model, adapter, out, resume=resume))
 
 
+@app.command("floors")
+def distill_floors(
+    dataset: DatasetOption,
+    out: options.Out,
+    split: Annotated[Literal["train", "val", "test"], typer.Option(help="Samples to answer.")] = "test",
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+) -> None:
+    """Answers without a look at a window, as predictions: `caption --teacher student:` judges their sentences beside a student's."""
+    from distill.evaluation.floors import write_floors
+
+    for path in write_floors(dataset, split, out, options.resolve(config, overrides, {"seed": seed}).seed):
+        typer.echo(path)
+
+
 @app.command("evaluate")
 def distill_evaluate(
     dataset: DatasetOption,
     predictions: Annotated[Path, typer.Option(help="Predictions, the output of `distill infer`.")],
     out: options.Out,
-    bertscore_model: Annotated[
-        Path | None, typer.Option(help="Local model folder for BERTScore; none: not computed.")
+    bertscore_en: Annotated[
+        Path | None,
+        typer.Option(help="Local model folder for BERTScore of English (roberta-large); none: not computed."),
+    ] = None,
+    bertscore_zh: Annotated[
+        Path | None,
+        typer.Option(help="Local model folder for BERTScore of Chinese (bert-base-chinese); none: not computed."),
+    ] = None,
+    judged: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]CAPTIONS",
+            help="captions.jsonl that `caption --teacher student:` made of these predictions; of a floor's as shuffled=... or constant=...",
+        ),
     ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
@@ -141,10 +169,41 @@ def distill_evaluate(
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
 ) -> None:
-    """JSON parse rate, decision accuracy beside the majority floor, BERTScore beside a shuffled floor."""
+    """Parse rate, decisions, verdicts on the true future, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
 
     cfg = options.resolve(config, overrides, {"seed": seed})
     options.verify_first(verify, predictions, dataset, out)
-    given: Any = {"bertscore_model": bertscore_model, "seed": cfg.seed, "resume": resume}
+    models = {"en": bertscore_en, "zh": bertscore_zh}
+    given: Any = {
+        "bertscore_models": {language: folder for language, folder in models.items() if folder is not None},
+        "judged": dict(map(_judged, judged or [])), "seed": cfg.seed, "resume": resume,
+    }  # fmt: skip
     typer.echo(evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))
+
+
+def _judged(text: str) -> tuple[str, Path]:
+    name, mark, path = text.partition("=")
+    if not mark:
+        return "student", Path(text)
+    if name not in ("student", "shuffled", "constant"):
+        raise typer.BadParameter(f"{name}: not student, shuffled or constant", param_hint="--judged")
+    return name, Path(path)
+
+
+@app.command("report")
+def distill_report(
+    evaluations: Annotated[
+        list[Path], typer.Argument(help="Folders of `distill evaluate`, one a student; their names name the rows.")
+    ],
+    out: options.Out,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    resume: options.Resume = "if-same",
+) -> None:
+    """Students side by side: the trade-off table, and differences by paired bootstrap over walks."""
+    from distill.evaluation import compare
+
+    cfg = options.resolve(config, overrides, {"seed": seed})
+    typer.echo(compare.run(cfg.distill.report, evaluations, out, seed=cfg.seed, resume=resume))

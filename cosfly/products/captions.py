@@ -193,6 +193,15 @@ def is_in_script(text: str, language: Language) -> bool:
     return num_words + num_others <= num_han if language == "zh" else num_han + num_others <= num_words
 
 
+def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) -> Verdict:
+    """Give the verdict on a decision from what a caption's record says of its window's future, whoever decided."""
+    if decision == label:
+        return "CONSISTENT"
+    if decision in contradicted:
+        return "HARD_CONFLICT"
+    return "ABSTAIN" if label is None else "SOFT_CONFLICT"
+
+
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------
 
 

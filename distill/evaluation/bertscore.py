@@ -1,49 +1,72 @@
-"""BERTScore on a local model folder, with the library's traps walked round. Knows texts only, no samples.
+"""BERTScore on local model folders, one for each language, with the library's traps walked round. Knows texts only, no samples.
+
+The library loads the model and cuts it at the layer. Embedding and matching are here: each text once, in batches of like lengths, and the
+floors beside the answers without a second look at a text; the scores are the library's to rounding.
 
 Source: Zhang et al. 2020, doi:10.48550/arXiv.1904.09675; settings of sec:appendix_f_caption_distillation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.config import Config
+from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
 from cosfly.reading.documents import read_json, read_object
+from cosfly.reading.files import sha256_file
 from distill.student.model import Device, pick_device, quiet_transformers, require
 
-Scorer = Callable[[Sequence[str], Sequence[str]], np.ndarray]  # candidates, references -> (n, 3) precision, recall, F1
+log = logging.getLogger(__name__)
+
+Embedded = tuple[Any, Any]  # of one text: (t, d) embeddings of length 1, (t,) weights of its tokens
+FOREIGN_TOKENS = 1.5  # tokens a character of Chinese: bert-base-chinese has 1, a byte-level English vocabulary 2 to 3
 
 
-class BertScoreConfig(Config):
-    """Settings of BERTScore within `distill evaluate`; the model's folder is an argument of the command."""
+class LanguageMetric(Config):
+    """BERTScore of one language; the model's folder is an argument of the command."""
 
-    layer: int = Field(17, ge=1, description="layer of the embeddings; 17 for roberta-large, as in the paper")
-    languages: tuple[Language, ...] = Field(
-        ("en", "zh"), description="languages to score; leave out those that the model folder does not know"
-    )
-    idf: bool = Field(False, description="weigh tokens by their rarity in the references")
+    layer: int = Field(17, ge=1, description="layer of the embeddings")
     baseline: Path | None = Field(
         None, description="baseline file (.tsv) of the scored model to rescale with; none: no rescaling"
     )
+
+
+class BertScoreConfig(Config):
+    """Settings of BERTScore within `distill evaluate`."""
+
+    en: LanguageMetric = Field(LanguageMetric(), description="English: layer 17 of roberta-large, as in the paper")
+    zh: LanguageMetric = Field(LanguageMetric(layer=8), description="Chinese: layer 8 of bert-base-chinese")
+    idf: bool = Field(False, description="weigh tokens by their rarity in the references")
     batch_size: int = Field(64, ge=1, description="texts embedded together")
     device: Device = Field("auto", description="auto, cpu or cuda")
 
 
-def score_texts(scorer: Scorer, candidates: Sequence[str], references: Sequence[str]) -> np.ndarray:
-    """Give (n, 3) precision, recall and F1; an empty candidate or reference scores 0 without asking the scorer."""
-    scores = np.zeros((len(candidates), 3))
-    asked = [i for i, pair in enumerate(zip(candidates, references, strict=True)) if all(text.strip() for text in pair)]
-    if asked:
-        scores[asked] = scorer([candidates[i] for i in asked], [references[i] for i in asked])
-    return scores
+class Metric(BaseModel):
+    """What a score was measured with: two scores can be compared where all of it is equal.
+
+    sha256: of the folder's files that decide. cut: references longer than max_tokens, of which the rest was not read.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: str
+    layer: int
+    idf: bool
+    baseline_sha256: str | None
+    max_tokens: int
+    cut: int
+    sha256: dict[str, str]
+    versions: dict[str, str]
 
 
 def means_of(scores: np.ndarray) -> dict[str, float]:
@@ -51,68 +74,158 @@ def means_of(scores: np.ndarray) -> dict[str, float]:
     return {name: float(scores[:, i].mean()) for i, name in enumerate(("precision", "recall", "f1"))}
 
 
-def others_of(texts: Sequence[str], rng: np.random.Generator) -> list[str]:
-    """Give each place another place's text: one random cycle through all places."""
-    order = rng.permutation(len(texts))
-    shuffled = [""] * len(texts)
-    for here, there in zip(order, np.roll(order, 1), strict=True):
-        shuffled[here] = texts[there]
-    return shuffled
+def deciding_files(folder: Path) -> list[Path]:
+    """Give the files of a model's folder that decide its scores: configuration, tokenizer, weights."""
+    kinds = ("*.json", "*.txt", "*.safetensors", "*.bin", "*.model")
+    return sorted({path for kind in kinds for path in folder.glob(kind) if path.is_file()})
 
 
-def bert_scorer(cfg: BertScoreConfig, folder: Path, references: Sequence[str]) -> tuple[Scorer, dict[str, Any]]:
-    """Load BERTScore on a local model folder.
+class Scorer:
+    """BERTScore of one language."""
+
+    def __init__(self, cfg: BertScoreConfig, language: Language, folder: Path, references: Sequence[str]) -> None:
+        """Load the model.
+
+        Args:
+            references: the texts that idf weights are counted on, if they are used.
+        Raises:
+            InputError: the folder does not hold a usable encoder. ConfigError: it has fewer layers than asked for.
+        """
+        require("torch", "transformers", "bert_score")
+        quiet_transformers()
+        own: LanguageMetric = getattr(cfg, language)
+        check_encoder(own, folder, language)
+        import bert_score
+
+        try:
+            self._library = bert_score.BERTScorer(
+                model_type=str(folder),
+                num_layers=own.layer,
+                batch_size=cfg.batch_size,
+                nthreads=1,
+                idf=cfg.idf,
+                device=pick_device(cfg.device),
+                rescale_with_baseline=own.baseline is not None,
+                baseline_path=str(own.baseline) if own.baseline else None,
+                lang="en" if own.baseline else None,  # asked for by the library, unused with a baseline file
+            )
+        except (OSError, ValueError, RuntimeError) as error:
+            raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
+        # Without this limit in the tokenizer's files the library overflows; two places go to the sentence marks.
+        positions = read_object(folder / "config.json", what="BERTScore model").get("max_position_embeddings", 514)
+        tokenizer = self._library._tokenizer
+        limit = min(int(min(tokenizer.model_max_length, 10**9)), positions - 2)
+        tokenizer.model_max_length = limit
+        self._idf = self._weights(references) if cfg.idf else None
+        self._batch_size, self._device = cfg.batch_size, pick_device(cfg.device)
+        lengths = [len(tokenizer(text, truncation=False)["input_ids"]) for text in references]
+        _warn_of_foreign(language, references, sum(lengths), folder)
+        self.metric = Metric(
+            model=folder.name,
+            layer=own.layer,
+            idf=cfg.idf,
+            baseline_sha256=sha256_file(own.baseline) if own.baseline else None,
+            max_tokens=limit,
+            cut=sum(length > limit for length in lengths),
+            sha256={path.name: sha256_file(path) for path in deciding_files(folder)},
+            versions={name: version(name) for name in ("bert-score", "transformers", "torch")},
+        )
+
+    def _weights(self, references: Sequence[str]) -> Mapping[int, float]:
+        self._library.compute_idf(list(references))  # after the limit is set: it tokenizes
+        return self._library._idf_dict
+
+    def score(self, pairs: Sequence[tuple[str, str]]) -> np.ndarray:
+        """Score candidates against references, (n, 3) precision, recall, F1; an empty text scores 0 and is not read."""
+        scores = np.zeros((len(pairs), 3))
+        asked = [number for number, pair in enumerate(pairs) if all(text.strip() for text in pair)]
+        texts = {text: number for number, text in enumerate(dict.fromkeys(t for n in asked for t in pairs[n]))}
+        embedded = self._embed(list(texts))
+        asked.sort(key=lambda number: sum(len(embedded[texts[text]][0]) for text in pairs[number]))
+        for start in range(0, len(asked), self._batch_size):
+            batch = asked[start : start + self._batch_size]
+            candidates, references = ([embedded[texts[pairs[number][side]]] for number in batch] for side in (0, 1))
+            scores[batch] = _matched(candidates, references)
+        if self._library.rescale_with_baseline:
+            base = self._library.baseline_vals.numpy()
+            scores[asked] = (scores[asked] - base) / (1 - base)
+        return scores
+
+    def _embed(self, texts: Sequence[str]) -> list[Embedded]:
+        """Embed each text, longest first, so that a batch has one length and memory runs out at once or not at all."""
+        import torch
+        from bert_score.utils import bert_encode, sent_encode
+
+        tokenizer, found = self._library._tokenizer, [None] * len(texts)
+        ids = [sent_encode(tokenizer, text) for text in texts]
+        weights = self._idf or defaultdict(lambda: 1.0, {tokenizer.sep_token_id: 0.0, tokenizer.cls_token_id: 0.0})
+        order = sorted(range(len(texts)), key=lambda number: -len(ids[number]))
+        for start in range(0, len(order), self._batch_size):
+            batch = order[start : start + self._batch_size]
+            longest = max(len(ids[number]) for number in batch)
+            padded = torch.full((len(batch), longest), tokenizer.pad_token_id)
+            mask = torch.zeros((len(batch), longest), dtype=torch.long)
+            for row, number in enumerate(batch):
+                padded[row, : len(ids[number])] = torch.tensor(ids[number])
+                mask[row, : len(ids[number])] = 1
+            with torch.no_grad():
+                out = bert_encode(self._library._model, padded.to(self._device), attention_mask=mask.to(self._device))
+                out = out / torch.norm(out, dim=-1, keepdim=True)
+            for row, number in enumerate(batch):
+                own = torch.tensor([weights[token] for token in ids[number]], device=out.device)
+                found[number] = (out[row, : len(ids[number])], own)  # type: ignore[call-overload]
+        return found  # type: ignore[return-value]
+
+
+def _matched(candidates: list[Embedded], references: list[Embedded]) -> np.ndarray:
+    """Match tokens greedily, (n, 3) precision, recall, F1. What pads has no embedding, so nothing is like it."""
+    import torch
+    from torch.nn.utils.rnn import pad_sequence
+
+    left, right = (pad_sequence([pair[0] for pair in side], batch_first=True) for side in (candidates, references))
+    likeness = torch.bmm(left, right.transpose(1, 2))
+    sides = []
+    for side, best in ((candidates, likeness.amax(dim=2)), (references, likeness.amax(dim=1))):
+        weights = pad_sequence([pair[1] for pair in side], batch_first=True)
+        sides.append((best * weights).sum(dim=1) / weights.sum(dim=1))
+    precision, recall = sides
+    f1 = torch.nan_to_num(2 * precision * recall / (precision + recall), nan=0.0)
+    return torch.stack([precision, recall, f1], dim=1).cpu().numpy()
+
+
+def score_beside_floors(
+    scorer: Callable[[Sequence[tuple[str, str]]], np.ndarray],
+    groups: Sequence[np.ndarray],
+    candidates: Mapping[str, Sequence[str]],
+    references: Sequence[str],
+    label: str,
+) -> dict[str, np.ndarray]:
+    """Score several who answer on the same references: name -> (n, 3).
 
     Args:
-        references: the texts that idf weights are counted on, if they are used.
-    Returns:
-        The scorer, and facts for the report: versions, settings, the longest text in tokens that the model reads.
-    Raises:
-        InputError: the folder does not hold a usable encoder. ConfigError: it has fewer layers than asked for.
+        groups: places that are scored together; what is embedded of them is let go before the next.
     """
-    require("torch", "transformers", "bert_score")
-    quiet_transformers()
-    check_encoder(cfg, folder)
-    import bert_score
-
-    try:
-        scorer = bert_score.BERTScorer(
-            model_type=str(folder),
-            num_layers=cfg.layer,
-            batch_size=cfg.batch_size,
-            nthreads=1,
-            idf=cfg.idf,
-            device=pick_device(cfg.device),
-            rescale_with_baseline=cfg.baseline is not None,
-            baseline_path=str(cfg.baseline) if cfg.baseline else None,
-            lang="en" if cfg.baseline else None,  # asked for by the library, unused with a baseline file
-        )
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
-    # Without this limit in the tokenizer's files the library overflows; two places go to the sentence marks.
-    positions = read_object(folder / "config.json", what="BERTScore model").get("max_position_embeddings", 514)
-    limit = min(int(min(scorer._tokenizer.model_max_length, 10**9)), positions - 2)
-    scorer._tokenizer.model_max_length = limit
-    if cfg.idf:
-        scorer.compute_idf(list(references))  # after the limit is set: it tokenizes
-
-    def score(candidates: Sequence[str], texts: Sequence[str]) -> np.ndarray:
-        return np.stack([part.numpy() for part in scorer.score(list(candidates), list(texts))], axis=1)
-
-    num_cut = sum(len(scorer._tokenizer(text, truncation=False)["input_ids"]) > limit for text in references)
-    facts = {
-        "model": folder.name,
-        "layer": cfg.layer,
-        "idf": cfg.idf,
-        "rescaled": cfg.baseline is not None,
-        "max_tokens": limit,
-        "references_cut_at_max_tokens": num_cut,
-        "versions": {name: version(name) for name in ("bert-score", "transformers", "torch")},
-    }
-    return score, facts
+    found = {name: np.zeros((len(references), 3)) for name in candidates}
+    with progress_bar(f"BERTScore, {label}", total=len(references)) as advance:
+        for group in groups:
+            pairs = [(texts[place], references[place]) for texts in candidates.values() for place in group]
+            scores = scorer(pairs)
+            for number, name in enumerate(found):
+                found[name][group] = scores[number * len(group) : (number + 1) * len(group)]
+            advance(len(group))
+    return found
 
 
-def check_encoder(cfg: BertScoreConfig, folder: Path) -> None:
+def _warn_of_foreign(language: Language, references: Sequence[str], num_tokens: int, folder: Path) -> None:
+    num_characters = sum(map(len, references))
+    if language == "zh" and num_tokens > FOREIGN_TOKENS * num_characters:
+        log.warning(
+            "%s: %.1f tokens a Chinese character: its vocabulary has no Chinese, scores say little (bert-base-chinese has 1)",
+            folder, num_tokens / num_characters,
+        )  # fmt: skip
+
+
+def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None:
     """Check that a folder holds an encoder that fits the settings.
 
     Raises:
@@ -120,20 +233,21 @@ def check_encoder(cfg: BertScoreConfig, folder: Path) -> None:
     """
     config = read_json(folder / "config.json", what="BERTScore model (a folder with config.json)")
     layers = config.get("num_hidden_layers") if isinstance(config, dict) else None
+    where = f"bertscore.{language}"
     if not isinstance(layers, int):
         raise InputError("not a text encoder", where=folder / "config.json", expected="num_hidden_layers")
-    if cfg.layer > layers:
-        raise ConfigError("the model has fewer layers", where="bertscore.layer", got=cfg.layer, expected=f"<= {layers}")
+    if own.layer > layers:
+        raise ConfigError("the model has fewer layers", where=f"{where}.layer", got=own.layer, expected=f"<= {layers}")
     if "t5" in str(folder) or str(folder).startswith("scibert"):  # bert-score reads the model's family off its path
         raise InputError(
             "bert-score would take this path for another kind of model",
             where=folder,
             fix="rename or link it without 't5' and not as scibert...",
         )
-    if cfg.baseline is not None and not cfg.baseline.is_file():
+    if own.baseline is not None and not own.baseline.is_file():
         raise ConfigError(
             "no such baseline file",
-            where="bertscore.baseline",
-            got=str(cfg.baseline),
+            where=f"{where}.baseline",
+            got=str(own.baseline),
             expected="a .tsv of the scored model",
         )

@@ -136,6 +136,7 @@ def make_sample(
             fix="run cosfly caption anew",
         )
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
+    is_noisy = caption.label_from == "perturbed"  # and so is what that future rules out
     return Sample(
         sample_id=sample_id or caption.sample_id,
         language=language,
@@ -151,7 +152,8 @@ def make_sample(
         prompt=caption.prompt[language].told(pictures.sentence(language), measured=cfg.text_state),
         answer=answer,
         decision=parsed.coc.flight_decision,
-        label=None if caption.label_from == "perturbed" else caption.label,  # that one holds noise
+        label=None if is_noisy else caption.label,
+        contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
         repair=None if caption.repair is None else caption.repair.strategy,
         proved=proved,
         weight=_weight(caption, proved, cfg),

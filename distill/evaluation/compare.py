@@ -1,0 +1,240 @@
+"""Evaluated students side by side: the trade-off table, and differences by paired bootstrap.
+
+Reads the folders of `distill evaluate`; writes `comparison.json`, `comparison.md` and `comparison.html`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.chance import rng_for
+from cosfly.config import Config
+from cosfly.errors import InputError
+from cosfly.escaping import for_html, for_markdown, html_page
+from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.store import write_bytes, write_model
+from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, Difference, differences_of
+from distill.evaluation.measure import STUDENT, Measured, Report, read_report
+from distill.evaluation.pages import (
+    NOTHING,
+    STYLE,
+    decision_bars,
+    figure_table,
+    heat_map,
+    histogram,
+    score_bars,
+    shown,
+    table,
+)
+from distill.evaluation.scores import SCORES, read_scores
+
+STAGE = "distill.report"
+FLOORS = ("majority", "shuffled", "constant")
+Names = dict[str, Report]
+
+
+class CompareConfig(Config):
+    """Settings of `distill report`."""
+
+    confidence: float = Field(0.95, gt=0, lt=1, description="level of the intervals of differences")
+    resamples: int = Field(5000, ge=100, description="draws of walks that they are made of")
+
+
+class Pairing(BaseModel):
+    """Of two students: on how many samples they are compared, and the first's figures less the second's."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    first: str
+    second: str
+    samples: int
+    differences: dict[str, Difference]
+
+
+class Comparison(BaseModel):
+    """`comparison.json`. not_comparable: figures that were measured in another way, and why."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    students: dict[str, Measured]
+    models: dict[str, str]
+    floors: dict[str, Measured]
+    pairings: list[Pairing]
+    not_comparable: list[str]
+    confidence: float
+    resamples: int
+
+
+def run(
+    cfg: CompareConfig, evaluations: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same"
+) -> Path:
+    """Read the evaluations of several students; write their comparison.
+
+    Returns:
+        The path of `comparison.md`.
+    Raises:
+        InputError: two evaluations have one name, or are of other splits.
+    """
+    names = [folder.absolute().name for folder in evaluations]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "two evaluations have one name",
+            got=", ".join(names),
+            fix="give folders of different names: they name the rows",
+        )
+    inputs = {f"evaluation/{name}": folder for name, folder in zip(names, evaluations, strict=True)}
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    path = out / "comparison.md"
+    if stage.is_complete:
+        return path
+    folders = dict(zip(names, evaluations, strict=True))
+    reports = {name: read_report(folder) for name, folder in folders.items()}
+    splits = {report.split for report in reports.values()}
+    if len(splits) > 1:
+        raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
+    comparison = compare(cfg, reports, folders, seed)
+    record, page = out / "comparison.json", out / "comparison.html"
+    write_model(record, comparison, schema="cosfly.distill_comparison", version="1.0")
+    write_bytes(path, markdown_of(comparison, reports).encode())
+    write_bytes(page, page_of(comparison, reports).encode())
+    stage.finish([record, path, page], Tally(input=len(names), kept=len(names)))
+    return path
+
+
+def compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> Comparison:
+    """Put students side by side; of the floors those of the first."""
+    scores = {name: read_scores(folder / SCORES) for name, folder in folders.items()}
+    pairings = []
+    for first, second in combinations(reports, 2):
+        rng = rng_for(seed, STAGE, f"{first}/{second}")
+        count, found = differences_of(
+            scores[first], scores[second], resamples=cfg.resamples, confidence=cfg.confidence, rng=rng
+        )
+        pairings.append(Pairing(first=first, second=second, samples=count, differences=found))
+    someone = next(iter(reports.values())).all
+    return Comparison(
+        students={name: report.all.who[STUDENT] for name, report in reports.items()},
+        models={name: report.model for name, report in reports.items()},
+        floors={name: someone.who[name] for name in FLOORS if name in someone.who},
+        pairings=pairings,
+        not_comparable=_mismatches(reports),
+        confidence=cfg.confidence,
+        resamples=cfg.resamples,
+    )
+
+
+def _mismatches(reports: Names) -> list[str]:
+    """Say which scores were measured in different ways."""
+    found = []
+    for first, second in combinations(reports, 2):
+        one, other = reports[first], reports[second]
+        if one.metrics != other.metrics:
+            found.append(f"BERTScore of {first} and {second}: other models, layers, versions or settings")
+        if one.all.samples != other.all.samples:
+            found.append(f"{first} has {one.all.samples} samples, {second} {other.all.samples}: see the pairings")
+    return found
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+# The paper's table, and what its text adds.
+_TABLE = ("parsed", "bertscore_precision", "bertscore_recall", "bertscore_f1", "accuracy", "accuracy_parsed", "macro_f1",
+          "consistent", "hard_conflict", "proved", "contradicted", "tokens")  # fmt: skip
+
+
+def everyone_of(comparison: Comparison) -> dict[str, Measured]:
+    """Give the students and the floors, by what they are called."""
+    return comparison.students | {f"floor: {name}": own for name, own in comparison.floors.items()}
+
+
+def _rows(comparison: Comparison, reports: Names) -> tuple[list[str], list[list[str]]]:
+    everyone = everyone_of(comparison)
+    names = [name for name in _TABLE if any(own.figures[name].value is not None for own in everyone.values())]
+    header = ["", *(FIGURES[name] for name in names), "samples/s"]
+    rows = []
+    for who, own in everyone.items():
+        speed = reports[who].speed.samples_per_s if who in reports else None
+        rows.append([
+            who, *(shown(name, own.figures[name], interval=who in reports) for name in names),
+            NOTHING if speed is None else f"{speed:.2f}",
+        ])  # fmt: skip
+    return header, rows
+
+
+def _difference(name: str, found: Difference) -> list[str]:
+    if found.value is None:
+        return [NOTHING, NOTHING, NOTHING]
+    interval = NOTHING if found.low is None or found.high is None else f"{found.low:+.4f} to {found.high:+.4f}"
+    return [f"{found.value:+.4f}", interval, NOTHING if found.p is None else f"{found.p:.4f}"]
+
+
+def _said(pairing: Pairing) -> list[list[str]]:
+    rows = []
+    for name, found in pairing.differences.items():
+        if found.value is not None:
+            is_clear = found.low is not None and found.high is not None and (found.low > 0 or found.high < 0)
+            first_leads = (found.value > 0) != (name in LESS_IS_BETTER)
+            better = (pairing.first if first_leads else pairing.second) if is_clear else "cannot be told"
+            rows.append([FIGURES[name], *_difference(name, found), better])
+    return rows
+
+
+_HEADER = ["", "difference", "interval", "p", "better"]
+
+
+def markdown_of(comparison: Comparison, reports: Names) -> str:
+    """Give the comparison as a Markdown page."""
+    header, rows = _rows(comparison, reports)
+    lines = ["# Students side by side", "", *table(header, [[for_markdown(cell) for cell in row] for row in rows]), ""]
+    lines += [f"- {for_markdown(name)}: {for_markdown(model)}" for name, model in comparison.models.items()]
+    lines += [f"- not comparable: {for_markdown(words)}" for words in comparison.not_comparable]
+    for pairing in comparison.pairings:
+        lines += [
+            "",
+            f"## {for_markdown(pairing.first)} less {for_markdown(pairing.second)}",
+            "",
+            _how(comparison, pairing),
+            "",
+        ]
+        lines += table(_HEADER, [[for_markdown(cell) for cell in row] for row in _said(pairing)])
+    return "\n".join(lines) + "\n"
+
+
+def _how(comparison: Comparison, pairing: Pairing) -> str:
+    return (
+        f"On the {pairing.samples} samples that both were asked; intervals {comparison.confidence:.0%}, {comparison.resamples} draws "
+        "of walks, the same for both."
+    )
+
+
+def page_of(comparison: Comparison, reports: Names) -> str:
+    """Give the comparison as a page that needs nothing but itself."""
+    header, rows = _rows(comparison, reports)
+    body = ["<h1>Students side by side</h1>", _html_table(header, rows)]
+    body += [f"<p>{for_html(name)}: {for_html(model)}</p>" for name, model in comparison.models.items()]
+    body += [f'<p class="lead">Not comparable: {for_html(words)}</p>' for words in comparison.not_comparable]
+    body.append(f'<div class="panel"><h3>Accuracy by decision</h3>{decision_bars(comparison.students)}</div>')
+    histograms = {name: found for name, report in reports.items() if (found := report.all.histogram_f1) is not None}
+    if histograms:
+        body.append(f'<div class="panel"><h3>BERTScore F1 of parsed answers</h3>{histogram(histograms)}</div>')
+        body.append(f'<div class="panel"><h3>BERTScore, all answers</h3>{score_bars(comparison.students)}</div>')
+    for name, own in comparison.students.items():
+        body.append(f'<div class="panel"><h3>{for_html(name)}: reference against answer</h3>{heat_map(own)}</div>')
+    for pairing in comparison.pairings:
+        body.append(f"<h2>{for_html(pairing.first)} less {for_html(pairing.second)}</h2>")
+        body.append(f'<p class="lead">{for_html(_how(comparison, pairing))}</p>{_html_table(_HEADER, _said(pairing))}')
+    body.append("<h2>All figures</h2>" + figure_table(everyone_of(comparison)))
+    return html_page("cosfly: students side by side", STYLE, "\n".join(body))
+
+
+def _html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    heads = "".join(f"<th>{for_html(cell)}</th>" for cell in header)
+    lines = "".join(
+        f"<tr><th>{for_html(row[0])}</th>{''.join(f'<td>{for_html(cell)}</td>' for cell in row[1:])}</tr>"
+        for row in rows
+    )
+    return f'<div class="panel"><table class="figures"><tr>{heads}</tr>{lines}</table></div>'

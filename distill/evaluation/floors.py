@@ -1,0 +1,121 @@
+"""What can be had without a look at a window, answered as a student would: the floors beside every figure.
+
+majority    the decision that train has most often; no text
+shuffled    the reference of another sample of the split
+constant    one answer of train, with the majority's decision, for every sample
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.chance import rng_for
+from cosfly.errors import InputError
+from cosfly.products.captions import ACTIONS, Coc, Language
+from cosfly.products.predictions import PREDICTIONS, Prediction
+from cosfly.reading.documents import parse_document, validation_errors
+from cosfly.splits import Split
+from cosfly.store import dump_json, write_bytes
+from distill.evaluation.scores import Answer
+from distill.schema import Sample, open_split
+
+SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
+WRITTEN = ("shuffled", "constant")  # floors that have texts
+
+
+def coc_of(sample: Sample) -> Coc:
+    """Give a sample's answer.
+
+    Raises:
+        InputError: it is none.
+    """
+    with validation_errors(sample.key):
+        return Coc.model_validate(parse_document(sample.answer, sample.key, what="answer"))
+
+
+def majority(decisions: Iterable[str]) -> str | None:
+    """Give the most frequent decision; a tie goes to the first in the order of the action table."""
+    counts = Counter(decisions)
+    return max(ACTIONS, key=lambda action: counts[action]) if counts else None
+
+
+def shuffled_groups(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Deal places into groups at random, of SHUFFLED_AMONG to twice as many each."""
+    return np.array_split(rng.permutation(count), max(1, count // SHUFFLED_AMONG))
+
+
+def shuffled_places(groups: Sequence[np.ndarray]) -> np.ndarray:
+    """Give each place another place of its group, (count,): one cycle through each group."""
+    others = np.empty(sum(map(len, groups)), dtype=int)
+    for group in groups:
+        others[group] = np.roll(group, 1)
+    return others
+
+
+class Floors:
+    """The floors of one language, from the training split."""
+
+    def __init__(self, train: Iterable[Sample], language: Language, seed: int) -> None:
+        self._language, self._seed = language, seed
+        counts, typical = Counter[str](), dict[str, tuple[bytes, Sample]]()
+        for sample in train:
+            if sample.language == language:
+                counts[sample.decision] += 1
+                rank = hashlib.sha256(f"{seed}/distill.floor/{sample.key}".encode()).digest()
+                if sample.decision not in typical or rank < typical[sample.decision][0]:
+                    typical[sample.decision] = rank, sample
+        self.decision = majority(counts.elements())
+        self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
+
+    def groups(self, count: int) -> list[np.ndarray]:
+        """Deal samples into groups, within which references are shuffled."""
+        return shuffled_groups(count, rng_for(self._seed, "distill.floor", self._language))
+
+    def answers(self, references: Sequence[Coc]) -> dict[str, list[Answer]]:
+        """Give what each floor answers to samples with these references, of which there is one at least."""
+        found: dict[str, list[Answer]] = {}
+        if self._constant is not None and self.decision is not None:
+            bare = Coc(critical_components="", reasoning_trace="", flight_decision=self.decision)
+            found["majority"] = [Answer(bare)] * len(references)
+            found["constant"] = [Answer(self._constant)] * len(references)
+        if len(references) > 1:
+            places = shuffled_places(self.groups(len(references))).tolist()
+            found["shuffled"] = [Answer(references[place]) for place in places]
+        return found
+
+
+def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
+    """Write the floors that have texts as predictions, so that `cosfly caption --teacher student:` judges their sentences too.
+
+    Raises:
+        InputError: the split is empty.
+    """
+    samples = open_split(dataset, split)
+    if not samples:
+        raise InputError("the split is empty", where=dataset, got=split, fix="choose another split")
+    lines: dict[str, list[str]] = {name: [] for name in WRITTEN}
+    languages: list[Language] = ["en", "zh"]
+    for language in languages:
+        own = [sample for sample in samples if sample.language == language]
+        if own:
+            floors = Floors(open_split(dataset, "train"), language, seed).answers([coc_of(sample) for sample in own])
+            for name in WRITTEN:
+                for sample, answer in zip(own, floors.get(name, ()), strict=False):
+                    lines[name].append(_prediction(sample, split, name, answer).model_dump_json() + "\n")
+    paths = [out / name / PREDICTIONS for name in WRITTEN if lines[name]]
+    for path in paths:
+        write_bytes(path, "".join(lines[path.parent.name]).encode())
+    return paths
+
+
+def _prediction(sample: Sample, split: Split, name: str, answer: Answer) -> Prediction:
+    assert answer.coc is not None
+    return Prediction(
+        sample_id=sample.sample_id, language=sample.language, split=split, model=f"floor: {name}",
+        raw=dump_json(answer.coc.model_dump()), num_tokens=0, is_finished=True, coc=answer.coc, reason=None, recovered=[],
+    )  # fmt: skip

@@ -1,0 +1,231 @@
+"""An evaluation's report: what a student's answers are worth beside what the floors' are, by language and over all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.chance import rng_for
+from cosfly.errors import InputError
+from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, SentenceState, read_captions
+from cosfly.products.predictions import Prediction
+from cosfly.reading.documents import read_model
+from cosfly.splits import Split
+from distill.evaluation.bertscore import Metric, score_beside_floors
+from distill.evaluation.figures import Figure, figures_of
+from distill.evaluation.floors import Floors, coc_of
+from distill.evaluation.scores import UNPARSED, Answer, Scores, score_answers
+from distill.evaluation.speed import Speed
+from distill.schema import Sample
+
+REPORT, REPORT_SCHEMA, REPORT_VERSION = "report.json", "cosfly.distill_report", "2.0"
+STAGE = "distill.evaluate"
+STUDENT = "student"
+UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
+Judged = Mapping[str, Mapping[str, Sequence[SentenceState]]]  # who -> sample's key -> states of the sentences
+TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Measured(_Strict):
+    """Of one who answers: figures by name (figures.py), accuracy by decision, reference -> answers."""
+
+    figures: dict[str, Figure]
+    by_decision: dict[str, Figure]
+    confusion: dict[str, dict[str, int]]
+
+
+class Measurement(_Strict):
+    """Of one language, or over all. who: `student`, then the floors; failed: samples without an answer; unparsed: by reason."""
+
+    samples: int
+    walks: int
+    failed: dict[str, int]
+    unparsed: dict[str, int]
+    histogram_f1: list[int] | None  # of the student's parsed answers, in fiftieths from 0 to 1
+    who: dict[str, Measured]
+
+
+class Example(_Strict):
+    """A sample with its answer, side by side."""
+
+    key: str
+    walk: str
+    reference: Coc
+    answer: Coc | None
+    raw: str
+    label: str | None
+    f1: float | None
+
+
+class Report(_Strict):
+    """`report.json`."""
+
+    model: str
+    split: Split
+    confidence: float
+    resamples: int
+    seed: int
+    not_asked: int
+    metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
+    judged: list[str]  # whose sentences were judged
+    speed: Speed
+    languages: dict[Language, Measurement]
+    all: Measurement
+    examples: list[Example]
+    notes: list[str]
+
+
+NOTES = [
+    "reference: the teacher's accepted answer; an answer that does not parse is a wrong one and scores 0 in BERTScore",
+    "a sample that got no answer is no wrong answer: it is counted under `answered` and in nothing else",
+    "intervals: whole walks drawn with replacement, as windows of a flight overlap and flights of a walk resemble each other",
+    "verdicts: against what the flight did after the window, as the captions' own were made",
+]
+
+
+def read_report(folder: Path) -> Report:
+    """Read an evaluation's report; raises as `read_model`."""
+    path = folder / REPORT
+    return read_model(path, Report, schema=REPORT_SCHEMA, version=REPORT_VERSION, what="report", tree=folder)
+
+
+def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> list[tuple[Sample, Prediction]]:
+    """Give each sample that was asked its prediction, in the order of the samples.
+
+    Raises:
+        InputError: a prediction is for a sample that the split does not have.
+    """
+    by_key = {prediction.key: prediction for prediction in predictions}
+    unknown = by_key.keys() - {sample.key for sample in samples}
+    if unknown:
+        raise InputError(
+            "a prediction is for a sample that the split does not have",
+            where=min(unknown),
+            got=f"{len(unknown)} such predictions",
+            fix="give the training set that the predictions were made from",
+        )
+    return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
+
+
+def read_judged(path: Path) -> dict[str, Sequence[SentenceState]]:
+    """Read what `cosfly caption --teacher student:` found out about a student's sentences: sample's key -> states.
+
+    Raises:
+        InputError: as `read_captions`; or somebody else than a student wrote them.
+    """
+    found: dict[str, Sequence[SentenceState]] = {}
+    for caption in read_captions(path):
+        if caption.teacher.kind != "student":
+            raise InputError(
+                "these are no captions of a student", where=f"{path}: {caption.sample_id}", got=caption.teacher.kind,
+                fix="give what cosfly caption --teacher student:PREDICTIONS wrote",
+            )  # fmt: skip
+        for language, states in (caption.checks.sentences or {}).items():
+            found[f"{caption.sample_id}/{language}"] = states
+    return found
+
+
+def text_of(coc: Coc | None) -> str:
+    """Join the three fields into the text that BERTScore compares (sec:appendix_f_caption_distillation); "" for no answer.
+
+    A floor without texts has none to compare.
+    """
+    if coc is None or not coc.reasoning_trace:
+        return ""
+    return " ".join(getattr(coc, name) for name in FIELDS).strip()
+
+
+def score_language(
+    pairs: Sequence[tuple[Sample, Prediction]], floors: Floors, scorer: TextScorer | None, judged: Judged
+) -> dict[str, Scores]:
+    """Score the student and the floors on the samples of one language: who -> scores."""
+    samples = [sample for sample, _ in pairs]
+    references = [coc_of(sample) for sample in samples]
+    who = {STUDENT: [Answer.of(prediction) for _, prediction in pairs], **floors.answers(references)}
+    texts: dict[str, np.ndarray] = {}
+    if scorer is not None:
+        written = {name: [text_of(a.coc) for a in answers] for name, answers in who.items() if name != "majority"}
+        groups = floors.groups(len(samples))
+        texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
+    return {name: score_answers(samples, answers, texts.get(name), judged.get(name)) for name, answers in who.items()}
+
+
+def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
+    """Put the scores of several languages together; who answers in one alone is left out."""
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    columns = list(Scores.__dataclass_fields__)
+    return {
+        name: Scores(**{column: np.concatenate([getattr(part[name], column) for part in parts]) for column in columns})
+        for name in names
+    }
+
+
+def measure(
+    scores: Mapping[str, Scores], predictions: Sequence[Prediction], *, resamples: int, confidence: float, seed: int
+) -> Measurement:
+    """Measure everyone on the same samples and the same draws."""
+    student = scores[STUDENT]
+    found = {}
+    for name, own in scores.items():
+        rng = rng_for(seed, STAGE, "draws")
+        figures, decisions = figures_of(own, resamples=resamples, confidence=confidence, rng=rng)
+        found[name] = Measured(figures=figures, by_decision=decisions, confusion=_confusion(own))
+    reasons = Counter(p.reason or "unknown" for p in predictions if p.coc is None)
+    failed = {p.reason or "" for p in predictions if not Answer.of(p).is_answered}
+    known = student.answered & (student.answer != UNPARSED) & ~np.isnan(student.f1)
+    histogram = np.histogram(np.clip(student.f1[known], 0, 1), bins=50, range=(0, 1))[0].tolist()
+    return Measurement(
+        samples=len(student),
+        walks=len(set(student.walk)),
+        failed={reason: count for reason, count in sorted(reasons.items()) if reason in failed},
+        unparsed={reason: count for reason, count in sorted(reasons.items()) if reason not in failed},
+        histogram_f1=histogram if known.any() else None,
+        who=found,
+    )
+
+
+def _confusion(scores: Scores) -> dict[str, dict[str, int]]:
+    names = (*ACTIONS, UNPARSED_NAME)
+    cells = Counter(
+        zip(scores.reference[scores.answered].tolist(), scores.answer[scores.answered].tolist(), strict=True)
+    )
+    found: dict[str, dict[str, int]] = {}
+    for (reference, answer), count in sorted(cells.items()):
+        found.setdefault(names[reference], {})[names[answer]] = count
+    return found
+
+
+def examples_of(pairs: Sequence[tuple[Sample, Prediction]], scores: Scores, count: int, seed: int) -> Iterator[Example]:
+    """Choose samples to show: of each kind of outcome (no answer, unparsed, wrong, right) some, drawn by the seed."""
+    kinds: dict[str, list[int]] = {"failed": [], "unparsed": [], "wrong": [], "right": []}
+    for place in rng_for(seed, STAGE, "examples").permutation(len(pairs)).tolist():
+        kinds[_kind(scores, place)].append(place)
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(pairs)):
+        for places in kinds.values():
+            if places and len(chosen) < count:
+                chosen.append(places.pop())
+    for place in chosen:
+        sample, prediction = pairs[place]
+        f1 = float(scores.f1[place])
+        yield Example(
+            key=sample.key, walk=sample.walk, reference=coc_of(sample), answer=prediction.coc, raw=prediction.raw[:2000],
+            label=sample.label, f1=None if np.isnan(f1) else f1,
+        )  # fmt: skip
+
+
+def _kind(scores: Scores, place: int) -> Literal["failed", "unparsed", "wrong", "right"]:
+    if not scores.answered[place]:
+        return "failed"
+    if scores.answer[place] == UNPARSED:
+        return "unparsed"
+    return "right" if scores.answer[place] == scores.reference[place] else "wrong"
