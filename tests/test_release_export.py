@@ -26,27 +26,27 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.config import build as build_config
-from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.errors import InputError, ResumeError
 from cosfly.products.captions import write_captions
-from cosfly.products.frames import depth_bytes
+from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import find_flights, read_flight, sample_id
 from cosfly.products.town import read_town_map
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from cosfly.store import CHECKSUMS, read_checksums
-from release.export import depth
 from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
 from release.export.lerobot.features import moves, tiff_of_depth
 from release.export.lerobot.format import runs_of
 from release.export.lerobot.summary import merged, summarize
 from release.export.manifest import read_export
-from release.export.source import ReleasedRows, Span, open_release, read_span, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
 from release.export.stage import run as export
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
 TOWNS = ("Town01", "Town02")
+TWO_SPLITS = {"split_by": "town", "validation_fraction": 0.4, "test_fraction": 0.0}
 
 
 def config(format: str, **more) -> ExportConfig:
@@ -54,16 +54,21 @@ def config(format: str, **more) -> ExportConfig:
 
 
 def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -> Path:
-    tree = make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
-    flights = [read_flight(folder) for folder in find_flights(tree)]
+    make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
+    return release_of(root, window=window, num_frames=num_frames, **change)
+
+
+def release_of(root: Path, window: int = 5, **change) -> Path:
+    """Release `tree/` with captions of windows of so many frames."""
+    flights = [read_flight(folder) for folder in find_flights(root / "tree")]
     captions = [
         make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
         for flight in flights
         for i in range(4, NUM_POINTS - 1)
     ]
     write_captions(root / "captions.jsonl", captions)
-    write_inspection(root / "inspect.json", make_inspection(tree, {}))
-    return build(root, root / "release", CFG.model_copy(update={"num_frames": num_frames, **change}))
+    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **change}))
 
 
 @pytest.fixture(scope="module")
@@ -235,55 +240,44 @@ def test_webdataset_opens_it(dataset, tmp_path):
 # --- depth ------------------------------------------------------------------------------------------------------------
 
 
-def npy(values) -> bytes:
-    return depth_bytes(np.array(values, dtype=np.float32))
-
-
-def test_millimetres_are_what_they_say():
-    loss = depth.Loss()
-    png = depth.encode(npy([[0.0, 1000.0, 1.2344, 65.534]]), "x", "millimetre", loss)
-    codes = parse_picture(png, "x", flags=-1)
-    assert codes.tolist() == [[0, 65535, 1234, 65534]]
-    assert loss.error_m == pytest.approx(0.0004, abs=1e-6)
-    assert (loss.nearest_m, loss.farthest_m) == (pytest.approx(1.2344), pytest.approx(65.534))
-
-
-@pytest.mark.parametrize("far_m", [65.5346, 66.0, 999.0])
-def test_millimetres_end_at_65_metres(far_m):
-    with pytest.raises(InputError, match=r"beyond what the millimetre coding holds.*expected 0.0005 to 65.534"):
-        depth.encode(npy([[1.0, far_m]]), "x", "millimetre", depth.Loss())
-
-
-@given(st.lists(st.floats(0.125, 999.5, width=32), min_size=1, max_size=50))
-def test_the_logarithmic_coding_loses_what_it_measured(values):
-    loss = depth.Loss()
-    given_m = np.array([values], dtype=np.float32)
-    codes = parse_picture(depth.encode(npy(given_m), "x", "logarithmic", loss), "x", flags=-1)
-    errors = np.abs(depth.decode(codes, "logarithmic") / given_m.astype(np.float64) - 1)
-    assert errors.max() == pytest.approx(loss.error_share, rel=1e-6, abs=1e-12)
-    assert loss.error_share < 1e-4
-
-
-def test_another_coding_stands_with_its_measured_error(dataset, tmp_path):
-    product = export(config("webdataset", depth="logarithmic"), dataset, tmp_path / "out")
+@pytest.mark.parametrize(("coding", "ending"), [("float16", "depth.npy"), ("millimetre_png", "depth.png")])
+def test_depth_that_was_coded_stands_with_its_measured_error(coding, ending, tmp_path):
+    exact = {}
+    for folder in find_flights(make_near_tree(tmp_path / "tree")):
+        flight = read_flight(folder)
+        exact |= {sample_id(flight.flight_id, i): read_depth(flight.frame_folder(i)) for i in range(len(flight))}
+    dataset = release_of(tmp_path, depth=coding)
+    record = open_release(dataset).record
+    product = export(config("webdataset"), dataset, tmp_path / "wds")
     said = read_export(product / "export.json").codings["depth"]
-    assert "Measured over all pixels" in said
-    worst = 0.0
+    assert f"{record.depth.max_error_m:g} m" in said
+    assert record.depth.unit in said
     rows = rows_by_id(dataset)
-    with tarfile.open(product / "train-00000.tar") as tar:
-        for name in tar.getnames():
-            if name.endswith("depth.png"):
-                exact = np.load(io.BytesIO(rows[name.partition(".")[0]]["depth"]))
-                codes = parse_picture(tar.extractfile(name).read(), name, flags=-1)
-                is_distance = (exact != 0) & (exact != 1000)
-                worst = max(worst, np.abs(depth.decode(codes, "logarithmic") - exact)[is_distance].max())
-                assert (codes[exact == 1000] == depth.SKY).all()
-    assert 0 < worst <= float(said.split("error at most ")[1].split(" ")[0]) + 1e-6
+    assert any(name.endswith(ending) for shard in product.glob("*.tar") for name in names_in(shard))
+    worst = 0.0
+    for name, row in rows.items():
+        decoded = np.load(io.BytesIO(depth_npy(row, record.depth)))
+        assert decoded.dtype == np.float32
+        is_distance = (exact[name] != 0) & (exact[name] != 1000)
+        assert (decoded[~is_distance] == exact[name][~is_distance]).all()
+        worst = max(worst, np.abs(decoded.astype(np.float64) - exact[name])[is_distance].max(initial=0.0))
+    assert 0 < worst <= record.depth.max_error_m + 1e-5  # a millimetre in float32
+    tree = export(config("tree"), dataset, tmp_path / "back")
+    for folder in find_flights(tree):
+        flight = read_flight(folder)
+        for i in range(len(flight)):
+            assert read_depth(flight.frame_folder(i)).dtype == np.float32
 
 
-def test_only_webdataset_takes_another_coding(dataset, tmp_path):
-    with pytest.raises(ConfigError, match="float32 only"):
-        export(config("lerobot", depth="millimetre"), dataset, tmp_path / "out")
+def make_near_tree(root: Path) -> Path:
+    """A tree whose depth ends at 60 m but for the sky, as millimetres in 16 bits ask."""
+    tree = make_playback_tree(root, 2, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
+    for path in tree.rglob("depth.npy"):
+        depth = read_depth(path.parent)
+        depth[(depth > 60) & (depth < 1000)] = 60.0
+        depth[0, 0], depth[0, 1] = 0.0, 1000.0
+        path.write_bytes(depth_bytes(depth))
+    return tree
 
 
 # --- LeRobot: what needs no LeRobot -----------------------------------------------------------------------------------
@@ -348,9 +342,24 @@ def test_a_flight_with_gaps_is_several_episodes(tmp_path):
     assert info["total_frames"] == 48
 
 
+def test_splits_reach_every_format(tmp_path):
+    dataset = make_release(tmp_path, **TWO_SPLITS)
+    numbers = open_release(dataset).record.splits.splits
+    assert set(numbers) == {"train", "validation"}
+    shards = export(config("webdataset"), dataset, tmp_path / "wds")
+    for split, told in numbers.items():
+        names = [name for shard in shards.glob(f"{split}-*.tar") for name in names_in(shard)]
+        assert sum(name.endswith(".json") for name in names) == told.frames
+    episodes = numbers["train"].flights
+    for format in ("lerobot", "lerobot-v2.1"):
+        info = json.loads((export(config(format), dataset, tmp_path / format) / "meta/info.json").read_text())
+        assert info["splits"] == {"train": f"0:{episodes}", "validation": f"{episodes}:6"}
+
+
 # --- whatever the format ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path):
     one = export(config(format), dataset, tmp_path / "one")
@@ -456,7 +465,8 @@ def change_record(folder: Path, change) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["../../secret.parquet", "/etc/passwd", "data/x.parquet", "data/train-00000-of-00001.parquet/../x"]
+    "path",
+    ["../../secret.parquet", "/etc/passwd", "data/x.parquet", "data/train-0123456789ab-00000-of-00001.parquet/../x"],
 )
 def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, path):
     change_record(broken, lambda record: record["shards"][0].update(path=path))
@@ -471,6 +481,15 @@ def rewrite(folder: Path, change) -> None:
     rows = table.to_pylist()
     change(rows)
     pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path, row_group_size=NUM_POINTS)
+    tell_size(folder, path)
+
+
+def tell_size(folder: Path, path: Path) -> None:
+    def change(record):
+        (shard,) = [shard for shard in record["shards"] if shard["path"].endswith(path.name)]
+        shard["bytes"] = path.stat().st_size
+
+    change_record(folder, change)
 
 
 @pytest.mark.parametrize(
@@ -501,8 +520,7 @@ def test_rows_that_cannot_be_are_refused_before_anything_is_written(broken, tmp_
         (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "two frames of one name"),
     ],
 )
-def test_a_unit_that_fails_publishes_nothing_and_is_done_again(broken, tmp_path, change, words):
-    good = {p.name: p.read_bytes() for p in (broken / "data").iterdir()}
+def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     rewrite(broken, change)
     with pytest.raises(InputError, match="could not be exported"):
         export(config("webdataset"), broken, tmp_path / "out")
@@ -510,11 +528,17 @@ def test_a_unit_that_fails_publishes_nothing_and_is_done_again(broken, tmp_path,
     assert words in failures
     assert '"bug"' not in failures
     assert not (tmp_path / "out/webdataset").exists()
-    for name, data in good.items():
-        (broken / "data" / name).write_bytes(data)
+
+
+def test_a_unit_that_failed_is_done_again_alone(broken, dataset, tmp_path):
+    path = next((broken / "data").glob("train-*.parquet"))
+    good = path.read_bytes()
+    path.write_bytes(good.replace(b"\x89PNG", b"\x89GIF", 1))
+    with pytest.raises(InputError, match="1 failed"):
+        export(config("webdataset"), broken, tmp_path / "out")
+    path.write_bytes(good)
     product = export(config("webdataset"), broken, tmp_path / "out")
-    names = [name for shard in product.glob("*.tar") for name in names_in(shard)]
-    assert len(rows_by_id(broken)) == sum(name.endswith(".json") for name in names)
+    assert all_bytes(product) == all_bytes(export(config("webdataset"), dataset, tmp_path / "other"))
 
 
 @pytest.mark.parametrize("change", [lambda rows: rows[3].update(pose=None), lambda rows: rows[3].update(width_px=97)])
@@ -528,7 +552,15 @@ def test_a_flight_of_two_cameras_or_without_a_pose_is_no_tree(broken, tmp_path, 
 def test_a_shard_of_another_version_is_refused(broken, tmp_path):
     path = next((broken / "data").glob("*.parquet"))
     pq.write_table(pq.read_table(path).drop_columns(["style"]), path)
+    tell_size(broken, path)
     with pytest.raises(InputError, match=r"not a shard of this version.*style"):
+        export(config("webdataset"), broken, tmp_path / "out")
+
+
+def test_a_shard_of_another_size_than_its_record_says_is_refused(broken, tmp_path):
+    path = next((broken / "data").glob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"not a whole release.*bytes and not"):
         export(config("webdataset"), broken, tmp_path / "out")
 
 
@@ -549,8 +581,7 @@ def test_the_command(dataset, tmp_path):
     assert done.exit_code == 0, done.output
     assert str(tmp_path / "out/webdataset") in done.output
     done = CliRunner().invoke(
-        app,
-        ["release", "export", str(dataset), "--format", "tree", "--depth", "millimetre", "--out", str(tmp_path / "x")],
+        app, ["release", "export", str(tmp_path), "--format", "tree", "--out", str(tmp_path / "x")]
     )
     assert done.exit_code == 1
     assert "Traceback" not in done.output

@@ -305,7 +305,13 @@ def test_coordinates_stand_in_the_record_for_programs(built):
 def test_nothing_local_is_published(built, inputs):
     for name, data in all_bytes(built).items():
         assert str(inputs).encode() not in data, name
-    assert {p.name for p in built.iterdir()} == {"README.md", "release.json", "checksums.sha256", "data"}
+    assert {p.name for p in built.iterdir()} == {
+        "README.md",
+        "release.json",
+        "croissant.json",
+        "checksums.sha256",
+        "data",
+    }
 
 
 def test_shards_hold_whole_row_groups_in_order(built):

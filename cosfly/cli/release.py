@@ -132,12 +132,6 @@ def release_export(
         Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"],
         typer.Option(help="Playback tree (CosFly-Track v7), WebDataset, LeRobot v3.0 or v2.1."),
     ],
-    depth: Annotated[
-        Literal["float32", "millimetre", "logarithmic"],
-        typer.Option(
-            help="How depth is coded: lossless, or for WebDataset PNG of 16 bits; what that costs is measured."
-        ),
-    ] = "float32",
     shard_mb: Annotated[int | None, typer.Option(help="Size of a file of many frames, about, in MB.")] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
@@ -154,8 +148,6 @@ def release_export(
     cfg = options.resolve(config, overrides, {"workers": workers})
     options.set_aside(out, repair)
     options.verify_first(verify, folder, out)
-    given = {"format": format, "depth": depth} | ({} if shard_mb is None else {"shard_mb": shard_mb})
-    product = export.run(
-        build(ExportConfig, given, "--format, --depth, --shard-mb"), folder, out, **options.manner(cfg, resume)
-    )
+    given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
+    product = export.run(build(ExportConfig, given, "--format, --shard-mb"), folder, out, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)

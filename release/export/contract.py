@@ -30,17 +30,12 @@ FORMATS: dict[FormatName, str] = {
     "lerobot": "release.export.lerobot.format",
     "lerobot-v2.1": "release.export.lerobot.format",
 }
-DepthCoding = Literal["float32", "millimetre", "logarithmic"]
 
 
 class ExportConfig(Config):
     """What is made of a release."""
 
     format: FormatName = Field(description="tree, webdataset, lerobot (v3.0) or lerobot-v2.1")
-    depth: DepthCoding = Field(
-        "float32",
-        description="how depth is coded: float32 is lossless; millimetre and logarithmic are PNG of 16 bits, WebDataset only",
-    )
     shard_mb: int = Field(
         500,
         ge=1,
@@ -71,9 +66,7 @@ class Facts(BaseModel):
     """What a format says of itself in `export.json`, and the files that `finish` wrote (relative name -> sha256)."""
 
     version: str
-    codings: dict[
-        str, str
-    ] = {}  # of each modality: how it is stored, with unit, range and measured error where it is not lossless
+    codings: dict[str, str] = {}  # of each modality: how it is stored
     notes: list[str] = []  # what a reader must know: conventions, and what the format cannot carry
     how_to_open: str  # lines of Python
     coordinates: dict[str, str] = {}  # where the format has other axes than the release

@@ -54,7 +54,7 @@ def describe(release: Release, facts: Facts, cfg: ExportConfig, *, frames: int, 
         format_version=facts.version,
         made_by=f"cosfly {cosfly.__version__}",
         release=CameFrom(
-            name=record.name, made_by=record.made_by, digest=release.digest, record_sha256=release.record_sha256
+            name=record.name, made_by=record.made_by, digest=record.content_digest, record_sha256=release.record_sha256
         ),
         licence=record.licence,
         credits=record.credits,

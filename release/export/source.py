@@ -6,24 +6,24 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.errors import InputError
-from cosfly.products.frames import FrameFile
-from cosfly.reading.arrays import png_size
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_bytes
+from cosfly.reading.arrays import parse_array, parse_picture, png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
-from cosfly.store import inside, sha256_bytes
-from release.columns import PICTURES, PLACE, schema
-from release.record import ReleaseRecord, read_record
+from cosfly.store import inside
+from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, schema
+from release.record import DepthCoding, ReleaseRecord, read_record
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
-SHARD_NAME = re.compile(r"data/(train|validation|test)-(?:[0-9a-f]{12}-)?\d{5}-of-\d{5}\.parquet")
-SPLITS = ("train", "validation", "test")
+SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
 NEVER_NULL = ("sample_id", "track", "style", "pace", "width_px", "height_px", "frame_index", "time_s")
 LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision"]
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
@@ -53,7 +53,7 @@ class ReleasedRows:
     town: str
     trajectory: str
     variant: str
-    split: str
+    split: SplitName
     spans: list[Span] = field(default_factory=list)
     frames: list[np.ndarray] = field(default_factory=list)
     times: list[np.ndarray] = field(default_factory=list)
@@ -88,12 +88,6 @@ class Release:
     def modalities(self) -> list[FrameFile]:
         return self.record.settings.modalities
 
-    @property
-    def digest(self) -> str:
-        """Of its content; of a record without one, of the list of its shards."""
-        listed = "".join(f"{shard.sha256} {shard.path}\n" for shard in self.record.shards)
-        return getattr(self.record, "content", None) or sha256_bytes(listed.encode())
-
 
 def open_release(folder: Path) -> Release:
     """Open a release folder, or the `dataset` folder inside a release stage's.
@@ -104,21 +98,24 @@ def open_release(folder: Path) -> Release:
     if not (folder / "release.json").is_file() and (folder / "dataset" / "release.json").is_file():
         folder = folder / "dataset"
     record = read_record(folder / "release.json")
-    wrong = [shard.path for shard in record.shards if not SHARD_NAME.fullmatch(shard.path)]
-    missing = [s.path for s in record.shards if s.path not in wrong and not inside(folder, s.path).is_file()]
-    if wrong or missing:
-        got = "; ".join(
-            [*(f"{name!r} is no name of a shard" for name in wrong), *(f"{name} is missing" for name in missing)]
-        )
-        raise InputError("not a whole release", where=folder, got=got, fix="see `cosfly release verify`")
+    wrong = []
+    for shard in record.shards:
+        if not SHARD_NAME.fullmatch(shard.path):
+            wrong.append(f"{shard.path!r} is no name of a shard")
+        elif not (path := inside(folder, shard.path)).is_file():
+            wrong.append(f"{shard.path} is missing")
+        elif (size := path.stat().st_size) != shard.bytes:
+            wrong.append(f"{shard.path} has {size} bytes and not {shard.bytes}")
+    if wrong:
+        raise InputError("not a whole release", where=folder, got="; ".join(wrong), fix="see `cosfly release verify`")
     return Release(folder, record, sha256_file(folder / "release.json", tree=folder))
 
 
-def split_of(shard: str) -> str:
+def split_of(shard: str) -> SplitName:
     """Give the split that a shard's name says: train, validation or test."""
     match = SHARD_NAME.fullmatch(shard)
     assert match is not None, shard
-    return match[1]
+    return cast(SplitName, match[1])
 
 
 def scan(release: Release) -> list[ReleasedRows]:
@@ -130,7 +127,7 @@ def scan(release: Release) -> list[ReleasedRows]:
     """
     flights: dict[Place, ReleasedRows] = {}
     shards = sorted(
-        (shard.path for shard in release.record.shards), key=lambda path: (SPLITS.index(split_of(path)), path)
+        (shard.path for shard in release.record.shards), key=lambda path: (SPLIT_NAMES.index(split_of(path)), path)
     )
     wanted = schema(release.modalities)
     for shard in shards:
@@ -234,3 +231,34 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
             got="none" if not data else "no PNG",
         )
     return data
+
+
+def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
+    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release has coded it.
+
+    Raises:
+        InputError: it is not what the record of the release says.
+    """
+    data, where = picture(row, "depth"), row["sample_id"]
+    if coding is None or coding.coding == "float32":
+        return data
+    if coding.coding == "float16":
+        return depth_bytes(parse_array(data, where, dtype=np.float16, ndim=2, what="depth image").astype(np.float32))
+    codes = parse_picture(data, where, flags=cv2.IMREAD_UNCHANGED)
+    if codes.dtype != np.uint16 or codes.ndim != 2:
+        raise InputError(
+            "not a depth image", where=where, got=f"{codes.dtype} {codes.shape}", expected="a PNG of 16 bits"
+        )
+    depth = codes.astype(np.float32) / np.float32(1000.0)
+    depth[codes == coding.sky], depth[codes == coding.invalid] = SKY_DEPTH_M, INVALID_DEPTH_M
+    return depth_bytes(depth)
+
+
+def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
+    """Say how depth is stored, with unit, range and error where it is not the float32 that was rendered."""
+    if coding is None or coding.coding == "float32":
+        return f"{stored}: float32, metres, lossless"
+    return (
+        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; {coding.sky:g} sky, {coding.invalid:g} invalid), "
+        f"whose greatest error, measured over all pixels, is {coding.max_error_m:g} m"
+    )

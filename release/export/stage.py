@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cosfly.errors import ConfigError, InputError, VerifyError
+from cosfly.errors import InputError, VerifyError
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, result_of
 from cosfly.store import CHECKSUMS, inside, storage_errors, write_bytes, write_checksums
@@ -40,11 +40,6 @@ def run(
     resume: Resume = "if-same",
 ) -> Path:
     """Read a release; write it in the format of the settings and give the folder it stands in."""
-    if cfg.depth != "float32" and cfg.format != "webdataset":
-        raise ConfigError(
-            "this format carries depth as float32 only", where="depth", got=f"{cfg.depth} for {cfg.format}",
-            fix="leave --depth out, or choose --format webdataset",
-        )  # fmt: skip
     release = open_release(folder)
     record = release.folder / "release.json"
     stage = StageFolder.open(out, "export", config=cfg, inputs={"release": record}, seed=0, resume=resume)

@@ -31,7 +31,7 @@ from cosfly.runner import advance
 from cosfly.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import BOX, PICTURES, POINT, POSE, SCALAR_NAMES
 from release.export.contract import ExportConfig, Facts, Files, Unit, Written
-from release.export.source import Release, ReleasedRows, picture, read_span
+from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 Row = dict[str, Any]
@@ -71,7 +71,8 @@ def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Writ
     for i, row in enumerate(_rows(release, rows)):
         for file in release.modalities:
             name = f"{frame_name(i)}/{FILE_NAMES[file]}"
-            digests[name] = files.put(f"{place}/{name}", picture(row, file), listed=False)
+            data = depth_npy(row, release.record.depth) if file == "depth" else picture(row, file)
+            digests[name] = files.put(f"{place}/{name}", data, listed=False)
         scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance()
     (folder / place).mkdir(parents=True, exist_ok=True)
@@ -102,7 +103,12 @@ def finish(
         files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
     return Facts(
         version=VERSION,
-        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in release.modalities},
+        codings={
+            file: depth_in_words(release.record.depth, FILE_NAMES[file])
+            if file == "depth"
+            else f"{FILE_NAMES[file]}, the released bytes"
+            for file in release.modalities
+        },
         coordinates=COORDINATES,
         notes=list(_notes(units, written)),
         how_to_open="from cosfly.products.playback import find_flights, read_flight\n"
@@ -114,7 +120,7 @@ def finish(
 def _notes(units: Sequence[Unit], written: Sequence[Written]) -> Iterator[str]:
     yield (
         "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of the flight each was. "
-        "The layout has no captions: they stand in the release. meta.json and the order of missions are not released."
+        "The layout has no captions: they stand in the release. meta.json, weather and the order of missions are not in it."
     )
     gaps = sum(one.facts["has_gaps"] for one in written)
     if gaps:
@@ -176,7 +182,7 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
             "released_frames": placed.frame_index.tolist(),
             **pace_field(rows[0]["pace"]),
         },
-        raw={"points": [_point(row) for row in rows]},
+        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]),
     )
 
 
@@ -186,6 +192,11 @@ def _point(row: Row) -> dict[str, Any]:
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}
     return {"perturbation": told} if told else {}
+
+
+def _weather(row: Row) -> dict[str, Any]:
+    told = {name: row[name] for name in ("weather", "time_of_day") if row[name] is not None}
+    return {"weather": told} if told else {}
 
 
 def _segments(styles: list[str]) -> tuple[Segment, ...]:

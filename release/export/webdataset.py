@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import tarfile
 from collections.abc import Sequence
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, cast
@@ -19,10 +18,9 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile
 from cosfly.runner import advance
 from cosfly.store import atomic_file, dump_json
-from release.columns import PICTURES
-from release.export import depth as depth_coding
+from release.columns import PICTURES, SPLIT_NAMES
 from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
-from release.export.source import PART, SPLITS, Release, ReleasedRows, Span, picture, read_span
+from release.export.source import PART, Release, ReleasedRows, Span, depth_in_words, picture, read_span
 
 MB = 1024 * 1024
 VERSION = "tar, keys sorted"
@@ -33,7 +31,7 @@ PICTURE_COLUMNS = {column.name for column in PICTURES.values()}
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
     """Cut each split into shards of about `shard_mb`; a unit is one shard."""
     units = []
-    for split in SPLITS:
+    for split in SPLIT_NAMES:
         groups: list[list[Span]] = []
         filled = 0.0
         for flight in (flight for flight in flights if flight.split == split):
@@ -54,9 +52,9 @@ def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Writ
     """Write one shard.
 
     Raises:
-        InputError: a picture is missing or damaged, two frames have one key, or the depth is beyond its coding.
+        InputError: a picture is missing or damaged, or two frames have one key.
     """
-    files, loss = Files(folder), depth_coding.Loss()
+    files = Files(folder)
     name, keys = f"{unit.name}.tar", set[str]()
     with atomic_file(folder / name) as file:
         hashed = HashedFile(file)
@@ -67,26 +65,24 @@ def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Writ
                     if key in keys or not PART.fullmatch(key):
                         raise InputError("two frames of one name, or no name of a file", where=unit.name, got=key)
                     keys.add(key)
-                    for ending, data in members(row, release.modalities, cfg, loss):
+                    for ending, data in members(row, release):
                         tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))
                     advance()
     files.note(name, hashed.digest.hexdigest(), hashed.num_bytes)
-    return files.written(loss=vars(loss) if loss.farthest_m else None)
+    return files.written()
 
 
-def members(
-    row: dict[str, Any], modalities: Sequence[FrameFile], cfg: ExportConfig, loss: depth_coding.Loss
-) -> list[tuple[str, bytes]]:
+def members(row: dict[str, Any], release: Release) -> list[tuple[str, bytes]]:
     """Give the files of one frame, by their endings in order."""
     scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
-    found = {"json": (dump_json(scalars) + "\n").encode()}
-    for file in modalities:
-        data = picture(row, file)
-        if file == "depth" and cfg.depth != "float32":
-            found["depth.png"] = depth_coding.encode(data, row["sample_id"], cfg.depth, loss)
-        else:
-            found[ENDINGS[file]] = data
-    return sorted(found.items())
+    pictures = {ending: picture(row, file) for file, ending in endings(release).items()}
+    return sorted({"json": (dump_json(scalars) + "\n").encode(), **pictures}.items())
+
+
+def endings(release: Release) -> dict[FrameFile, str]:
+    """Give what the files of a frame's pictures end with."""
+    coded = release.record.depth is not None and release.record.depth.coding == "millimetre_png"
+    return {file: "depth.png" if file == "depth" and coded else ENDINGS[file] for file in release.modalities}
 
 
 def _header(name: str, size: int) -> tarfile.TarInfo:
@@ -98,20 +94,16 @@ def _header(name: str, size: int) -> tarfile.TarInfo:
 def finish(
     release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
 ) -> Facts:
-    """Say how the shards are opened and what the depth coding cost."""
-    codings = {file: f"{ENDINGS[file]}, the released bytes" for file in release.modalities}
-    if cfg.depth != "float32" and "depth" in codings:
-        total = depth_coding.Loss()
-        for one in written:
-            if one.facts["loss"]:
-                total.merge(replace(total, **one.facts["loss"]))
-        codings["depth"] = f"depth.png: {depth_coding.in_words(cfg.depth, total)}"
+    """Say how the shards are opened."""
+    codings = {file: f"{ending}, the released bytes" for file, ending in endings(release).items()}
+    if "depth" in codings:
+        codings["depth"] = depth_in_words(release.record.depth, codings["depth"])
     first = units[0].extra
     last = sum(unit.extra == first for unit in units) - 1
     shards = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
     splits = ", ".join(
         f"{split}: {sum(u.extra == split for u in units)} shards"
-        for split in SPLITS
+        for split in SPLIT_NAMES
         if any(u.extra == split for u in units)
     )
     return Facts(

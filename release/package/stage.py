@@ -1,7 +1,7 @@
 """`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
 Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md, release.json,
-checksums.sha256), which is what gets published: all of it, or nothing. Around it stand the stage's own records, which hold local paths and do not.
+croissant.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand the stage's own records, which hold local paths and do not.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
 from cosfly.store import CHECKSUMS, atomic_folder, write_bytes, write_checksums
 from release import columns
+from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.columns import SPLIT_NAMES, SplitName
@@ -460,10 +461,11 @@ def make_record(
 
 
 def write_records(folder: Path, record: ReleaseRecord) -> None:
-    """Write release.json, the card and the checksums beside the shards."""
+    """Write release.json, the card, croissant.json and the checksums beside the shards."""
     write_record(folder / "release.json", record)
     write_bytes(folder / "README.md", render_card(record).encode())
+    write_bytes(folder / CROISSANT, render_croissant(record).encode())
     digests = {shard.path: shard.sha256 for shard in record.shards}
-    for name in ("release.json", "README.md"):
+    for name in ("release.json", "README.md", CROISSANT):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)

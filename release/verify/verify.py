@@ -24,6 +24,7 @@ from cosfly.reading.tables import open_table
 from cosfly.stage_folder import flattened
 from cosfly.store import CHECKSUMS, inside, read_checksums
 from release import columns
+from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers, read_rows
 from release.card.render import render_card
 from release.columns import CAPTION_COLUMNS, CAPTION_FIELDS, CAPTION_LISTS, PICTURES, PLACE, POINT
@@ -31,7 +32,7 @@ from release.record import ReleaseRecord, read_record
 from release.subsample import select_frames
 
 REPROJECTION_TOLERANCE_PX = 0.5
-RECORDS = ("README.md", "release.json", CHECKSUMS)
+RECORDS = ("README.md", "release.json", CROISSANT, CHECKSUMS)
 ALLOWED = (".git", ".gitattributes", ".cache")  # what the hub and its client put beside a data set
 NEVER_NULL = (
     "decision",
@@ -124,7 +125,7 @@ def _check_checksums(folder: Path, record: ReleaseRecord, report: Report) -> Non
         report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
         return
     listed = {entry.path: entry.sha256 for entry in record.shards}
-    for name in sorted({*listed, "README.md", "release.json"} ^ set(digests)):
+    for name in sorted({*listed, "README.md", "release.json", CROISSANT} ^ set(digests)):
         place = "only in release.json" if name in listed else "only in one of the lists"
         report.error("checksum", f"{CHECKSUMS}: {name}", place, "one line per file")
     for name, digest in sorted(digests.items()):
@@ -207,6 +208,9 @@ def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
     except InputError as error:
         report.error("card", "README.md", error.got or error.what, "the card")
         return
+    croissant = folder / CROISSANT
+    if croissant.is_file() and read_bytes(croissant, tree=folder) != render_croissant(record).encode():
+        report.error("card", CROISSANT, "other words", "what release.json gives")
     wanted = render_card(record).split("\n")
     for number, (line, expected) in enumerate(itertools.zip_longest(found, wanted, fillvalue="the end"), 1):
         if line != expected:

@@ -28,11 +28,11 @@ from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.runner import advance
 from cosfly.store import atomic_file, dump_json
-from release.columns import PICTURES
+from release.columns import PICTURES, SPLIT_NAMES
 from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
 from release.export.lerobot.features import CAMERAS, COLUMNS, Feature, features_of, schema_of, tiff_of_depth, values_of
 from release.export.lerobot.summary import QUANTILES, Summary, merged, sampled, summarize, thinned
-from release.export.source import SPLITS, Release, ReleasedRows, picture, read_span, rows_of_flight
+from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, rows_of_flight
 
 MB = 1024 * 1024
 CHUNK = 1000  # files, or in v2.1 episodes, of one folder
@@ -84,7 +84,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
         )
     units: list[Unit] = []
     episode = index = 0
-    for split in SPLITS:
+    for split in SPLIT_NAMES:
         groups: list[list[ReleasedRows]] = []
         for flight in (flight for flight in flights if flight.split == split):
             is_full = groups and sum(member.num_bytes for member in groups[-1]) >= cfg.shard_mb * MB
@@ -200,10 +200,10 @@ def _tables(
     pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in release.modalities}
     schema, wanted = schema_of(features), sampled(n)
     for first, rows in _pictures(release, episode):
-        images = {CAMERAS[file]: [_image(row, file) for row in rows] for file in release.modalities}
+        images = {CAMERAS[file]: [_image(release, row, file) for row in rows] for file in release.modalities}
         for i in wanted & set(range(first, first + len(rows))):
             for file in release.modalities:
-                pixels[CAMERAS[file]].append(_pixels(rows[i - first], file))
+                pixels[CAMERAS[file]].append(_pixels(release, rows[i - first], file))
         part = slice(first, first + len(rows))
         columns = [images[name] if name in images else _column(values[name][part], features[name]) for name in features]
         yield pa.table(
@@ -237,20 +237,18 @@ def _pictures(release: Release, episode: Episode) -> Iterator[tuple[int, list[di
         at += span.stop - span.start
 
 
-def _image(row: dict[str, Any], file: FrameFile) -> dict[str, Any]:
-    data = picture(row, file)
-    ending = "tiff" if file == "depth" else "png"
-    return {
-        "bytes": tiff_of_depth(data, row["sample_id"]) if file == "depth" else data,
-        "path": f"{row['sample_id']}.{file}.{ending}",
-    }
-
-
-def _pixels(row: dict[str, Any], file: FrameFile) -> np.ndarray:
-    data, where = picture(row, file), row["sample_id"]
+def _image(release: Release, row: dict[str, Any], file: FrameFile) -> dict[str, Any]:
     if file == "depth":
-        return thinned(parse_array(data, where, dtype=np.float32, ndim=2))
-    return thinned(parse_picture(data, where)[..., ::-1])
+        data = tiff_of_depth(depth_npy(row, release.record.depth), row["sample_id"])
+        return {"bytes": data, "path": f"{row['sample_id']}.depth.tiff"}
+    return {"bytes": picture(row, file), "path": f"{row['sample_id']}.{file}.png"}
+
+
+def _pixels(release: Release, row: dict[str, Any], file: FrameFile) -> np.ndarray:
+    where = row["sample_id"]
+    if file == "depth":
+        return thinned(parse_array(depth_npy(row, release.record.depth), where, dtype=np.float32, ndim=2))
+    return thinned(parse_picture(picture(row, file), where)[..., ::-1])
 
 
 def _column(values: Any, feature: Feature) -> Any:
@@ -339,8 +337,7 @@ def finish(
     return Facts(
         version=VERSIONS[cfg.format],
         codings={
-            file: "TIFF of float32, m, uncompressed before the parquet file's zstd: the released numbers"
-            if file == "depth" else "PNG, the released bytes"
+            file: depth_in_words(release.record.depth, "TIFF, the released numbers") if file == "depth" else "PNG, the released bytes"
             for file in release.modalities
         }
         | {"poses and points": "float32 of the released float64: a coordinate of 1,000 m is rounded by at most 0.00003 m"},
@@ -361,7 +358,7 @@ def _info(release: Release, units: Sequence[Unit], counts: list[int], cfg: Expor
     layout: Layout = units[0].extra
     splits: dict[str, str] = {}
     total = 0
-    for split in SPLITS:
+    for split in SPLIT_NAMES:
         here = sum(count for unit, count in zip(units, counts, strict=True) if unit.extra.split == split)
         if here:
             splits[split] = f"{total}:{total + here}"
