@@ -72,7 +72,7 @@ from cosfly.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.store import CHECKSUMS, write_checksums, write_json
 from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.evaluation import stage as evaluate
-from distill.inference.stage import make_prediction
+from distill.inference.outcome import make_prediction
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared

@@ -10,6 +10,8 @@ from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_
 from cosfly.products.playback import find_flights, read_flight, sample_id
 from cosfly.provenance import fingerprint
 from cosfly.splits import Split
+from cosfly.store import write_json
+from cosfly.student_chat import Look, Taught, write_taught
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source
@@ -98,3 +100,40 @@ def make_captions(path: Path, tree: Path) -> list[Caption]:
         ]
     write_captions(path, captions)
     return captions
+
+
+ADAPTER_PIXELS = 64 * 64
+TEACHING = Taught.model_validate({
+    "prompts": {"en": {"system": "You fly.", "user": "Five frames."}}, "num_frames": 5, "max_pixels": ADAPTER_PIXELS,
+    "looks": [Look(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
+})  # fmt: skip
+
+
+def make_adapter(base: Path, folder: Path, **changes) -> Path:
+    """An adapter with random updates, as `distill train` leaves one."""
+    import torch
+    from peft import LoraConfig, get_peft_model
+
+    from distill.student.checkpoint import ADAPTER_FACTS, adapter_facts
+    from distill.student.model import load_student
+    from distill.training.settings import TARGET_MODULES
+
+    student = load_student(base, device="cpu", max_pixels=ADAPTER_PIXELS)
+    lora = {
+        "r": 4,
+        "lora_alpha": 12,
+        "target_modules": TARGET_MODULES,
+        "init_lora_weights": False,
+        "task_type": "CAUSAL_LM",
+    }
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(7)
+        student.model = get_peft_model(student.model, LoraConfig(**{**lora, **changes}))
+    with torch.no_grad():  # what training changes is small beside what was there
+        for name, tensor in student.model.named_parameters():
+            if "lora_B" in name:
+                tensor.mul_(0.02)
+    student.model.save_pretrained(folder)
+    write_json(folder / ADAPTER_FACTS, adapter_facts(student, ADAPTER_PIXELS, base))
+    write_taught(folder, TEACHING)
+    return folder

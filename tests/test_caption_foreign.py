@@ -21,8 +21,9 @@ from cosfly.inspection.flight import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
 from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction
+from cosfly.stage_folder import Failed
 from distill.inference import stage as infer
-from distill.inference.stage import failed_prediction, make_prediction
+from distill.inference.outcome import Answered, make_prediction, prediction_of
 from distill.prepare.samples import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.package import stage as package
@@ -256,7 +257,8 @@ def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_
     ]  # fmt: skip
     sample = make_sample(rules[2], "en", PrepareConfig())
     assert not isinstance(sample, str)
-    assert (failed_prediction(sample, "test", "oom").reason) == "failed_oom"
+    failed = Answered(sample, Failed(id=sample.key, code="oom", message="no"))
+    assert prediction_of(failed, "test").reason == "failed_oom"
 
 
 def test_predictions_of_before_and_of_nothing(tmp_path, rules):

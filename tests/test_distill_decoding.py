@@ -15,7 +15,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
 from distill.student import decoding  # noqa: E402
-from distill.student.decoding import Decoded, decode, image_features  # noqa: E402
+from distill.student.decoding import Decoded, decode  # noqa: E402
 from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
@@ -136,12 +136,20 @@ def test_rows_without_pictures_only(student, rows):
     blind = [row for row in rows if not len(row.image_grids)]
     assert len(blind) == 2
     assert decode(student, blind, max_tokens=MOST) == generated(student, blind)
-    assert image_features(student, blind) is None
 
 
 def test_features_seen_before_give_the_same(student, rows):
-    features = [image_features(student, [row]) for row in rows]
-    joined = torch.cat([each for each in features if each is not None])
+    seen = [prompt_batch(student, [row]) for row in rows if len(row.image_grids)]
+    with torch.inference_mode():
+        joined = torch.cat(
+            [
+                found
+                for row in seen
+                for found in student.core.model.get_image_features(
+                    row["pixel_values"], row["image_grid_thw"]
+                ).pooler_output
+            ]
+        )
     with student.model.model.visual.register_forward_hook(lambda *_: pytest.fail("the tower looked again")):
         found = decode(student, rows, max_tokens=MOST, features=joined)
     assert found == generated(student, rows)
@@ -173,7 +181,7 @@ class EvenTokens:
     def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
         allowed = np.tile(np.arange(num_tokens) % 2 == 0, (len(rows), 1))
         allowed[:, self.end] = [self.counts[row] > row for row in rows]
-        return allowed
+        return np.packbits(allowed, axis=1, bitorder="little")
 
     def consume(self, row: int, token: int) -> None:
         self.counts[row] += 1

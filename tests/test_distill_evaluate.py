@@ -29,7 +29,7 @@ from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_r
 from distill.evaluation.scores import VERDICTS, Answer, Scores, read_scores, score_answers, write_scores
 from distill.evaluation.speed import speed_of
 from distill.evaluation.stage import EvaluateConfig, run
-from distill.inference.stage import failed_prediction, make_prediction
+from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.samples import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 

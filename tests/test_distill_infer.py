@@ -6,6 +6,7 @@ import base64
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +16,11 @@ from teacher_server import TeacherServer, kept_answers
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import ConfigError, TeacherError
+from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
+from distill.inference import outcome
 from distill.inference import stage as infer
+from distill.inference.asking import make_request
 from distill.schema import open_split, resolve_trees
 from distill.student.encoding import load_pictures
 from specimens import make_playback_tree
@@ -47,7 +50,9 @@ def infer_with(cfg: infer.InferConfig, place: Path, url: str, out: Path, **more)
 def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
     samples = list(open_split(place / "set", "train"))
     with TeacherServer() as server:
-        path = infer_with(settings(max_new_tokens=99, max_pixels=300), place, server.url, tmp_path / "out")
+        path = infer_with(
+            settings(max_new_tokens=99, max_pixels=300, constrained=True), place, server.url, tmp_path / "out"
+        )
     predictions = read_predictions(path)
     assert [p.key for p in predictions] == [sample.key for sample in samples]
     assert all(p.coc is not None and p.is_finished and p.num_tokens == 100 for p in predictions)
@@ -68,7 +73,7 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
 def test_a_small_picture_is_sent_as_it_is(place):
     sample = open_split(place / "set", "train")[0]
     trees = resolve_trees(place / "set", [place / "tree"])
-    request = infer.make_request(sample, trees, settings())
+    request = make_request(sample, trees, settings().sampling, 0)
     parts = [part for part in request.messages[1]["content"] if part["type"] == "image_url"]
     for part, picture in zip(parts, load_pictures(sample, trees), strict=True):
         data = base64.b64decode(part["image_url"]["url"].partition(",")[2])
@@ -77,23 +82,94 @@ def test_a_small_picture_is_sent_as_it_is(place):
 
 def test_nothing_answered_is_asked_twice(place, tmp_path):
     out = tmp_path / "out"
+    cfg = settings(endpoint={"stop_after_failures": 2})
     with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
-        with pytest.raises(TeacherError, match=r"a sample got no answer.*http_500.*same command"):
-            infer_with(settings(), place, server.url, out)
+        with pytest.raises(TeacherError, match=r"2 samples in a row got no answer.*http_500.*same command"):
+            infer_with(cfg, place, server.url, out)
         num_kept = len(kept_answers(out))
         assert num_kept >= 5 - ENDPOINT["concurrency"]
         assert not (out / "predictions.jsonl").exists()
         server.fault, num_asked = (lambda number, body: None), len(server.bodies)
-        path = infer_with(settings(), place, server.url, out)
+        path = infer_with(cfg, place, server.url, out)
         num_samples = len(read_predictions(path))
         assert len(server.bodies) == num_asked + num_samples - num_kept
         (out / "manifest.json").unlink()
         before = path.read_bytes()
-        assert infer_with(settings(), place, server.url, out).read_bytes() == before
+        assert infer_with(cfg, place, server.url, out).read_bytes() == before
         assert len(server.bodies) == num_asked + num_samples - num_kept
 
 
-def test_what_a_server_refuses_counts_as_wrong(place, tmp_path):
+def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
+    """And the command ends with status 1; run again, it asks about that sample alone."""
+    words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
+    words += [
+        "--out",
+        tmp_path / "out",
+        "--set",
+        "distill.infer.split=train",
+        "--set",
+        "distill.infer.endpoint.max_tries=1",
+    ]
+    with TeacherServer(lambda number, body: "500" if number == 2 else None) as server:
+        words = [str(word) for word in [*words, "--model", server.url]]
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 1
+        assert "http_500" in str(result.exception)
+        predictions, num_asked = read_predictions(tmp_path / "out" / "predictions.jsonl"), len(server.bodies)
+        assert [p.reason for p in predictions if p.coc is None] == ["failed_http_500"]
+        manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+        assert manifest["counts"]["failed"] == {"http_500": 1}
+        assert manifest["counts"]["kept"] == manifest["parsed"] == len(predictions) - 1
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.output
+        assert len(server.bodies) == num_asked + 1
+    assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
+
+
+def test_a_folder_answers_for_one_student(place, tmp_path):
+    with TeacherServer(models=("one",)) as server:
+        path = infer_with(settings(max_samples=3), place, server.url, tmp_path / "out")
+        assert {p.model for p in read_predictions(path)} == {"one"}
+        url, num_asked = server.url, len(server.bodies)
+    assert infer_with(settings(max_samples=3), place, url, tmp_path / "out") == path  # complete: nobody is asked
+    with TeacherServer(models=("two",)) as server:
+        with pytest.raises(ResumeError, match=r"endpoint.model was 'one', is 'two'"):
+            infer_with(settings(max_samples=3), place, server.url, tmp_path / "out")
+        assert not server.bodies
+    with TeacherServer(models=("one",)) as server:  # the same student, served elsewhere
+        assert infer_with(settings(max_samples=3), place, server.url, tmp_path / "out") == path
+        assert not server.bodies
+    told = (tmp_path / "out" / "stage.json").read_text() + (tmp_path / "out" / "manifest.json").read_text()
+    assert "127.0.0.1" not in told
+    assert num_asked == 3
+
+
+def test_how_long_answers_took_is_known(place, tmp_path):
+    with TeacherServer() as server:
+        path = infer_with(settings(), place, server.url, tmp_path / "out")
+    predictions, kept = read_predictions(path), kept_answers(tmp_path / "out")
+    assert sorted((line["sample_id"], line["purpose"]) for line in kept) == sorted(
+        (p.sample_id, p.language) for p in predictions
+    )
+    assert all(line["latency_s"] > 0 and line["usage"]["completion_tokens"] == 100 for line in kept)
+    speed = json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]
+    assert speed["answers"] == len(predictions)
+    assert speed["completion_tokens"] == 100 * len(predictions)
+    assert speed["seconds"] > 0
+
+
+def test_flights_that_nobody_asks_about_are_forgotten(monkeypatch):
+    monkeypatch.setattr(outcome, "MOST_FLIGHTS", 2)
+    forgotten: list[str] = []
+    flights = outcome.OpenFlights(SimpleNamespace(forget=forgotten.append))
+    samples = [SimpleNamespace(sample_id=f"flight_{k}_frame_00001") for k in (1, 1, 2, 3, 1, 4, 5)]
+    names = [flights.begun(sample) for sample in samples]
+    for sample in samples:
+        flights.done(sample)
+    assert forgotten == [names[2], names[3], names[0]]  # idle longest; the first was worked on for longer
+
+
+def test_what_a_server_refuses_has_failed(place, tmp_path):
     with TeacherServer(lambda number, body: "413" if number == 0 else None) as server:
         path = infer_with(settings(), place, server.url, tmp_path / "out")
     predictions = read_predictions(path)

@@ -18,28 +18,23 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
-from specimens_distill import make_captions, prepared  # noqa: E402
+from specimens_distill import TEACHING, make_adapter, make_captions, prepared  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from cosfly.cli import app  # noqa: E402
 from cosfly.errors import InputError, ResumeError  # noqa: E402
 from cosfly.store import write_json  # noqa: E402
-from cosfly.student_chat import TAUGHT, Look, Taught, read_taught, write_taught  # noqa: E402
+from cosfly.student_chat import TAUGHT, read_taught  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.schema import open_split, resolve_trees  # noqa: E402
-from distill.student.checkpoint import ADAPTER_FACTS, adapter_facts, base_digests  # noqa: E402
+from distill.student.checkpoint import ADAPTER_FACTS, base_digests  # noqa: E402
 from distill.student.encoding import encode, prompt_batch  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
-from distill.training.settings import TARGET_MODULES  # noqa: E402
 from specimens import make_playback_tree  # noqa: E402
 
 PIXELS = 64 * 64
-TEACHING = Taught.model_validate({
-    "prompts": {"en": {"system": "You fly.", "user": "Five frames."}}, "num_frames": 5, "max_pixels": PIXELS,
-    "looks": [Look(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
-})  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,31 +65,6 @@ def base(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def adapter(base, tmp_path_factory) -> Path:
     return make_adapter(base, tmp_path_factory.mktemp("adapter") / "adapter")
-
-
-def make_adapter(base: Path, folder: Path, **changes) -> Path:
-    """An adapter with random updates, as `distill train` leaves one."""
-    from peft import LoraConfig, get_peft_model
-
-    student = load_student(base, device="cpu", max_pixels=PIXELS)
-    lora = {
-        "r": 4,
-        "lora_alpha": 12,
-        "target_modules": TARGET_MODULES,
-        "init_lora_weights": False,
-        "task_type": "CAUSAL_LM",
-    }
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(7)
-        student.model = get_peft_model(student.model, LoraConfig(**{**lora, **changes}))
-    with torch.no_grad():  # what training changes is small beside what was there
-        for name, tensor in student.model.named_parameters():
-            if "lora_B" in name:
-                tensor.mul_(0.02)
-    student.model.save_pretrained(folder)
-    write_json(folder / ADAPTER_FACTS, adapter_facts(student, PIXELS, base))
-    write_taught(folder, TEACHING)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -375,36 +375,7 @@ def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path)
         train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
 
 
-# --- inference --------------------------------------------------------------------------------------------------------
-
-
-def test_inference_is_deterministic_and_resumes(place, trained, tmp_path):
-    cfg = infer.InferConfig(split="val", batch_size=3, max_new_tokens=12, device="cpu")
-    arguments = (cfg, place / "set", [place / "tree"], place / "student")
-    first = infer.run(*arguments, tmp_path / "a", adapter=trained / "adapter")
-    real, calls = infer.decode, []
-
-    def stop_at_second(*args, **more):
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*args, **more)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(infer, "decode", stop_at_second)
-        with pytest.raises(KeyboardInterrupt):
-            infer.run(*arguments, tmp_path / "b", adapter=trained / "adapter")
-        patch.setattr(infer, "decode", lambda *args, **more: (calls.append(1), real(*args, **more))[1])
-        second = infer.run(*arguments, tmp_path / "b", adapter=trained / "adapter")
-    samples = samples_of(place, "val")
-    assert len(calls) == 1 + -(
-        -len(samples) // 3
-    )  # the finished batch was not asked again; the broken call counts once
-    assert first.read_bytes() == second.read_bytes()
-    predictions = read_predictions(first)
-    assert [p.key for p in predictions] == [s.key for s in samples]
-    assert all((p.coc is None) == (p.reason is not None) for p in predictions)
-    assert all(p.num_tokens <= 12 for p in predictions)
+# --- the whole way ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -432,40 +403,3 @@ def test_a_student_that_overfits_answers_right(place, tmp_path):
     predictions = read_predictions(out)
     assert [p.raw for p in predictions] == [sample.answer for sample in learnt]
     assert all(p.coc is not None and p.is_finished for p in predictions)
-
-
-def test_an_adapter_of_another_student_is_refused(place, trained, tmp_path):
-    other = make_tiny_student(tmp_path / "other", seed=5)
-    with pytest.raises(InputError, match="trained on another model"):
-        infer.run(
-            infer.InferConfig(device="cpu"),
-            place / "set",
-            [place / "tree"],
-            other,
-            tmp_path / "out",
-            adapter=trained / "adapter",
-        )
-
-
-def test_an_unreadable_image_fails_its_batch_and_is_counted(place, tmp_path):
-    shutil.copytree(place / "tree", tmp_path / "tree")
-    sample = samples_of(place, "val")[0]
-    # Frame 0 belongs to the first window alone, in two languages.
-    (tmp_path / "tree" / sample.images[0]).write_bytes(b"not a picture")
-    cfg = infer.InferConfig(split="val", batch_size=1, max_samples=6, max_new_tokens=2, device="cpu")
-    out = infer.run(cfg, place / "set", [tmp_path / "tree"], place / "student", tmp_path / "out")
-    predictions = read_predictions(out)
-    assert predictions[0].reason == "failed_input"
-    assert predictions[0].raw == ""
-    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
-    assert counts["input"] == len(predictions) == 6
-    assert counts["failed"]["input"] == sum(p.reason == "failed_input" for p in predictions) == 2
-    assert "not an image" in (tmp_path / "out" / "failures.jsonl").read_text()
-
-
-def test_predictions_with_odd_line_separators_survive(place, tmp_path):
-    sample = samples_of(place)[0]
-    record = infer.make_prediction(sample, "train", "a\u2028b\x85c\x0b", 3, True)
-    path = tmp_path / "predictions.jsonl"
-    path.write_text(infer.dump_json(record.model_dump(mode="json")) + "\n", encoding="utf-8")
-    assert read_predictions(path) == [record]

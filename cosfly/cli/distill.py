@@ -87,7 +87,12 @@ def distill_train(
 @app.command("infer")
 def distill_infer(
     dataset: DatasetOption,
-    model: Annotated[str, typer.Option(help="Folder of the student's base model; with --engine endpoint its URL.")],
+    model: Annotated[
+        str,
+        typer.Option(
+            help="Folder of the student's base model, or the name of its repository; with --engine endpoint a URL."
+        ),
+    ],
     out: options.Out,
     engine: Annotated[
         str | None, typer.Option(help="transformers, endpoint (a server) or vllm. [default: transformers]")
@@ -106,7 +111,8 @@ def distill_infer(
     cfg, trees = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folders(data)
     options.set_aside(out, repair)
     options.verify_first(verify, dataset, *trees, adapter, out)
-    typer.echo(infer.run(cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=resume))
+    product = infer.run(cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=resume)
+    options.tell_product(product, out, cfg)
 
 
 @app.command("merge")

@@ -23,7 +23,7 @@ from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, storage_errors, write_json
 from cosfly.student_chat import TAUGHT
 from distill.student.checkpoint import read_adapter_facts
-from distill.student.model import require, weight_files
+from distill.student.model import require, student_folder, weight_files
 
 STAGE = "distill.merge"
 _OS_ERROR = re.compile(r"\(os error (\d+)\)")
@@ -73,6 +73,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
         EnvironmentMissing: torch or safetensors is missing.
     """
     require("torch", "safetensors")
+    model = student_folder(str(model))
     inputs = {**weight_files(model), **adapter_files(adapter)}
     read_adapter_facts(adapter, model)
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)

@@ -1,32 +1,37 @@
-"""Let a student answer the samples of a split: here in left-padded batches, or through an engine as teachers are asked."""
+"""Let a student answer the samples of a split: in this process, or through an engine as teachers are asked."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+import contextlib
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient
-from cosfly.chat.contract import CONTEXT_FULL, Engine, NoAnswer, Request, started
+from cosfly.chat.contract import Engine, started
+from cosfly.chat.protocol import base_url
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.config import Config, MayDiffer
-from cosfly.errors import ConfigError, InputError, TeacherError
-from cosfly.products.captions import answer_schema, parse_answer
-from cosfly.products.playback import flight_of
-from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
-from cosfly.runner import Item, Outcome, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
-from cosfly.store import dump_json, write_bytes
-from cosfly.student_chat import StudentEndpointConfig, picture_to_send, student_request
+from cosfly.console import progress_bar
+from cosfly.errors import ConfigError, InputError
+from cosfly.products.predictions import PREDICTIONS, Split
+from cosfly.stage_folder import Resume, StageFolder, read_manifest
+from cosfly.store import sha256_bytes
+from cosfly.student_chat import StudentEndpointConfig
+from distill.inference.asking import Asking
+from distill.inference.constraint import AnswerSchemas
+from distill.inference.local import LocalAnswers
+from distill.inference.outcome import ANSWERS, Answered, Results, writing_results
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
-from distill.student.decoding import decode
-from distill.student.encoding import encode, load_pictures, most_pixels
-from distill.student.model import Device, load_student, require, weight_files
+from distill.student.encoding import most_pixels
+from distill.student.model import Device, load_student, require, student_folder, weight_files
 
 STAGE = "distill.infer"
 
@@ -41,156 +46,118 @@ class InferConfig(Config):
         "transformers",
         description="who computes: transformers in this process, a server at the URL --model, or vLLM in this process",
     )
+    constrained: bool = Field(
+        False,
+        description="hold answers to their JSON schema: transformers and vllm by a mask over the tokens, a server by response_format. "
+        "Their parse rate then says nothing of the student",
+    )
     batch_size: int = Field(
-        8, ge=1, description="samples that transformers answers together; part of the result where rounding matters"
+        8,
+        ge=1,
+        description="samples that transformers answers together, halved where the memory is full; part of the result where rounding matters",
     )
     max_pixels: int = Field(
         0, ge=0, description="most pixels kept of a picture; 0: as in training, and with an engine all"
     )
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
+    feature_memory_gb: MayDiffer[float] = Field(
+        16.0, ge=0, description="memory for what the vision tower makes of pictures that several samples share, GB"
+    )
     endpoint: StudentEndpointConfig = Field(
-        StudentEndpointConfig(), description="how the engines endpoint and vllm are asked"
+        StudentEndpointConfig(),
+        description="how the engines endpoint and vllm are asked; max_tokens is max_new_tokens, json_schema is constrained",
     )
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine vllm")
 
+    @property
+    def sampling(self) -> StudentEndpointConfig:
+        """How engines are asked."""
+        return self.endpoint.model_copy(update={"max_tokens": self.max_new_tokens, "json_schema": self.constrained})
 
-# --- transformers -----------------------------------------------------------------------------------------------------
+
+# --- who answers --------------------------------------------------------------------------------------------------------
 
 
-def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
-    """Check an answer and give its record."""
-    parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
-    return Prediction(
-        sample_id=sample.sample_id,
-        language=sample.language,
-        split=split,
-        raw=text,
-        num_tokens=num_tokens,
-        is_finished=is_finished,
-        coc=parsed.coc,
-        reason=parsed.reason,
-        recovered=list(parsed.recovered),
+@dataclass(frozen=True)
+class Inputs:
+    """What a run reads. model: a folder, or the URL of a server."""
+
+    samples: Sequence[Sample]
+    trees: Mapping[str, Path]
+    model: str | Path
+    adapter: Path | None
+
+    @property
+    def name(self) -> str:
+        """The model's name where it runs in this process."""
+        name = Path(self.model).absolute().name
+        return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
+
+
+@contextlib.asynccontextmanager
+async def _answering(
+    cfg: InferConfig, inputs: Inputs, book: AnswerBook
+) -> AsyncIterator[AsyncGenerator[Answered, None]]:
+    """Start who answers; gives what becomes of the samples, in their order."""
+    if cfg.engine == "transformers":
+        with _local(cfg, inputs, book) as local:
+            yield local.answers(inputs.samples)
+        return
+    engine = _make_engine(cfg, inputs)
+    in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
+    async with started(engine):
+        asking = Asking(engine, book, inputs.trees, cfg.sampling, max_pixels=cfg.max_pixels, in_flight=in_flight)
+        yield asking.answers(inputs.samples)
+
+
+def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
+    model = Path(inputs.model)
+    trained = read_adapter_facts(inputs.adapter, model).max_pixels if inputs.adapter else 0
+    max_pixels = cfg.max_pixels or trained or most_pixels(inputs.samples)
+    student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=inputs.adapter)
+    return LocalAnswers(
+        student,
+        book,
+        inputs.trees,
+        model=inputs.name,
+        batch_size=cfg.batch_size,
+        max_tokens=cfg.max_new_tokens,
+        constrain=AnswerSchemas(student) if cfg.constrained else None,
+        feature_bytes=int(cfg.feature_memory_gb * 1e9),
     )
 
 
-def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
-    """Give the record of a sample that could not be answered: an empty answer, which evaluation counts as wrong."""
-    return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
-
-
-def make_worker(
-    cfg: InferConfig, trees: Mapping[str, Path], model: Path, adapter: Path | None, max_pixels: int
-) -> Work:
-    student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=adapter)
-
-    def work(item: Item) -> Outcome:
-        samples: list[Sample] = item.payload
-        rows = [encode(student, sample, trees) for sample in samples]
-        answers = decode(student, rows, max_tokens=cfg.max_new_tokens)
-        records = [
-            make_prediction(sample, cfg.split, answer.text, answer.num_tokens, answer.is_finished)
-            for sample, answer in zip(samples, answers, strict=True)
-        ]
-        return Outcome({"predictions": [record.model_dump(mode="json") for record in records]})
-
-    return work
-
-
-class _Predicted(BaseModel):
-    """What the journal holds of a batch."""
-
-    predictions: list[Prediction]
-
-
-def _infer(
-    cfg: InferConfig,
-    stage: StageFolder,
-    samples: list[Sample],
-    trees: Mapping[str, Path],
-    model: Path,
-    adapter: Path | None,
-) -> tuple[list[Prediction], Tally]:
-    trained = read_adapter_facts(adapter, model).max_pixels if adapter else most_pixels(samples)
-    # Whole batches are the unit of resumption: rounding may depend on what else is in a batch.
-    batches = [samples[start : start + cfg.batch_size] for start in range(0, len(samples), cfg.batch_size)]
-    items = [Item(f"batch_{number:06d}", batch) for number, batch in enumerate(batches)]
-    max_pixels = cfg.max_pixels or trained
-    finished = run_items(stage, items, make_worker, (cfg, trees, model, adapter, max_pixels), label=STAGE)
-    tally = Tally(input=len(samples))
-    predictions: list[Prediction] = []
-    for record, batch in zip(finished.records, batches, strict=True):
-        if isinstance(record, Failed):
-            tally.failed[record.code] += len(batch)
-            predictions += [failed_prediction(sample, cfg.split, record.code) for sample in batch]
-        else:
-            tally.kept += len(batch)
-            predictions += result_of(record, _Predicted).predictions
-    return predictions, tally
-
-
-# --- engines ----------------------------------------------------------------------------------------------------------
-
-
-def make_request(sample: Sample, trees: Mapping[str, Path], cfg: InferConfig) -> Request:
-    """Give a sample as chat messages: its pictures as the student was taught to see them, then the question.
-
-    Raises:
-        InputError: a picture of its playback tree cannot be read.
-    """
-    pictures = iter([picture_to_send(picture, cfg.max_pixels) for picture in load_pictures(sample, trees)])
-    frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
-    sampling = cfg.endpoint.model_copy(update={"max_tokens": cfg.max_new_tokens})
-    return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
-
-
-async def _ask(
-    cfg: InferConfig, stage: StageFolder, engine: Engine, samples: list[Sample], trees: Mapping[str, Path]
-) -> tuple[list[Prediction], Tally]:
-    """Ask an engine about every sample; answers are kept in `answers/`, so nothing answered is asked twice.
-
-    Raises:
-        TeacherError: it cannot be used, or a sample got no answer.
-    """
-    in_flight = asyncio.Semaphore(cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency)
-    tally, failures = Tally(input=len(samples)), list[Failed]()
-
-    async def answer(sample: Sample) -> Prediction:
-        async with in_flight:
-            try:
-                request = await asyncio.to_thread(make_request, sample, trees, cfg)
-                reply = await kept.ask(request, flight_of(sample.sample_id), sample.sample_id, sample.language)
-            except InputError as error:
-                failed = Failed(id=sample.key, code=error.code, message=str(error))
-            except NoAnswer as error:
-                if not error.is_final:
-                    fix = "see to the server, then run the same command again: nothing answered is asked twice"
-                    raise TeacherError("a sample got no answer", where=engine.where, got=str(error), fix=fix) from None
-                failed = Failed(id=sample.key, code=error.cause, message=str(error))
-            else:
-                tally.kept += 1
-                num_tokens = reply.usage.completion_tokens if reply.usage else 0
-                is_finished = reply.finish_reason not in ("length", CONTEXT_FULL)
-                return make_prediction(sample, cfg.split, reply.text, num_tokens, is_finished)
-            tally.failed[failed.code] += 1
-            failures.append(failed)
-            return failed_prediction(sample, cfg.split, failed.code)
-
-    with AnswerBook(stage.path / "answers") as book:
-        try:
-            async with started(engine), asyncio.TaskGroup() as group:
-                kept = KeptAnswers(engine, book)
-                tasks = [group.create_task(answer(sample)) for sample in samples]
-        except ExceptionGroup as found:  # the first one tells why
-            raise found.exceptions[0] from None
-    write_failures(stage.path / "failures.jsonl", failures)
-    return [task.result() for task in tasks], tally
-
-
-def _make_engine(cfg: InferConfig, model: str, samples: list[Sample]) -> Engine:
+def _make_engine(cfg: InferConfig, inputs: Inputs) -> Engine:
     if cfg.engine == "endpoint":
-        return ChatClient(model, cfg.endpoint)
-    num_images = max(len(sample.images) for sample in samples)
-    return VllmEngine(Path(model), cfg.vllm, cfg.endpoint, num_images=num_images, settings="distill.infer")
+        return ChatClient(str(inputs.model), cfg.sampling)
+    num_images = max(len(sample.images) for sample in inputs.samples)
+    return VllmEngine(Path(inputs.model), cfg.vllm, cfg.sampling, num_images=num_images, settings=STAGE)
+
+
+def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str]:
+    """Put the name of the model that a server serves into the settings, so that no folder holds answers of two students.
+
+    A folder that is complete is not asked for again, so its server need not run.
+
+    Returns:
+        The settings, and a digest of the server's address, which itself stays out of records.
+    """
+    server = sha256_bytes(base_url(url).encode())[:16]
+    if (out / "manifest.json").exists():
+        facts = read_manifest(out).facts
+        if facts.get("server") == server and cfg.endpoint.model in (None, facts.get("model")):
+            return _serving(cfg, str(facts.get("model"))), server
+    client = ChatClient(url, cfg.sampling)
+
+    async def name() -> str:
+        async with started(client):
+            return client.model
+
+    return _serving(cfg, asyncio.run(name())), server
+
+
+def _serving(cfg: InferConfig, model: str) -> InferConfig:
+    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": model})})
 
 
 # --- the step ---------------------------------------------------------------------------------------------------------
@@ -208,48 +175,86 @@ def run(
 ) -> Path:
     """Read a split, its playback trees `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
+    Every answer stands in a journal in `answers/` before anything is made of it, so nothing answered is asked twice.
+
     Args:
-        model: a folder, or with engine `endpoint` a URL.
+        model: a folder, the name of a repository, or with engine `endpoint` a URL.
     Returns:
-        The path of `predictions.jsonl`: one line per sample, in the order of the split.
+        The path of `predictions.jsonl`: one line per sample, in the order of the split. Of a sample that was not answered it says so, and
+        the manifest counts it as failed; a later run tries it again.
     Raises:
-        InputError: an input is missing or does not fit. ConfigError: the engine takes no adapter.
-        EnvironmentMissing: torch, transformers, peft or vllm is missing. TeacherError: the engine does not answer.
+        InputError: an input is missing or does not fit. ConfigError: the engine takes no adapter, or the memory is full with one sample.
+        EnvironmentMissing: a package is missing. TeacherError: the engine does not answer. NothingKept: no sample was answered.
     """
     trees = resolve_trees(dataset, data)
-    inputs = {"dataset": dataset, **tree_inputs(trees)}
+    files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees)}
+    facts: dict[str, Any] = {"split": cfg.split, "has_adapter": adapter is not None}
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
         raise ConfigError(
-            "an adapter is read by transformers alone",
-            where="distill.infer.engine",
-            got=cfg.engine,
-            fix="merge it into the weights (peft's merge_and_unload), or --engine transformers",
-        )
-    if cfg.engine != "endpoint":
-        inputs |= weight_files(Path(model))
+            "an adapter is read by transformers alone", where="distill.infer.engine", got=cfg.engine,
+            fix="put it into the weights first (cosfly distill merge), or --engine transformers",
+        )  # fmt: skip
+    if cfg.engine == "endpoint":
+        cfg, facts["server"] = _identified(cfg, str(model), out)
+    else:
+        model = student_folder(str(model))
+        files |= weight_files(model)
     if adapter is not None:
         read_adapter_facts(adapter, Path(model))
-        inputs |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)
-    path = out / PREDICTIONS
+        files |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
     if stage.is_complete:
-        return path
-    samples = open_split(dataset, cfg.split)[: cfg.max_samples or None]
-    if not samples:
+        return out / PREDICTIONS
+    split = open_split(dataset, cfg.split)
+    if not len(split):
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix="choose another split")
-    if cfg.engine == "transformers":
-        predictions, tally = _infer(cfg, stage, samples, trees, Path(model), adapter)
-        name = Path(model).name if adapter is None else f"{Path(model).name}+{adapter.absolute().parent.name}"
-    else:
-        engine = _make_engine(cfg, str(model), samples)
-        predictions, tally = asyncio.run(_ask(cfg, stage, engine, samples, trees))
-        name = engine.model
-    predictions = [prediction.model_copy(update={"model": name}) for prediction in predictions]
-    if not tally.kept:
-        raise stage.nothing_kept(tally)
-    write_bytes(path, "".join(dump_json(p.model_dump(mode="json")) + "\n" for p in predictions).encode())
-    num_parsed = sum(prediction.coc is not None for prediction in predictions)
-    stage.finish([path], tally, split=cfg.split, parsed=num_parsed, has_adapter=adapter is not None)
-    return path
+    samples = split[: cfg.max_samples] if cfg.max_samples else split
+    results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
+    outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
+    stage.finish(outputs, results.tally, **facts, model=results.model, parsed=results.num_parsed, speed=results.speed)
+    return out / PREDICTIONS
+
+
+def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
+    """Have all samples answered and write what came of them.
+
+    Raises:
+        ConfigError: the memory is full outside the batches.
+    """
+    try:
+        return asyncio.run(_write_answers(cfg, inputs, out))
+    except Exception as error:
+        if not _is_memory_full(error):
+            raise
+        said = f"{cfg.batch_size}: {str(error)[:120]}"
+    raise ConfigError(
+        "the accelerator's memory is full", where="distill.infer.batch_size", got=said, fix="lower it, or max_pixels"
+    )
+
+
+def _is_memory_full(error: Exception) -> bool:
+    return type(error).__name__ == "OutOfMemoryError" and type(error).__module__.startswith("torch")
+
+
+async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
+    begun_s = time.monotonic()
+    name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else inputs.name
+    with AnswerBook(out / ANSWERS) as book:
+        async with _answering(cfg, inputs, book) as answers:
+            started_s = time.monotonic()
+            with (
+                writing_results(out, cfg.split, name) as results,
+                progress_bar(STAGE, total=len(inputs.samples)) as advance,
+            ):
+                async with contextlib.aclosing(answers) as each:
+                    async for answered in each:
+                        results.add(answered)
+                        advance(1)
+            results.speed = {
+                "loading_s": round(started_s - begun_s, 3),
+                "seconds": round(time.monotonic() - started_s, 3),
+                **results.new,
+            }
+    return results

@@ -33,7 +33,7 @@ class Constraint(Protocol):
     """Says which tokens may come next; rows are counted as they were given to `decode`."""
 
     def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
-        """Give (len(rows), num_tokens) bool; every row allows one at least."""
+        """Give (len(rows), num_tokens / 8, rounded up) uint8, a bit a token, the lowest first; every row allows one at least."""
 
     def consume(self, row: int, token: int) -> None:
         """Note the token that a row was continued with."""
@@ -80,30 +80,6 @@ def decode(
     ]
 
 
-def image_features(student: Student, rows: Sequence[Encoded]) -> Any:
-    """Have the vision tower look at the pictures of all rows: (their tokens, width of the language model), None without any."""
-    inputs = prompt_batch(student, rows)
-    return _features(_core(student), inputs["pixel_values"], inputs["image_grid_thw"])
-
-
-def _features(core: Any, pixel_values: Any, grids: Any) -> Any:
-    import torch
-
-    if not len(grids):
-        return None
-    return torch.cat(core.get_image_features(pixel_values, grids).pooler_output)
-
-
-def _core(student: Student) -> Any:
-    """Give the model below the head, with the adapter's layers in it where there is one."""
-    return _head(student).model
-
-
-def _head(student: Student) -> Any:
-    model = student.model
-    return model.get_base_model() if hasattr(model, "get_base_model") else model
-
-
 @contextlib.contextmanager
 def _evaluating(student: Student) -> Iterator[None]:
     """Switch dropout off, and on again where it was."""
@@ -122,9 +98,11 @@ def _choose(batch: _Batch, constraint: Constraint | None) -> list[int]:
     logits = batch.logits
     if constraint is not None:
         live = [place for place in range(len(batch.rows)) if batch.is_live(place)]
-        allowed = np.ones((len(batch.rows), logits.shape[1]), dtype=bool)
-        allowed[live] = constraint.allowed([batch.rows[place] for place in live], logits.shape[1])
-        logits = logits.masked_fill(~torch.from_numpy(allowed).to(logits.device), float("-inf"))
+        bits = np.full((len(batch.rows), -(-logits.shape[1] // 8)), 255, np.uint8)
+        bits[live] = constraint.allowed([batch.rows[place] for place in live], logits.shape[1])
+        packed = torch.from_numpy(bits).to(logits.device)[:, :, None]
+        allowed = (packed >> torch.arange(8, dtype=torch.uint8, device=logits.device)) & 1
+        logits = logits.masked_fill(allowed.flatten(1)[:, : logits.shape[1]] == 0, float("-inf"))
     chosen = batch.take(logits.argmax(dim=-1))
     if constraint is not None:
         for place in live:
@@ -143,14 +121,14 @@ class _Batch:
         import torch
         from transformers import StaticCache
 
-        self._head, self._core, self._dtype = _head(student), _core(student), student.dtype
+        self._head, self._core, self._dtype = student.core.lm_head, student.core.model, student.dtype
         self.rows = list(range(len(rows)))
         self._is_live = [True] * len(rows)
         inputs = prompt_batch(student, rows)
         ids, mask, grids = inputs["input_ids"], inputs["attention_mask"], inputs["image_grid_thw"]
         self._num_prompt, self._room = ids.shape[1], ids.shape[1] + max_tokens
         if features is None:
-            features = _features(self._core, inputs["pixel_values"], grids)
+            features = self._look_at(inputs["pixel_values"], grids)
         embedded = self._core.get_input_embeddings()(ids).to(student.dtype)
         if features is not None:
             is_image = (ids == student.image_token_id)[..., None]
@@ -216,6 +194,12 @@ class _Batch:
         self._place.add_(1)
         self._positions.add_(1)
 
+    def _look_at(self, patches: Any, grids: Any) -> Any:
+        """Have the vision tower look at the pictures; None without any."""
+        import torch
+
+        return torch.cat(self._core.get_image_features(patches, grids).pooler_output) if len(grids) else None
+
     def _run(self, embedded: Any, positions: Any, mask: Any, linear_mask: Any) -> Any:
         return self._core.language_model(
             inputs_embeds=embedded,
@@ -226,7 +210,7 @@ class _Batch:
         ).last_hidden_state
 
     def _logits(self, hidden: Any) -> Any:
-        return self._head.lm_head(hidden[:, -1]).float()
+        return self._head(hidden[:, -1]).float()
 
 
 def _prompt_mask(mask: Any, room: int) -> Any:

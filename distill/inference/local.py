@@ -1,0 +1,240 @@
+"""Samples answered by a student in this process: prompts of like length together, each picture looked at once, answers journaled.
+
+Samples are taken a shelf at a time, in their order; within a shelf they are sorted by length and cut into batches. Which samples are in
+one batch follows from the samples and the settings alone, since rounding may depend on it: a run that was killed answers like one that was not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+
+from cosfly.chat.answers import Answer, AnswerBook
+from cosfly.errors import ConfigError, InputError
+from cosfly.products.captions import Language
+from cosfly.products.playback import flight_of
+from cosfly.stage_folder import Failed
+from cosfly.store import dump_json, sha256_bytes
+from distill.inference.outcome import Answered, OpenFlights
+from distill.schema import Sample
+from distill.student.decoding import Constraint, Decoded, decode
+from distill.student.encoding import Encoded, encode_text
+from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, pictures_of
+from distill.student.model import Processor, Student
+
+log = logging.getLogger(__name__)
+
+SHELF_BATCHES = 16
+READING_THREADS = 4
+
+Constrain = Callable[[Sequence[Language]], Constraint]
+
+
+class _Shelf:
+    """Samples that are sorted together: what became of them, their rows, and what was seen of their pictures."""
+
+    def __init__(self, samples: list[Sample], features: VisionFeatures) -> None:
+        self.samples, self.features = samples, features
+        self.found: dict[str, Answered] = {}  # by key of the sample
+        self.rows: dict[str, Encoded] = {}
+        self.damaged: dict[Picture, InputError] = {}
+        self.plan = features.plan()
+
+
+class LocalAnswers:
+    """One run of a student over samples. Use as a context manager, for its threads."""
+
+    def __init__(
+        self,
+        student: Student,
+        book: AnswerBook,
+        trees: Mapping[str, Path],
+        *,
+        model: str,
+        batch_size: int,
+        max_tokens: int,
+        constrain: Constrain | None,
+        feature_bytes: int,
+    ) -> None:
+        """
+        Args:
+            model: its name, for the journal. max_tokens: of an answer. constrain: makes what holds the answers of a batch to their form.
+            feature_bytes: most memory for what the vision tower made of the pictures of a shelf.
+        """
+        self.student, self.book, self.model = student, book, model
+        self.batch_size, self.max_tokens, self.constrain = batch_size, max_tokens, constrain
+        self.most_rows = batch_size  # fewer once the memory was full
+        self._feature_bytes = feature_bytes
+        self._flights = OpenFlights(book)
+        processor = Processor(student.tokenizer, student.image_processor)
+        self._reader = PictureReader(processor, trees, None, student.dtype)
+        self._threads = ThreadPoolExecutor(READING_THREADS, "pictures")
+
+    def __enter__(self) -> LocalAnswers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    async def answers(self, samples: Iterable[Sample]) -> AsyncGenerator[Answered, None]:
+        """Yield what becomes of each sample, in their order.
+
+        Raises:
+            ConfigError: the memory does not hold even one.
+        """
+        rest = iter(samples)
+        while chosen := list(islice(rest, SHELF_BATCHES * self.batch_size)):
+            shelf = _Shelf(chosen, VisionFeatures(self.student, memory_bytes=self._feature_bytes))
+            self._take_kept(shelf)
+            if len(shelf.found) < len(shelf.samples):
+                await self._answer(shelf)
+            for sample in shelf.samples:
+                yield shelf.found[sample.key]
+                self._flights.done(sample)
+
+    def _take_kept(self, shelf: _Shelf) -> None:
+        for sample in shelf.samples:
+            known = self.book.get(self._flights.begun(sample), self._key(sample))
+            if known is not None:
+                shelf.found[sample.key] = Answered(sample, known)
+
+    def _key(self, sample: Sample) -> str:
+        """Name what the answer depends on beside what the folder's records hold: weights, pictures and settings."""
+        asked = sample.model_dump(mode="json", include={"run", "window", "views", "picture_px", "prompt", "language"})
+        return sha256_bytes(
+            dump_json([self.model, sample.sample_id, asked, self.max_tokens, self.constrain is not None]).encode()
+        )
+
+    async def _answer(self, shelf: _Shelf) -> None:
+        """Answer what is not answered. Pictures of the others are looked at all the same: which are looked at together may tell in the
+        last bit."""
+        batches = self._batches(shelf)
+        loading = [self._load(shelf, batch) for batch in batches[:1]]
+        for number, batch in enumerate(batches):
+            begun_s = time.monotonic()
+            self._look(shelf, loading.pop())
+            loading += [self._load(shelf, following) for following in batches[number + 1 : number + 2]]  # meanwhile
+            whole = [sample for sample in batch if not self._fails(shelf, sample)]
+            if any(sample.key not in shelf.found for sample in whole):
+                await self._keep(shelf, whole, self._decode(shelf, whole), begun_s)
+            shelf.features.end_step()
+
+    def _batches(self, shelf: _Shelf) -> list[list[Sample]]:
+        """Cut a shelf into batches of like length; a sample whose prompt cannot be written has failed."""
+        for sample in shelf.samples:
+            try:
+                shelf.rows[sample.key] = encode_text(self.student, sample)
+            except InputError as error:
+                shelf.found[sample.key] = _failed(sample, error)
+        ordered = sorted(
+            (sample for sample in shelf.samples if sample.key in shelf.rows),
+            key=lambda sample: (
+                -len(shelf.rows[sample.key].prompt_ids),
+                sample.key,
+            ),  # the largest first: it shows what fits
+        )
+        return [ordered[start : start + self.batch_size] for start in range(0, len(ordered), self.batch_size)]
+
+    # --- pictures ---
+
+    def _load(self, shelf: _Shelf, batch: Sequence[Sample]) -> dict[Picture, Future[Loaded]]:
+        """Have pictures read that are not known."""
+        pictures = [picture for sample in batch for picture in pictures_of(sample) if picture not in shelf.damaged]
+        wanted = shelf.features.wanted(shelf.plan, pictures)
+        return {picture: self._threads.submit(self._reader.read, picture) for picture in wanted}
+
+    def _look(self, shelf: _Shelf, loading: Mapping[Picture, Future[Loaded]]) -> None:
+        """Have the vision tower look at what was read."""
+        loaded: list[Loaded] = []
+        for picture, future in loading.items():
+            try:
+                loaded.append(future.result())
+            except InputError as error:
+                shelf.damaged[picture] = error
+        shelf.features.take(loaded)
+
+    def _fails(self, shelf: _Shelf, sample: Sample) -> bool:
+        """Tell whether a picture of a sample cannot be read; it has then failed, and no other with it."""
+        error = next((shelf.damaged[picture] for picture in pictures_of(sample) if picture in shelf.damaged), None)
+        if error is not None:
+            shelf.found[sample.key] = _failed(sample, error)
+        return error is not None
+
+    # --- answers ---
+
+    def _decode(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Decoded]:
+        """Answer samples together, in halves where the memory does not hold them all.
+
+        Raises:
+            ConfigError: it does not hold one.
+        """
+        import torch
+
+        answers: list[Decoded] = []
+        while len(answers) < len(samples):
+            chosen = samples[len(answers) : len(answers) + self.most_rows]
+            try:
+                answers += self._decode_together(shelf, chosen)
+                continue
+            except torch.OutOfMemoryError as error:
+                said = str(error)[:120]
+            self._halve(len(chosen), said)  # after the error is let go, and with it what it holds
+        return answers
+
+    def _halve(self, num_rows: int, said: str) -> None:
+        import torch
+
+        if num_rows == 1:
+            raise ConfigError(
+                "the accelerator's memory does not hold one sample", where="distill.infer.max_new_tokens", got=said,
+                fix="lower max_new_tokens or max_pixels, or ask a server (--engine endpoint)",
+            )  # fmt: skip
+        self.most_rows = num_rows // 2
+        log.warning(
+            "distill.infer: the memory is full with %d samples; going on with %d at once", num_rows, self.most_rows
+        )
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+
+    def _decode_together(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Decoded]:
+        return decode(
+            self.student,
+            [shelf.rows[sample.key] for sample in samples],
+            max_tokens=self.max_tokens,
+            constraint=self.constrain([sample.language for sample in samples]) if self.constrain else None,
+            features=shelf.features.of([picture for sample in samples for picture in pictures_of(sample)]),
+        )
+
+    async def _keep(self, shelf: _Shelf, samples: Sequence[Sample], decoded: Sequence[Decoded], begun_s: float) -> None:
+        """Journal new answers; they are on the disk when this returns."""
+        latency_s = round(time.monotonic() - begun_s, 3)
+        for sample, answer in zip(samples, decoded, strict=True):
+            if sample.key not in shelf.found:
+                new = self._answer_of(sample, shelf.rows[sample.key], answer, latency_s)
+                shelf.found[sample.key] = Answered(sample, new, is_new=True)
+        found = [shelf.found[sample.key] for sample in samples]
+        new_ones = [each.found for each in found if each.is_new and isinstance(each.found, Answer)]
+        await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new_ones))
+
+    def _answer_of(self, sample: Sample, row: Encoded, decoded: Decoded, latency_s: float) -> Answer:
+        return Answer(
+            key=self._key(sample),
+            sample_id=sample.sample_id,
+            purpose=sample.language,
+            model=self.model,
+            text=decoded.text,
+            usage={"prompt_tokens": len(row.prompt_ids), "completion_tokens": decoded.num_tokens},
+            structured="json_schema" if self.constrain else "plain",
+            finish_reason="stop" if decoded.is_finished else "length",
+            latency_s=latency_s,
+            time=round(time.time(), 3),
+        )
+
+
+def _failed(sample: Sample, error: InputError) -> Answered:
+    return Answered(sample, Failed(id=sample.key, code=error.code, message=str(error)))

@@ -1,0 +1,290 @@
+"""Students that answer in this process: batches, pictures, kills, full memory, constrained answers."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
+from teacher_server import kept_answers
+from typer.testing import CliRunner
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("peft", reason="needs the extra distill")
+
+from cosfly.cli import app  # noqa: E402
+from cosfly.errors import ConfigError, InputError, NothingKept  # noqa: E402
+from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
+from cosfly.store import dump_json  # noqa: E402
+from distill.inference import stage as infer  # noqa: E402
+from distill.inference.outcome import make_prediction  # noqa: E402
+from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
+from distill.student.decoding import decode  # noqa: E402
+from distill.student.encoding import encode  # noqa: E402
+from distill.student.model import load_student  # noqa: E402
+from distill.student.random_student import make_tiny_student  # noqa: E402
+from specimens import make_playback_tree  # noqa: E402
+
+NUM_TOKENS = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("local")
+    tree = make_playback_tree(root / "tree", num_flights=3, num_points=8)
+    make_captions(root / "captions.jsonl", tree)
+    prepared(tree, root / "captions.jsonl", root / "set", modalities=("rgb", "depth"))
+    make_tiny_student(root / "student", seed=1)
+    make_adapter(root / "student", root / "trained" / "adapter")
+    return root
+
+
+@pytest.fixture(scope="module")
+def clean(place) -> Path:
+    """The predictions of a run that nothing disturbed."""
+    return answer(place, place / "clean")
+
+
+def settings(**changes: Any) -> infer.InferConfig:
+    base = {"split": "train", "batch_size": 5, "max_new_tokens": NUM_TOKENS, "device": "cpu"}
+    return infer.InferConfig.model_validate(base | changes)
+
+
+def answer(place: Path, out: Path, tree: Path | None = None, **changes: Any) -> Path:
+    given = (place / "set", [tree or place / "tree"], place / "student", out)
+    return infer.run(settings(**changes), *given, adapter=place / "trained" / "adapter")
+
+
+def samples_of(place: Path) -> list[Sample]:
+    return list(open_split(place / "set", "train"))
+
+
+def counts_of(out: Path) -> dict:
+    return json.loads((out / "manifest.json").read_text())["counts"]
+
+
+def told(predictions: list[Prediction]) -> dict[str, str]:
+    return {prediction.key: prediction.raw for prediction in predictions}
+
+
+def test_each_sample_has_the_answer_that_it_has_alone(place, clean):
+    student = load_student(
+        place / "student", device="cpu", max_pixels=ADAPTER_PIXELS, adapter=place / "trained" / "adapter"
+    )
+    samples, trees = samples_of(place), resolve_trees(place / "set", [place / "tree"])
+    alone = {
+        sample.key: decode(student, [encode(student, sample, trees)], max_tokens=NUM_TOKENS)[0].text
+        for sample in samples
+    }
+    predictions = read_predictions(clean)
+    assert [prediction.key for prediction in predictions] == [sample.key for sample in samples]
+    assert told(predictions) == alone
+    assert len(set(alone.values())) > 1
+    assert {prediction.model for prediction in predictions} == {"student+trained"}
+
+
+def test_time_and_tokens_of_each_answer_are_kept(place, clean):
+    kept = {f"{line['sample_id']}/{line['purpose']}": line for line in kept_answers(clean.parent)}
+    predictions = read_predictions(clean)
+    assert {p.key: p.num_tokens for p in predictions} == {
+        key: line["usage"]["completion_tokens"] for key, line in kept.items()
+    }
+    assert all(line["latency_s"] > 0 and line["usage"]["prompt_tokens"] > 0 for line in kept.values())
+    assert counts_of(clean.parent) == {"input": len(kept), "kept": len(kept), "dropped": {}, "failed": {}}
+
+
+def test_each_picture_is_looked_at_once_and_rows_of_like_length_go_together(place, clean, tmp_path, monkeypatch):
+    looked, lengths = [], []
+
+    def load(*args: Any, **more: Any) -> Any:
+        student = load_student(*args, **more)
+        student.model.get_base_model().model.visual.register_forward_pre_hook(
+            lambda module, inputs: looked.append(inputs[0])
+        )
+        return student
+
+    def watched(student: Any, rows: Any, **more: Any) -> Any:
+        lengths.append([len(row.prompt_ids) for row in rows])
+        return decode(student, rows, **more)
+
+    monkeypatch.setattr(infer, "load_student", load)
+    monkeypatch.setattr("distill.inference.local.decode", watched)
+    assert answer(place, tmp_path / "out").read_bytes() == clean.read_bytes()
+    samples = samples_of(place)
+    assert (
+        len(looked)
+        == len({image for sample in samples for image in sample.images})
+        < sum(len(s.images) for s in samples) / 2
+    )
+    together = [length for batch in lengths for length in batch]
+    assert together == sorted(together, reverse=True)
+    assert len(set(together)) > 1
+
+
+def test_the_size_of_batches_changes_no_answer(place, clean, tmp_path):
+    for size in (1, 64):
+        assert told(read_predictions(answer(place, tmp_path / f"{size}", batch_size=size))) == told(
+            read_predictions(clean)
+        )
+
+
+def test_killed_and_continued_is_the_same(place, clean, tmp_path):
+    """Killed at a real moment of a real process, three times."""
+    out = tmp_path / "out"
+    words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--model", place / "student"]
+    words += ["--adapter", place / "trained" / "adapter", "--out", out]
+    for name, value in settings().model_dump(include={"split", "batch_size", "max_new_tokens", "device"}).items():
+        words += ["--set", f"distill.infer.{name}={value}"]
+    known = 0
+    for _ in range(3):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "cosfly", *map(str, words)],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stderr=subprocess.DEVNULL,
+        )
+        while len(kept_answers(out)) <= known and process.poll() is None:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        known = len(kept_answers(out))
+    assert known > 0
+    assert not (out / "manifest.json").exists()
+    assert not (out / "predictions.jsonl").exists()
+    assert answer(place, out).read_bytes() == clean.read_bytes()
+    keys = [line["key"] for line in kept_answers(out)]
+    assert len(keys) == len(set(keys)) == len(samples_of(place))
+    assert json.loads((out / "manifest.json").read_text())["speed"]["answers"] == len(keys) - known
+    assert not list(out.rglob("*.partial"))
+
+
+def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    samples = samples_of(place)
+    bad = samples[0].images[0]
+    hit = {sample.key for sample in samples if bad in sample.images}
+    whole = (tree / bad).read_bytes()
+    (tree / bad).write_bytes(b"not a picture")
+    words = ["distill", "infer", "--dataset", place / "set", "--data", tree, "--model", place / "student"]
+    words += ["--adapter", place / "trained" / "adapter", "--out", tmp_path / "out"]
+    for name, value in settings().model_dump(include={"split", "batch_size", "max_new_tokens", "device"}).items():
+        words += ["--set", f"distill.infer.{name}={value}"]
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 1
+    assert "some items failed" in str(result.exception)
+    found, expected = read_predictions(tmp_path / "out" / "predictions.jsonl"), told(read_predictions(clean))
+    assert {p.key for p in found if p.reason == "failed_input"} == hit
+    assert 0 < len(hit) < len(samples) / 2
+    assert {p.key: p.raw for p in found if p.key not in hit} == {
+        key: raw for key, raw in expected.items() if key not in hit
+    }
+    assert counts_of(tmp_path / "out")["failed"] == {"input": len(hit)}
+    assert (tmp_path / "out" / "failures.jsonl").read_text().count("not an image") == len(hit)
+    (tree / bad).write_bytes(whole)  # mended: those alone are answered
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
+
+
+def test_nothing_answered_is_an_error(place, tmp_path):
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    for path in tree.rglob("rgb.png"):
+        path.write_bytes(b"")
+    with pytest.raises(NothingKept, match="failed"):
+        answer(place, tmp_path / "out", tree)
+
+
+# --- a full memory ----------------------------------------------------------------------------------------------------
+
+
+def with_room_for(num_rows: int, sizes: list[int]) -> Any:
+    """A student whose memory holds so many rows: its language model says so as an accelerator would."""
+
+    def load(*args: Any, **more: Any) -> Any:
+        student = load_student(*args, **more)
+
+        def check(module: Any, inputs: Any, given: dict) -> None:
+            sizes.append(len(given["inputs_embeds"]))
+            if sizes[-1] > num_rows:
+                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+        student.model.get_base_model().model.language_model.register_forward_pre_hook(check, with_kwargs=True)
+        return student
+
+    return load
+
+
+def test_a_full_memory_halves_the_batch(place, clean, tmp_path, monkeypatch, caplog):
+    sizes: list[int] = []
+    monkeypatch.setattr(infer, "load_student", with_room_for(3, sizes))
+    assert told(read_predictions(answer(place, tmp_path / "out", batch_size=12))) == told(read_predictions(clean))
+    assert counts_of(tmp_path / "out")["failed"] == {}
+    assert [size for size in sizes if size > 3] == [12, 6]  # each once: what did not fit is not tried again
+    assert max(sizes[2:]) == 3
+    assert caplog.text.count("the memory is full") == 2
+
+
+def test_a_memory_too_small_for_one_is_one_clear_line(place, tmp_path, monkeypatch):
+    monkeypatch.setattr(infer, "load_student", with_room_for(0, []))
+    with pytest.raises(ConfigError, match=r"does not hold one sample.*CUDA out of memory.*max_pixels"):
+        answer(place, tmp_path / "out")
+
+
+def test_a_memory_too_small_for_the_model_is_one_clear_line(place, tmp_path, monkeypatch):
+    def load(*args: Any, **more: Any) -> Any:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB")
+
+    monkeypatch.setattr(infer, "load_student", load)
+    with pytest.raises(ConfigError, match=r"memory is full.*9\.00 GiB"):
+        answer(place, tmp_path / "out")
+
+
+# --- what is answered -------------------------------------------------------------------------------------------------
+
+
+def test_constrained_answers_all_parse(place, clean, tmp_path):
+    pytest.importorskip("llguidance")
+    assert all(prediction.coc is None for prediction in read_predictions(clean))  # it knows nothing
+    free = answer(place, tmp_path / "out", constrained=True, max_new_tokens=900, max_samples=2)
+    predictions = read_predictions(free)
+    assert len(predictions) == 2
+    for prediction in predictions:
+        if prediction.is_finished:
+            assert prediction.reason in (None, "critical_components_wrong_language", "reasoning_trace_wrong_language")
+            assert set(json.loads(prediction.raw)) == {"critical_components", "reasoning_trace", "flight_decision"}
+        else:
+            assert prediction.raw.startswith('{"critical_components":"')
+    again = answer(place, tmp_path / "one", constrained=True, max_new_tokens=900, max_samples=2, batch_size=1)
+    assert told(read_predictions(again)) == told(predictions)
+
+
+def test_an_adapter_of_another_student_is_refused(place, tmp_path):
+    other = make_tiny_student(tmp_path / "other", seed=5)
+    with pytest.raises(InputError, match="trained on another model"):
+        infer.run(
+            settings(), place / "set", [place / "tree"], other, tmp_path / "out", adapter=place / "trained" / "adapter"
+        )
+
+
+def test_predictions_with_odd_line_separators_survive(place, tmp_path):
+    record = make_prediction(samples_of(place)[0], "train", "a\u2028b\x85c\x0b", 3, True)
+    path = tmp_path / "predictions.jsonl"
+    path.write_text(dump_json(record.model_dump(mode="json")) + "\n", encoding="utf-8")
+    assert read_predictions(path) == [record]
