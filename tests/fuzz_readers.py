@@ -83,7 +83,10 @@ from distill.student.taught import taught_by
 from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
+from release.stats import stats
 from release.verify.verify import verify
+from release.viewer import page as viewer
+from release.viewer.schema import ViewerConfig
 from specimens import make_playback_tree
 
 ANSWER = {
@@ -450,6 +453,23 @@ def _verified(root: Path) -> None:
     verify(root / "release/dataset")
 
 
+def _place_shard(root: Path) -> None:
+    """Put the changed shard in its place, where it is a file."""
+    if (root / "shard.parquet").is_file():
+        shutil.copy(root / "shard.parquet", _first_shard(root))
+
+
+def _counted(root: Path, scratch: Path) -> None:
+    _place_shard(root)
+    stats.run(root / "release/dataset", scratch / "stats", pixels=4)
+
+
+def _viewed(root: Path, scratch: Path, folder: Path) -> None:
+    _place_shard(root)
+    captions = None if folder.name == "release" else root / "captions.jsonl"
+    viewer.run(folder, scratch / "page.html", ViewerConfig(frames=2, picture_px=32), captions)
+
+
 def _released(root: Path, scratch: Path) -> None:
     source = Source("one", root / "render", root / "captions.jsonl", root / "inspect.json")
     _stage(lambda: package.run(RELEASE, [source], scratch / "release"), scratch / "release")
@@ -511,6 +531,9 @@ READERS: dict[str, Reader] = {
     "release, verify": Reader(
         ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md"))),
         lambda root, _: _verified(root), share=0.4, hashes=True),
+    "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4),
+    "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4),
+    "tree, viewer": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, scratch: _viewed(root, scratch, root / "render"), share=0.2),
     "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
     "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),

@@ -118,8 +118,11 @@ def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspect
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> Path:
-    """tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
-    root = tmp_path_factory.mktemp("inputs")
+    return make_inputs(tmp_path_factory.mktemp("inputs"))
+
+
+def make_inputs(root: Path) -> Path:
+    """Write tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
     tree = make_playback_tree(
         root / "tree", num_flights=3, num_points=NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02")
     )

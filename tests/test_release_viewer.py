@@ -15,15 +15,22 @@ from browser import browser
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_distill import WINDOW, make_caption
+from test_release_package import build as build_release
+from test_release_package import make_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
+from cosfly.frame_views import read_view
 from cosfly.products.boxes import make_box_map, write_boxes
 from cosfly.products.captions import write_captions
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight
+from cosfly.reading.tables import rows_of
+from release.columns import PLACE, POINT
+from release.record import read_record
 from release.viewer.choosing import PATH_POINTS, boxes_of, choose_flights, choose_frames, path_of, spread
+from release.viewer.of_release import VIEW_OF, picture
 from release.viewer.page import page_html, run
 from release.viewer.schema import Shown, ViewerConfig
 from specimens import make_playback_tree
@@ -186,6 +193,49 @@ def test_the_page_asks_for_nothing_and_names_its_script(page):
         f"{word}(" not in script[-1] for word in ("innerHTML", "insertAdjacentHTML", "document.write", "eval", "fetch")
     )
     assert "innerHTML" not in script[-1]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("release")
+    return build_release(make_inputs(root / "inputs"), root / "release")
+
+
+def test_a_release_is_shown_as_its_rows_say(dataset, tmp_path):
+    record = read_record(dataset / "release.json")
+    page = run(dataset.parent, tmp_path / "page.html", ViewerConfig(frames=3, picture_px=32))
+    data = data_of(page.read_text(encoding="utf-8"))
+    assert data["kind"] == "release"
+    assert {flight["name"]: (flight["split"], flight["num_frames"]) for flight in data["flights"]} == {
+        flight.flight: (flight.split, flight.frames) for flight in record.flights
+    }
+    rows = {row["sample_id"]: row for shard in record.shards for row in rows_of(dataset / shard.path)}
+    by_place = {("/".join(row[name] for name in PLACE), row["frame_index"]): row for row in rows.values()}
+    shown = [(flight["name"], frame) for flight in data["flights"] for frame in flight["frames"]]
+    assert {len(flight["frames"]) for flight in data["flights"]} == {3}
+    for name, frame in shown:
+        row, caption = by_place[name, frame["index"]], frame["caption"]
+        assert set(frame["pictures"]) == {"rgb", "depth", "segmentation"}
+        assert frame["drone"][:3] == [round(row["pose"][axis], 2) for axis in POINT]
+        assert bool(caption) == row["has_caption"]
+        if caption:
+            assert caption["verdict"] == row["verdict"]
+            assert [sentence["text"] for sentence in caption["texts"]["en"]] == [
+                row["caption_en_critical_components"],
+                row["caption_en_reasoning_trace"],
+            ]
+    two = data_of(run(dataset, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
+    assert len(two["flights"]) <= 2
+    assert any("flights are shown" in note for note in two["notes"])
+
+
+def test_pictures_of_a_release_look_like_those_of_its_tree(dataset):
+    record = read_record(dataset / "release.json")
+    row = next(rows_of(dataset / record.shards[0].path))
+    place = dataset.parents[1] / "inputs/tree" / row["town"] / row["trajectory"] / row["variant"]
+    frame = read_flight(place).frame_folder(row["frame_index"])
+    for file, view in VIEW_OF.items():
+        assert (picture(row, file, record) == read_view(frame, view)).all()
 
 
 def test_a_page_keeps_its_size(run_folder, tmp_path):

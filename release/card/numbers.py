@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ import pyarrow.compute as pc
 
 from cosfly.errors import InputError
 from cosfly.products.coverage import AXES, NAMED, Coverage, axis_values
-from cosfly.reading.tables import arrow_errors, open_table, row_groups, rows_of
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, SCALAR_NAMES
+from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups, rows_of
+from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, SCALAR_NAMES, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
@@ -35,6 +35,7 @@ COLUMNS = [
 NEVER_NULL = frozenset(
     {"sample_id", *PLACE, "track", "time_s", "width_px", "height_px", "fov_deg", "pose", "has_caption"}
 )
+SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
 
 
@@ -71,25 +72,47 @@ def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]
     """Yield the rows of a shard, a row group at a time, in which every value that must be there is there.
 
     Raises:
-        InputError: it cannot be read, or a column of NEVER_NULL, or a part of a pose, place or box, is null.
+        InputError: it cannot be read, has other columns than a release, or a column of NEVER_NULL, or a part of a pose, place or box, is null.
     """
     for group in row_groups(shard, columns, tree=shard.parents[1]):
+        check_columns(group, columns, shard)
         for member in group.schema:
             column = group.column(member.name)
             wanted = 0 if member.name in NEVER_NULL else column.null_count
-            parts = (
-                [pc.struct_field(column, i) for i in range(member.type.num_fields)]
-                if pa.types.is_struct(member.type)
-                else []
-            )
+            is_struct = pa.types.is_struct(member.type)
+            parts = [pc.struct_field(column, i) for i in range(member.type.num_fields)] if is_struct else []
             is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
             if any(part.null_count > wanted for part in (column, *(parts if is_plain else ()))):
-                raise InputError(
-                    "a value is missing", where=f"{shard}: {member.name}", got="null", expected="a value in every row"
-                )
+                where, expected = f"{shard}: {member.name}", "a value in every row"
+                raise InputError("a value is missing", where=where, got="null", expected=expected)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
         yield rows
+
+
+def check_rows(shard: Path, rows: int) -> None:
+    """See that a shard has as many rows as its record says, before they are read; raises as `row_lists`."""
+    found = num_rows(shard)
+    if found != rows:
+        raise InputError(
+            "a shard of another length", where=shard, got=f"{found} rows", expected=f"{rows} rows, as release.json says"
+        )
+
+
+def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:
+    """See that columns of a row group are those of a release.
+
+    Raises:
+        InputError: one is missing or of another type.
+    """
+    for name in columns:
+        found = group.schema.field(name).type if group.schema.get_field_index(name) >= 0 else None
+        if found != SCHEMA.field(name).type:
+            got = "no such column" if found is None else str(found)
+            expected = str(SCHEMA.field(name).type)
+            raise InputError(
+                "a shard with other columns than a release", where=f"{shard}: {name}", got=got, expected=expected
+            )
 
 
 @dataclass
@@ -131,9 +154,14 @@ class Sum:
 
 def millionths(value: float) -> int:
     """Give a value in whole millionths; raises as `Sum.add`."""
+    return round(bounded(value) * MILLION)
+
+
+def bounded(value: float) -> float:
+    """Give a value that a flight can have; raises as `Sum.add`."""
     if not -LARGEST < value < LARGEST:  # NaN is not
         raise InputError("not a number of a flight", where="data", got=str(value), expected=f"within {LARGEST:g}")
-    return round(value * MILLION)
+    return value
 
 
 @dataclass
@@ -159,7 +187,7 @@ class FlightCount:
         self.times_s, self.ends = (self.times_s[0], later.times_s[1]), (self.ends[0], later.ends[1])
 
 
-def clean_place(row: dict[str, Any]) -> Place3 | None:
+def clean_place(row: Mapping[str, Any]) -> Place3 | None:
     """Give where the drone would be without the frame's perturbation, m; None where the row does not say."""
     offset = row["drone_offset"]
     if offset is None:

@@ -1,39 +1,42 @@
-"""`cosfly release stats`: what a release covers, drawn beside the plain run that ships. Reads `release.json`, writes a page and its numbers."""
+"""`cosfly release stats`: what the paper tells of its data, computed again from the rows of a release."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from cosfly.coverage_page import STYLE, coverage_html
-from cosfly.escaping import for_html, html_page
+from cosfly.console import progress_bar
 from cosfly.store import write_bytes, write_json
-from release.record import ReleaseRecord, read_record
+from release.card.numbers import COLUMNS as CARD_COLUMNS
+from release.card.numbers import Counted, check_rows, row_lists
+from release.record import read_record
+from release.stats.counting import COLUMNS, Counts
+from release.stats.page import markdown, page_html
+from release.stats.pixels import look_at
+from release.stats.tables import make_stats
 
-PAGE = (
-    "body { font: 14px/1.45 system-ui, 'Noto Sans', sans-serif; color: #1a202c; background: #f7fafc; margin: 24px auto; padding: 0 24px; "
-    "max-width: 1400px; } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; } table { border-collapse: collapse; } "
-    "th { text-align: left; }"
-)
 
+def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
+    """Reads a release folder; writes `stats.json`, `stats.md`, `stats.html` and gives the page. Memory holds a row group and a few numbers a flight.
 
-def run(dataset: Path, out: Path) -> Path:
-    """Reads `release.json` of a release folder; writes `stats.html` and `stats.json` (frames by bin, style, pace and label). Gives the page.
-
+    Args:
+        pixels: frames whose depth and instance pictures are decoded; 0 for none.
     Raises:
-        InputError: there is no release record, or a field of it is wrong.
+        InputError: it is no release, or something in it cannot be read.
     """
+    dataset = dataset / "dataset" if (dataset / "dataset/release.json").is_file() else dataset
     record = read_record(dataset / "release.json")
-    write_json(out / "stats.json", record.numbers.coverage.model_dump(mode="json"))
-    page = out / "stats.html"
-    write_bytes(page, html_page(f"cosfly: {record.name}", PAGE + STYLE, _body(record)).encode())
-    return page
-
-
-def _body(record: ReleaseRecord) -> str:
-    numbers = record.numbers
-    lead = (
-        f"{numbers.frames:,} frames of {numbers.flights:,} flights over {numbers.trajectories:,} trajectories; "
-        "below a histogram, where 5 % to 95 % of the frames lie; the line, and the last column of the tables, are those of the plain run that "
-        "ships (quickstart)."
-    )
-    return f"<h1>{for_html(record.name)}</h1>\n<p>{for_html(lead)}</p>\n{coverage_html(numbers.coverage)}"
+    counts, card = Counts(), Counted()
+    with progress_bar("stats: rows", sum(shard.rows for shard in record.shards)) as advance:
+        for shard in record.shards:
+            check_rows(dataset / shard.path, shard.rows)
+            for rows in row_lists(dataset / shard.path, list(dict.fromkeys([*COLUMNS, *CARD_COLUMNS]))):
+                card.add(rows)
+                for row in rows:
+                    counts.add(row)
+                advance(len(rows))
+    looked = look_at(dataset, record, pixels) if pixels else None
+    stats = make_stats(record, counts, looked)
+    write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": card.coverage.model_dump(mode="json")})
+    write_bytes(out / "stats.md", markdown(stats).encode())
+    write_bytes(out / "stats.html", page_html(stats, card.coverage).encode())
+    return out / "stats.html"

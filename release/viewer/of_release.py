@@ -15,23 +15,26 @@ from cosfly.console import progress_bar
 from cosfly.frame_views import View, depth_colors, segmentation_colors
 from cosfly.products.captions import Coc, Language
 from cosfly.products.frames import FrameFile
-from cosfly.reading.arrays import parse_array, parse_picture
+from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, row_groups
-from release.card.numbers import row_lists
-from release.columns import BOX, PLACE, POINT, SCALAR_NAMES
+from release.card.numbers import bounded, check_columns, check_rows, row_lists
+from release.columns import BOX, CAPTION_PROMPTS, PLACE, POINT, SCALAR_NAMES
 from release.columns import PICTURES as COLUMNS
+from release.depth import depth_of
 from release.record import ReleaseRecord, read_record
 from release.viewer.choosing import choose_flights, choose_frames, path_of, shown_sentences
 from release.viewer.pictures import Pictures, box_of
 from release.viewer.schema import Shown, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
 
 Place = tuple[str, ...]  # PLACE
+SHOWN = [name for name in SCALAR_NAMES if name not in CAPTION_PROMPTS]
 VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
 LANGUAGES: tuple[Language, ...] = ("en", "zh")
 SCAN = [
     *PLACE,
     "sample_id",
     "track",
+    "split",
     "frame_index",
     "time_s",
     "width_px",
@@ -39,6 +42,7 @@ SCAN = [
     "fov_deg",
     "pose",
     "target",
+    "visibility",
     "has_caption",
     "verdict",
     "decision",
@@ -58,6 +62,9 @@ class Scanned:
     def add(self, row: Mapping[str, Any], shard: Path, group: int) -> None:
         """Take a row of the flight."""
         index, target = row["frame_index"], row["target"]
+        numbers = [row["time_s"], row["fov_deg"], *row["pose"].values(), *(target or {}).values()]
+        for value in (*numbers, row["visibility"] or 0.0):
+            bounded(value)
         drone = [row["pose"][axis] for axis in POINT[:2]]
         self.places[index] = (drone, [np.nan] * 2 if target is None else [target[axis] for axis in POINT[:2]])
         self.groups[index] = (shard, group)
@@ -97,7 +104,8 @@ def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place,
     with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
         for shard in record.shards:
             path = dataset / shard.path
-            for group, rows in enumerate(row_lists(path, [*SCAN, *_split()])):
+            check_rows(path, shard.rows)
+            for group, rows in enumerate(row_lists(path, SCAN)):
                 for row in rows:
                     if "/".join(place_of(row)) in chosen:
                         scanned.setdefault(place_of(row), Scanned(row)).add(row, path, group)
@@ -105,15 +113,11 @@ def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place,
     return scanned
 
 
-def _split() -> list[str]:
-    return [name for name in ("split",) if name in SCALAR_NAMES]
-
-
 def _rows(
     dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, Scanned], frames: Mapping[Place, list[int]]
 ) -> Iterator[dict[str, Any]]:
     """Read the chosen rows with their pictures; of the row groups those alone that hold one."""
-    columns = [*SCALAR_NAMES, *(COLUMNS[file].name for file in record.settings.modalities)]
+    columns = [*SHOWN, *(COLUMNS[file].name for file in record.settings.modalities)]
     wanted: dict[Path, set[int]] = {}
     for place, indices in frames.items():
         for index in indices:
@@ -122,6 +126,7 @@ def _rows(
     for shard in record.shards:
         path = dataset / shard.path
         for table in row_groups(path, columns, tree=dataset, wanted=wanted.get(path, ())):
+            check_columns(table, columns, path)
             with arrow_errors(path):
                 places = table.select([*PLACE, "frame_index"]).to_pylist()
                 kept = [row["frame_index"] in frames.get(place_of(row), ()) for row in places]
@@ -131,7 +136,7 @@ def _rows(
 
 def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) -> ShownFrame:
     views: Mapping[View, Callable[[], np.ndarray]] = {
-        VIEW_OF[file]: partial(picture, row, file) for file in record.settings.modalities
+        VIEW_OF[file]: partial(picture, row, file, record) for file in record.settings.modalities
     }
     pose, target, seen, box = row["pose"], row["target"], row["visibility"], row["target_bbox"]
     x, y, z, yaw = (round(float(pose[name]), 2) for name in (*POINT, "yaw_deg"))
@@ -150,7 +155,7 @@ def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) ->
     )
 
 
-def picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
+def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> np.ndarray:
     """Give a picture of a row as colours, (h, w, 3) uint8 RGB.
 
     Raises:
@@ -158,7 +163,8 @@ def picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
     """
     where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
     if file == "depth":
-        return depth_colors(parse_array(cell or b"", where, dtype=np.float32, ndim=2))
+        assert record.depth is not None, "build writes it with depth"
+        return depth_colors(depth_of(cell or b"", record.depth, where))
     data = (cell or {}).get("bytes") or b""
     if file == "rgb":
         return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
@@ -170,7 +176,7 @@ def _caption(row: Mapping[str, Any]) -> ShownCaption:
     texts = {}
     for language in LANGUAGES:
         coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in Coc.model_fields})
-        texts[language] = shown_sentences(coc, row.get(f"sentence_states_{language}"))
+        texts[language] = shown_sentences(coc, row[f"sentence_states_{language}"])
     return ShownCaption(
         decision=row["decision"],
         label=row["label"],
@@ -192,7 +198,7 @@ def _flight(scanned: Scanned) -> ShownFlight:
         map=f"{row['run']}/{row['town']}",
         town=row["town"],
         track=row["track"],
-        split=row.get("split"),
+        split=row["split"],
         result=None,
         fov_deg=round(row["fov_deg"], 1),
         num_frames=len(order),

@@ -66,6 +66,6 @@ class Pictures:
 def box_of(corners_px: Sequence[float], width_px: int, height_px: int) -> tuple[float, float, float, float] | None:
     """Give a box, xmin, ymin, xmax, ymax px, as shares of the picture; None where it is not known."""
     xmin, ymin, xmax, ymax = (
-        round(float(v) / size, 4) for v, size in zip(corners_px, (width_px, height_px) * 2, strict=True)
+        round(float(v) / max(1, size), 4) for v, size in zip(corners_px, (width_px, height_px) * 2, strict=True)
     )
-    return None if any(np.isnan((xmin, ymin, xmax, ymax))) else (xmin, ymin, xmax, ymax)
+    return None if not np.isfinite((xmin, ymin, xmax, ymax)).all() else (xmin, ymin, xmax, ymax)

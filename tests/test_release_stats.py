@@ -1,0 +1,271 @@
+"""The statistics: figures against those of whole flights, tables against rows counted by hand, pages that show no foreign text as markup."""
+
+from __future__ import annotations
+
+import gc
+import math
+import shutil
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from specimens_rows import make_row
+from test_release_package import build, make_inputs
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import InputError
+from cosfly.flight_metrics import accel_rms, jerk_rms, length_m
+from cosfly.products.coverage import Coverage, default_coverage
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.kinds import KINDS
+from cosfly.reading.documents import read_json
+from release.columns import BOX, POINT, POSE
+from release.record import read_record
+from release.stats.counting import Counts, overlap
+from release.stats.page import markdown, page_html
+from release.stats.pixels import BIN_M, Pixels
+from release.stats.schema import Absent, Stats, Table
+from release.stats.stats import run
+from release.stats.tables import _weather
+
+BIG = dict(zip(BOX, (10.0, 10.0, 20.0, 30.0), strict=True))
+SMALL = dict(zip(BOX, (10.0, 10.0, 20.0, 20.0), strict=True))
+
+
+def counted(rows: list[dict]) -> Counts:
+    counts = Counts()
+    for row in rows:
+        counts.add(row)
+    return counts
+
+
+def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None = None) -> list[dict]:
+    """Rows at some frames of a flight, perturbed by known offsets."""
+    offsets = np.zeros_like(positions) if offsets is None else offsets
+    return [
+        make_row(
+            i, "aug_001", pose=dict.fromkeys(POSE, 0.0) | dict(zip(POINT, (positions[i] + offsets[i]).tolist(), strict=True)),
+            drone_offset=dict.fromkeys(POSE, 0.0) | dict(zip(POINT, offsets[i].tolist(), strict=True)), target_offset=dict.fromkeys(POINT, 0.0),
+        )
+        for i in frames
+    ]  # fmt: skip
+
+
+@given(seed=st.integers(0, 99), num=st.integers(4, 30))
+def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
+    rng = np.random.default_rng(seed)
+    plan = np.cumsum(rng.normal(0, 1, (num, 3)), axis=0)
+    (flight,) = counted(rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3)))).flights.values()
+    assert flight.path_m == pytest.approx(length_m(plan), rel=1e-9)
+    assert flight.accel_rms_mps2 == pytest.approx(accel_rms(plan), rel=1e-6)
+    assert flight.jerk_rms_mps3 == pytest.approx(jerk_rms(plan), rel=1e-6)
+
+
+def test_differences_are_taken_over_frames_in_a_row_alone():
+    """Two runs of a straight flight with a jump between: no acceleration, but the way across counts."""
+    plan = np.array([[i * 1.0, 0.0, 0.0] for i in range(20)])
+    plan[10:, 1] += 50.0
+    (flight,) = counted(rows_of(plan, [0, 1, 2, 3, 4, 15, 16, 17, 18])).flights.values()
+    assert flight.accel_rms_mps2 == pytest.approx(0.0, abs=1e-9)
+    assert flight.jerk_rms_mps3 == pytest.approx(0.0, abs=1e-9)
+    assert flight.path_m == pytest.approx(4 + math.hypot(11, 50) + 3)
+    (strided,) = counted(rows_of(plan, list(range(0, 20, 2)))).flights.values()
+    assert strided.accel_rms_mps2 is strided.jerk_rms_mps3 is None  # nothing to say, rather than something wrong
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "share"),
+    [
+        ((0, 0, 2, 2), (0, 0, 2, 2), 1.0),
+        ((0, 0, 2, 2), (1, 0, 3, 2), 1 / 3),
+        ((0, 0, 1, 1), (2, 2, 3, 3), 0.0),
+        ((0, 0, 0, 0), (0, 0, 0, 0), 0.0),
+        ((2, 2, 0, 0), (0, 0, 2, 2), 0.0),
+    ],
+)
+def test_overlap(a, b, share):
+    assert overlap(list(a), list(b)) == pytest.approx(share)
+    assert overlap(list(b), list(a)) == pytest.approx(share)
+
+
+def test_sizes_count_where_the_person_is_seen():
+    rows = [make_row(i, target_bbox=BIG, target_mask_bbox=SMALL, visibility=0.0 if i == 1 else 0.5) for i in range(3)]
+    (flight,) = counted(rows).flights.values()
+    assert (flight.width_px.spread().mean, flight.height_px.spread().mean, flight.iou.spread().mean) == (
+        10.0,
+        20.0,
+        0.5,
+    )
+    assert (flight.width_px.count, flight.visibility.count) == (2, 3)
+
+
+def test_what_became_of_the_perturbation():
+    turned = dict.fromkeys(POSE, 0.0) | {"yaw_deg": 3.0}
+    told = {"position": "applied", "rotation": "fallback: target hidden"}
+    rows = [
+        make_row(0),
+        make_row(0, "aug_001"),
+        make_row(1, "aug_001", drone_offset=turned),
+        make_row(2, "aug_001", drone_offset=turned | {"x_m": 2.0}, perturbation=told),
+    ]
+    rows.append(make_row(3, "aug_001", drone_offset=dict.fromkeys(POSE, 0.0)))
+    rows.append(make_row(4, "aug_001", drone_offset=None))
+    counts = counted(rows)
+    assert counts.states == {"position only": 1, "rotation only": 1, "full": 1, "unperturbed": 1}
+    assert counts.events == {
+        ("perturbed", "position", "applied"): 1,
+        ("perturbed", "rotation", "fallback: target hidden"): 1,
+    }
+    assert counts.over_frames["shift of the drone, m"].spread().max == 2.0
+
+
+def test_captions_are_counted_by_what_they_say():
+    states = {"proved_sentences_en": 3, "contradicted_sentences_en": 0, "unread_sentences_en": 1}
+    rows = [
+        make_row(0, **states),
+        make_row(1),
+        make_row(2, label=None, repair_strategy="cascade", caption_en_reasoning_trace="x" * 60),
+    ]
+    counts = counted(rows)
+    assert counts.decisions == {"hover": 2}
+    assert counts.labels == {"ascend": 1, "none": 1}
+    assert counts.confusion == {("ascend", "hover"): 1, ("none", "hover"): 1}
+    assert counts.repairs["cascade"] == 1
+    assert counts.sentences == {("en", "proved"): 3, ("en", "contradicted"): 0, ("en", "unread"): 1}
+    assert counts.whole == {("en", "some unread"): 1}
+    assert counts.lengths["en", "reasoning_trace"].spread().max == 60.0
+    assert counts.length_bins["en", "reasoning_trace", 2] == 1
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def test_depth_percentiles_against_numpy():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 90, (50, 80)).astype(np.float32)
+    depth[:5], depth[5] = SKY_DEPTH_M, INVALID_DEPTH_M
+    pixels = Pixels()
+    pixels.add_depth(depth)
+    assert (pixels.sky, pixels.invalid) == (5 * 80, 80)
+    for share, found in pixels.percentiles_m():
+        assert found == pytest.approx(np.quantile(depth[6:], share), abs=2 * BIN_M)
+    assert Pixels().percentiles_m() == []
+
+
+def test_kinds_are_shares_of_pixels_and_of_frames():
+    pixels = Pixels(frames=2)
+    for row in ((1, 1, 1, 3), (1, 1, 1, 1)):
+        pixels.add_kinds(np.array([row], dtype=np.uint8))
+    assert pixels.by_kind() == [("Roads", 0.875, 1.0), ("Buildings", 0.125, 0.5)]
+    assert KINDS["Roads"] == 1
+
+
+# --- pages ------------------------------------------------------------------------------------------------------------
+
+
+def test_pages_show_foreign_text_as_text():
+    evil = "<script>alert(1)</script>|`x`\u202e\n# head"
+    rows: list = [[evil, 3, 1.5], ["b", None, 0]]
+    tables = [
+        Table(key=evil, title=evil, paper=evil, note=evil, head=["a", evil, "c"], rows=rows, plot=plot)
+        for plot in (None, "bars", "stacked", "heat")
+    ]
+    stats = Stats(name=evil, content_digest="0" * 64, tables=tables, absent=[Absent(what=evil, paper=evil, why=evil)])
+    page, text = page_html(stats, default_coverage()), markdown(stats)
+    assert "<script" not in page
+    assert "<script" not in text
+    assert "\u202e" not in page + text
+    assert "\n# head" not in text
+    assert all(line.count(" | ") <= 3 for line in text.splitlines() if line.startswith("|"))
+
+
+def test_an_empty_table_is_drawn():
+    empty = [
+        Table(key="x", title="x", head=["a", "b"], rows=[], plot=plot) for plot in (None, "bars", "stacked", "heat")
+    ]
+    assert "<table>" in page_html(Stats(name="x", content_digest="", tables=empty, absent=[]), Coverage())
+
+
+def test_nothing_is_kept_a_frame():
+    """Counts of ten times the frames hold as much memory."""
+
+    def held(num: int) -> int:
+        gc.collect()
+        tracemalloc.start()
+        counts = Counts()
+        for i in range(num):
+            counts.add(make_row(i))
+        gc.collect()
+        size = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        return size
+
+    held(200)
+    assert held(4000) < held(400) + 10_000
+
+
+# --- a whole release --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("release")
+    return build(make_inputs(root / "inputs"), root / "release")
+
+
+def test_a_release_is_counted_again(dataset, tmp_path):
+    result = CliRunner().invoke(app, ["release", "stats", str(dataset.parent), "--out", str(tmp_path), "--pixels", "5"])
+    assert result.exit_code == 0, result.output
+    written = Stats.model_validate({k: v for k, v in read_json(tmp_path / "stats.json").items() if k != "coverage"})
+    tables = {table.key: {row[0]: row[1:] for row in table.rows} for table in written.tables}
+    numbers, record = read_json(dataset / "release.json")["numbers"], read_record(dataset / "release.json")
+    assert len(tables) == len(written.tables)
+    assert tables["release"]["frames"] == [numbers["frames"]]
+    assert tables["release"]["trajectories"] == [numbers["trajectories"]]
+    assert tables["release"]["captions"] == [numbers["captions"]["frames_with"]]
+    assert {name: row[0] for name, row in tables["decisions"].items() if row[0]} == numbers["captions"]["decision"]
+    assert {name: row[0] for name, row in tables["verdicts"].items() if row[0]} == numbers["captions"]["verdict"]
+    assert {name: row[0] for name, row in tables["splits"].items()} == {
+        name: own.frames for name, own in record.splits.splits.items()
+    }
+    assert sum(row[1] for row in tables["fovs"].values()) == numbers["frames"]
+    assert tables["quality_stats"]["dropped before rendering: smoothness"] == [2]
+    assert tables["quality_stats"]["flights released"] == [numbers["flights"]]
+    lengths = [flight for flight in tables["text_lengths"].values() if flight[0] is not None]
+    assert len(lengths) == 4
+    assert "weather and time of day, 15 x 4" in {one.what for one in written.absent}
+    assert "weather" not in tables
+    assert {"depth", "semantics"} <= tables.keys()
+    text = (tmp_path / "stats.md").read_text(encoding="utf-8")
+    page = (tmp_path / "stats.html").read_text(encoding="utf-8")
+    for table in written.tables:
+        assert f'id="{table.key}"' in page
+        assert table.title.split("|")[0][:20] in text.replace("\\", "")
+    for outside in ("<script", "src=", "://"):
+        assert outside not in page
+
+
+def test_weather_is_counted_where_frames_name_it():
+    rows = [make_row(i, weather="heavy rain" if i < 3 else "green sky", time_of_day="noon") for i in range(5)]
+    (table,) = [table for table in _weather(counted(rows)) if table.key == "weather"]
+    grid = {row[0]: row[1:] for row in table.rows}
+    assert table.head == ["preset", "morning", "noon", "dusk", "night"]
+    assert len(grid) == 15 + 1
+    assert grid["heavy_rain"] == [0, 3, 0, 0]
+    assert grid["green_sky"] == [0, 2, 0, 0]
+    assert grid["clear"] == [0, 0, 0, 0]
+
+
+def test_damage_is_one_error(dataset, tmp_path):
+    broken = shutil.copytree(dataset, tmp_path / "dataset")
+    shard = next((broken / "data").glob("*.parquet"))
+    shard.write_bytes(shard.read_bytes()[:-40])
+    with pytest.raises(InputError):
+        run(broken, tmp_path / "stats")
+    assert not (tmp_path / "stats").exists()
+    with pytest.raises(InputError):
+        run(tmp_path / "nothing", tmp_path / "stats")
