@@ -4,44 +4,34 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
+import shutil
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_rows import make_row
+from test_release_package import build, make_inputs
+from typer.testing import CliRunner
 
+from cosfly.cli import app
 from cosfly.errors import InputError
+from cosfly.products.captions import ACTIONS
 from release.card.numbers import COLUMNS, Counted, Sum, count_shard, spread_of
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, POINT, POSE, schema
+from release.card.render import render_card
+from release.card.snippets import first_split
+from release.columns import POINT, schema
+from release.package.stage import write_records
+from release.record import MadeBy, read_record
+from release.verify.verify import verify
 
-WORDS = {
-    "decision": "hover",
-    "label": "ascend",
-    "label_from": "flight",
-    "verdict": "SOFT_CONFLICT",
-    "teacher_kind": "rules",
-}
-
-
-def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **change) -> dict:
-    """A frame of a drone that flies 3 m a frame to the east, 20 m above a person; the perturbed track 1 m beside, left and right in turn."""
-    shift = 0.0 if variant == "ORI" else (-1.0) ** i
-    place = {"x_m": 3.0 * i, "y_m": shift, "z_m": 20.0}
-    row = dict.fromkeys(COLUMNS) | {
-        "sample_id": f"{trajectory}_{variant}_frame_{i:05d}", "run": "one", "town": "Town01", "trajectory": trajectory, "variant": variant,
-        "track": "clean" if variant == "ORI" else "perturbed", "style": "follow", "pace": "walk", "frame_index": i, "time_s": 0.5 * i,
-        "width_px": 64, "height_px": 36, "fov_deg": 60.0, "pose": dict.fromkeys(POSE, 0.0) | place,
-        "drone_offset": dict.fromkeys(POSE, 0.0) | {"y_m": shift}, "target": dict(zip(POINT, (3.0 * i, 0.0, 0.0), strict=True)),
-        "visibility": 0.75, "is_perturbed": variant != "ORI", "target_in_view": True, "target_visible": True, "has_caption": i % 2 == 0,
-    }  # fmt: skip
-    if row["has_caption"]:
-        row |= dict.fromkeys((*CAPTION_FACTS, *CAPTION_FIELDS), "word") | WORDS | {"proved_en": 0.5}
-    return row | change
-
-
+ROOT = Path(__file__).resolve().parents[1]
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]
 
 
@@ -142,3 +132,117 @@ def test_memory_does_not_grow_with_the_number_of_frames():
 
     peak(2)  # what is imported and cached
     assert peak(60) < peak(6) + 100_000
+
+
+# --- the card ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("release")
+    return build(make_inputs(root / "inputs"), root / "release")
+
+
+@pytest.fixture(scope="module")
+def record(dataset):
+    return read_record(dataset / "release.json")
+
+
+def card_of(record, **change) -> str:
+    return render_card(record.model_copy(update=change))
+
+
+def with_stages(record, *stages: tuple[str, dict]):
+    """The record of a release whose first source has these stages."""
+    made = [MadeBy(stage=name, code_version="0", seed=0, config=config, inputs={}) for name, config in stages]
+    sources = [record.provenance.sources[0].model_copy(update={"stages": made})]
+    return record.model_copy(update={"provenance": record.provenance.model_copy(update={"sources": sources})})
+
+
+def test_a_town_is_what_its_map_was_made_with(record):
+    nothing = render_card(record)
+    assert "made elsewhere" in nothing
+    assert "synthetic" not in nothing
+    assert "nobody was filmed" not in nothing
+    ours = render_card(with_stages(record, ("maps", {"source": "synthetic"}), ("render", {})))
+    assert "cosfly's generator from a seed; no real place" in ours
+    assert "nobody was filmed" in ours
+    assert "- synthetic" in ours
+    delft = render_card(with_stages(record, ("maps", {"source": "cityjson"}), ("render", {})))
+    assert "of a real place" in delft
+    assert "no real place" not in delft
+    odd = render_card(with_stages(record, ("maps", {"source": "another"}), ("render", {})))
+    assert "made elsewhere; what it shows is not known" in odd
+
+
+def test_coordinates_are_read_by_a_program(record):
+    (block,) = re.findall(r"```yaml\n(.*?)\n```", render_card(record), re.DOTALL)
+    found = yaml.safe_load(block)
+    assert found["coordinates"] == record.coordinates
+    assert found["depth"]["coding"] == "float32"
+    evil = card_of(record, coordinates={"x": "```\n# owned\n"})
+    assert "\n# owned" not in evil
+    assert "````yaml" in evil
+
+
+def test_the_card_says_whom_it_is_not_for_and_whom_to_cite(record):
+    card = render_card(record)
+    assert "dual use" in card
+    assert "without their knowledge" in card
+    cff = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    (bib,) = re.findall(r"```bibtex\n(.*?)\n```", card, re.DOTALL)
+    assert cff["preferred-citation"]["title"] in bib
+    authors = " ".join(re.search(r"author = \{(.*?)\}\n", bib, re.DOTALL)[1].split())
+    assert authors == " and ".join(
+        f"{a['family-names']}, {a['given-names']}" for a in cff["preferred-citation"]["authors"]
+    )
+
+
+def test_limits_are_those_of_the_numbers(record):
+    card = render_card(record)
+    missing = [name for name in ACTIONS if name not in record.numbers.captions.decision]
+    line = next(line for line in card.splitlines() if line.startswith("- Decisions that no caption has"))
+    assert all(f"`{name}`" in line for name in missing)
+    assert "rule teacher" in card
+    none = record.numbers.captions.model_copy(
+        update={"frames_with": 0, "decision": {}, "teacher_kind": {}, "repair_strategy": {}, "label_from": {}}
+    )
+    bare = card_of(record, numbers=record.numbers.model_copy(update={"captions": none}))
+    assert "There are no captions" in bare
+    assert "rule teacher" not in bare
+
+
+def test_every_snippet_of_the_card_runs(record, dataset, tmp_path, monkeypatch):
+    datasets = pytest.importorskip("datasets")
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+    values: dict = {"FOLDER": str(dataset)}
+    blocks = re.findall(r"```python\n(.*?)```", render_card(record), re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block, values)
+    assert set(values["splits"]) == set(record.splits.splits)
+    assert values["poses"].num_rows == record.splits.splits[first_split(record)].frames
+    assert values["poses"].column_names == ["sample_id", "pose"]
+    assert len(values["places"]) == min(10, values["poses"].num_rows)
+
+
+def test_a_changed_number_fails_verify(dataset, tmp_path):
+    """In the card, or in the record and the card that is made of it."""
+    broken = shutil.copytree(dataset, tmp_path / "dataset")
+    card = (broken / "README.md").read_text(encoding="utf-8")
+    (broken / "README.md").write_text(card.replace("Perturbed frames: ", "Perturbed frames: 1"), encoding="utf-8")
+    assert any("README.md" in str(issue.where) for issue in verify(broken).issues)
+    record = read_record(broken / "release.json")
+    longer = record.numbers.flight_length_m.model_copy(update={"mean": 202.5})
+    changed = record.model_copy(update={"numbers": record.numbers.model_copy(update={"flight_length_m": longer})})
+    write_records(broken, changed)
+    assert any("flight_length_m" in str(issue.where) for issue in verify(broken).issues)
+
+
+def test_the_command_renders_what_verify_expects(dataset, tmp_path):
+    shown = CliRunner().invoke(app, ["release", "card", str(dataset)])
+    assert shown.exit_code == 0, shown.output
+    assert shown.output == (dataset / "README.md").read_text(encoding="utf-8")
+    written = CliRunner().invoke(app, ["release", "card", str(dataset.parent), "--out", str(tmp_path / "card.md")])
+    assert written.exit_code == 0, written.output
+    assert (tmp_path / "card.md").read_bytes() == (dataset / "README.md").read_bytes()

@@ -87,12 +87,41 @@ def release_verify(
 @app.command("stats")
 def release_stats(
     folder: Annotated[Path, typer.Argument(help="Release folder.")],
-    out: Annotated[Path, typer.Option(help="Folder for stats.html and stats.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for stats.html, stats.md and stats.json.")],
+    pixels: Annotated[
+        int,
+        typer.Option(min=0, help="Frames whose depth and instance pictures are decoded, spread evenly; 0 for none."),
+    ] = 200,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
 ) -> None:
-    """Draw what a release covers (heights, distances, azimuths, sizes, styles, paces, labels) beside the plain run that ships."""
+    """Compute every table that the paper gives of its data again from the rows, and draw what is covered beside the plain run that ships."""
     from release.stats import stats
 
-    typer.echo(stats.run(folder, out))
+    options.resolve(config, overrides)
+    typer.echo(stats.run(folder, out, pixels=pixels))
+
+
+@app.command("card")
+def release_card(
+    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    out: Annotated[Path | None, typer.Option(help="File to write; by default it is printed.")] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
+    """Render the data-set card of a release from its release.json, as `verify` expects it in README.md."""
+    from cosfly.store import write_bytes
+    from release.card.render import render_card
+    from release.record import read_record
+
+    options.resolve(config, overrides)
+    dataset = folder / "dataset" if (folder / "dataset/release.json").exists() else folder
+    card = render_card(read_record(dataset / "release.json"))
+    if out is None:
+        typer.echo(card, nl=False)
+    else:
+        write_bytes(out, card.encode())
+        typer.echo(out)
 
 
 @app.command("viewer")

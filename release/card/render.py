@@ -1,6 +1,6 @@
 """The data-set card: `render_card` turns release.json into README.md, so that a card which says anything else is found.
 
-Its numbers are those of `card_numbers.py`: build writes them into release.json, verify computes them again and compares.
+Its numbers are those of `numbers.py`, its words those of `claims.py`: build writes the numbers into release.json, verify computes them again and compares.
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED, Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
+from release.card import claims, snippets
 from release.columns import PICTURES, schema
-from release.record import CaptionNumbers, FramesBy, History, Numbers, ReleaseRecord, shard_pattern
+from release.record import CaptionNumbers, DepthCodingName, FramesBy, History, Numbers, ReleaseRecord, shard_pattern
 
-FILE_TEXT: dict[FrameFile, str] = {
+FILE_TEXT: dict[FrameFile, str] = {  # of depth: DEPTH_TEXT
     "rgb": "`image`: colour, PNG",
-    "depth": "`depth`: z-depth in metres, float32 `.npy` bytes, lossless",
     "instance": "`instance`: semantic number and instance id, PNG",
+}
+DEPTH_TEXT: dict[DepthCodingName, str] = {
+    "float32": "z-depth in metres, float32 `.npy` bytes, lossless",
+    "float16": "z-depth in metres, float16 `.npy` bytes",
+    "millimetre_png": "z-depth in millimetres, PNG of 16 bits",
 }
 
 
@@ -57,6 +62,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "perturbed": f"{numbers.frames_perturbed:,} ({_share(numbers.frames_perturbed, frames)})",
         "num_frames": "all" if settings.num_frames is None else str(settings.num_frames),
         "splits_table": _splits(record),
+        "split_by": record.splits.by,
         "split_rule": for_markdown(record.splits.rule),
         "frame_rule": for_markdown(record.frame_selection),
         "short_flights": str(numbers.flights_shorter_than_num_frames),
@@ -78,14 +84,32 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
             + [("all shards", f"{numbers.files.bytes:,}")],
         ),
         "funnel_table": _funnel(history),
-        "modalities": "\n".join(f"- {FILE_TEXT[name]}" for name in settings.modalities),
-        "decode": _decode_snippet(settings.modalities),
+        "flights_without_length": str(numbers.flights - numbers.flight_length_m.count),
+        "shown": claims.shown(record),
+        "verification": claims.verification(record),
+        "limits": claims.limits(record),
+        "modalities": "\n".join(f"- {_file_text(record, name)}" for name in settings.modalities),
+        "decode": snippets.one_row(record),
+        "parts": snippets.parts(record),
         "columns_table": _columns(settings.modalities),
-        "coordinates_table": _table(("", ""), [(name, str(text)) for name, text in record.coordinates.items()]),
+        "coordinates": claims.coordinates_block(record),
         "licence": for_markdown(record.licence),
-        "credits": "".join(f"\n\n{for_markdown(line)}" for line in (*_maps(record), record.credits) if line),
+        "credits": claims.credits(record),
+        "citation": read_text(Path(__file__).with_name("citation.bib")).strip(),
         "made_by": for_markdown(record.made_by),
     }
+
+
+def _file_text(record: ReleaseRecord, file: FrameFile) -> str:
+    """Say what a picture column holds; of a coded depth also what the coding costs."""
+    if file != "depth" or record.depth is None:
+        return FILE_TEXT.get(file, "")
+    coded = record.depth
+    text = f"`depth`: {DEPTH_TEXT[coded.coding]}"
+    if coded.coding == "float32":
+        return text
+    reach = "" if coded.min_m is None else f", {coded.min_m:g} to {coded.max_m:g} m"
+    return f"{text}{reach}; {coded.sky:g} sky, {coded.invalid:g} invalid; greatest error of a pixel {coded.max_error_m:g} m"
 
 
 def _provenance(captions: CaptionNumbers) -> str:
@@ -112,7 +136,7 @@ def _front_matter(record: ReleaseRecord) -> str:
         "pretty_name": for_terminal(record.name),
         "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
-        "tags": ["uav", "aerial-tracking", "synthetic", "depth", "instance-segmentation", "chain-of-thought"],
+        "tags": claims.tags(record),
         "configs": [{"config_name": "default", "data_files": _data_files(record)}],
     }
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
@@ -135,14 +159,6 @@ def _splits(record: ReleaseRecord) -> str:
         for split, own in record.splits.splits.items()
     ]
     return _table(("split", "frames", "captions", "flights", "trajectories", "walks", "towns"), rows)
-
-
-def _maps(record: ReleaseRecord) -> list[str]:
-    """One line a map: its licence, and who must be named."""
-    return [
-        f"Map of {shown.town}: {shown.name}, licence {shown.licence}.{' ' * bool(shown.credits)}{shown.credits}"
-        for shown in record.maps
-    ]
 
 
 def _summary(record: ReleaseRecord) -> str:
@@ -234,25 +250,6 @@ def _columns(files: list[FrameFile]) -> str:
             kind = f"list of {member.type.value_type}"
         rows.append((_Code(member.name), kind))
     return _table(("column", "type"), rows)
-
-
-def _decode_snippet(files: list[FrameFile]) -> str:
-    lines = ["import io", "import numpy as np", "from datasets import load_dataset", ""]
-    lines += ['data = load_dataset(FOLDER, split="train")  # this folder, or its name on the hub', "row = data[0]"]
-    if "rgb" in files:
-        lines.append('rgb = np.asarray(row["image"].convert("RGB"))')
-    if "depth" in files:
-        lines.append('depth_m = np.load(io.BytesIO(row["depth"]))  # float32 (height, width)')
-    if "instance" in files:
-        lines += [
-            'coded = np.asarray(row["instance"].convert("RGB")).astype(np.uint16)',
-            "semantic, instance_id = coded[..., 0], coded[..., 1] | (coded[..., 2] << 8)",
-        ]
-    lines += [
-        'intrinsics, pose = row["intrinsics"], row["pose"]',
-        'reason = row["caption_en_reasoning_trace"]  # or _zh_',
-    ]
-    return "\n".join(lines)
 
 
 def _share(count: int, total: int) -> str:

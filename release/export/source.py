@@ -8,18 +8,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.errors import InputError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_bytes
-from cosfly.reading.arrays import parse_array, parse_picture, png_size
+from cosfly.products.frames import FrameFile, depth_bytes
+from cosfly.reading.arrays import png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
 from cosfly.store import inside
 from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, schema
+from release.depth import depth_of
 from release.record import DepthCoding, ReleaseRecord, read_record
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
@@ -242,16 +242,7 @@ def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
     data, where = picture(row, "depth"), row["sample_id"]
     if coding is None or coding.coding == "float32":
         return data
-    if coding.coding == "float16":
-        return depth_bytes(parse_array(data, where, dtype=np.float16, ndim=2, what="depth image").astype(np.float32))
-    codes = parse_picture(data, where, flags=cv2.IMREAD_UNCHANGED)
-    if codes.dtype != np.uint16 or codes.ndim != 2:
-        raise InputError(
-            "not a depth image", where=where, got=f"{codes.dtype} {codes.shape}", expected="a PNG of 16 bits"
-        )
-    depth = codes.astype(np.float32) / np.float32(1000.0)
-    depth[codes == coding.sky], depth[codes == coding.invalid] = SKY_DEPTH_M, INVALID_DEPTH_M
-    return depth_bytes(depth)
+    return depth_bytes(depth_of(data, coding, where))
 
 
 def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
