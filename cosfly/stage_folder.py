@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 Resume = Literal["never", "if-same", "force"]
 
 # What stands in a folder before anything is finished.
-BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", "events.jsonl")
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", "events.jsonl", "preflight.json")
 
 
 # --- what became of the items -----------------------------------------------------------------------------------------

@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_distill import make_captions, prepared, write_set
-
-from specimens import make_playback_tree
+from specimens_distill import prepared, write_set
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, make_place, samples_of, trees_of  # noqa: E402
+
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
-from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
+from distill.schema import open_split  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
 from distill.student.encoding import IGNORED, encode, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
@@ -34,13 +34,6 @@ from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 from distill.training.steps import Steps, learning_rate_at, share_of  # noqa: E402
-
-MAX_PIXELS = 64 * 64
-FAST = {
-    "max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "schedule": "constant", "device": "cpu", "data_workers": 0,
-    "validation_answers": False,
-}  # fmt: skip
-TWELVE = {**FAST, "samples_per_step": 4, "batch_size": 2, "epochs": 6, "max_steps": 12, "save_every_steps": 5}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -54,13 +47,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """A folder with a playback tree, a training set and a tiny student."""
-    root = tmp_path_factory.mktemp("distill")
-    make_playback_tree(root / "tree", num_flights=3, num_points=7)
-    make_captions(root / "captions.jsonl", root / "tree")
-    prepared(root / "tree", root / "captions.jsonl", root / "set")
-    make_tiny_student(root / "student")
-    return root
+    return make_place(tmp_path_factory.mktemp("distill"))
 
 
 @pytest.fixture(scope="module")
@@ -69,18 +56,6 @@ def trained(place) -> Path:
     cfg = TrainConfig(**TWELVE)
     train.run(cfg, place / "set", [place / "tree"], place / "student", place / "trained")
     return place / "trained"
-
-
-def load(place: Path) -> student.Student:
-    return student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS)
-
-
-def samples_of(place: Path, split: str = "train") -> list[Sample]:
-    return list(open_split(place / "set", split))
-
-
-def trees_of(place: Path) -> dict[str, Path]:
-    return resolve_trees(place / "set", [place / "tree"])
 
 
 # --- student ----------------------------------------------------------------------------------------------------------
@@ -261,12 +236,6 @@ def test_adapter_covers_all_language_layers_and_nothing_else(place):
     assert all("lora_" in name and "language_model" in name for name in names)
     # 3 linear-attention layers of 5, one full-attention layer of 4, an MLP of 3 in each of 4 layers; two matrices each
     assert len(names) == 2 * (3 * 5 + 4 + 4 * 3)
-
-
-def log_of(out: Path, kind: str = "loss") -> list[dict]:
-    """The log without what depends on the machine."""
-    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in record.items() if k != "speed"} for record in records if kind in record]
 
 
 def test_loss_falls_and_the_log_tells_how_fast(trained):

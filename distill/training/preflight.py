@@ -57,7 +57,7 @@ def findings(
     """
     return [
         *_about_data(cfg, census, validation, steps),
-        *_about_decisions(census, validation),
+        *_about_decisions(cfg, census, validation),
         _about_chat(student, sample),
         *_about_memory(cfg, student, census, features),
         *_about_features(cfg, census, validation, features),
@@ -81,14 +81,15 @@ def _about_data(cfg: TrainConfig, census: Census, validation: Census, steps: Ste
     return [*found, Finding("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions")]
 
 
-def _about_decisions(census: Census, validation: Census) -> list[Finding]:
+def _about_decisions(cfg: TrainConfig, census: Census, validation: Census) -> list[Finding]:
     missing = [action for action in ACTIONS if not census.decisions[action]]
     asked = [action for action in missing if validation.decisions[action]]
     found = []
     if missing:
         found.append(Finding("decisions", f"no sample of {', '.join(missing)}", "warning"))
     if asked:
-        found.append(Finding("decisions", f"val asks for what train never shows: {', '.join(asked)}", "warning"))
+        level: Any = "error" if cfg.empty_decision == "refuse" else "warning"
+        found.append(Finding("decisions", f"val asks for what train never shows: {', '.join(asked)}", level))
     return found
 
 

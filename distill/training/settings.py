@@ -64,6 +64,9 @@ class TrainConfig(Config):
     max_tokens: int = Field(
         4096, ge=16, description="longest sample, images and answer included; a longer one is skipped and counted"
     )
+    empty_decision: Literal["warn", "refuse"] = Field(
+        "warn", description="what becomes of a training where val asks for a decision that no sample of train makes"
+    )
     dtype: Dtype = Field(
         "auto",
         description="what is computed in; auto: bfloat16 on an accelerator, float32 on a CPU. Learning weights are float32",

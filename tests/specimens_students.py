@@ -1,0 +1,51 @@
+"""A training set of small pictures, a tiny student, and settings under which it learns in seconds; what a training left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from specimens_distill import make_captions, prepared
+
+from distill.schema import Sample, open_split, resolve_trees
+from distill.student.model import Student, load_student
+from distill.student.random_student import make_tiny_student
+from specimens import make_playback_tree
+
+MAX_PIXELS = 64 * 64
+FAST = {
+    "max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "schedule": "constant", "device": "cpu", "data_workers": 0,
+    "validation_answers": False,
+}  # fmt: skip
+TWELVE = {**FAST, "samples_per_step": 4, "batch_size": 2, "epochs": 6, "max_steps": 12, "save_every_steps": 5}
+
+
+def make_place(root: Path) -> Path:
+    """A folder with a playback tree, a training set and a tiny student."""
+    make_playback_tree(root / "tree", num_flights=3, num_points=7)
+    make_captions(root / "captions.jsonl", root / "tree")
+    prepared(root / "tree", root / "captions.jsonl", root / "set")
+    make_tiny_student(root / "student")
+    return root
+
+
+def load(place: Path) -> Student:
+    return load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS)
+
+
+def samples_of(place: Path, split: str = "train") -> list[Sample]:
+    return list(open_split(place / "set", split))
+
+
+def trees_of(place: Path) -> dict[str, Path]:
+    return resolve_trees(place / "set", [place / "tree"])
+
+
+def log_of(out: Path, kind: str = "loss") -> list[dict]:
+    """The log of a training without what depends on the machine."""
+    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in record.items() if k != "speed"} for record in records if kind in record]
+
+
+def losses_of(out: Path) -> list[float]:
+    return [record["loss"] for record in log_of(out)]

@@ -1,0 +1,169 @@
+"""distill: what a student is taught is what its own chat template writes, for the templates of Qwen3.5, 3.6 and 3.8.
+
+The templates here were written for these tests; they branch where the public ones do: texts are trimmed, thoughts of the last answer are
+kept and others dropped, 3.6 can keep them (`preserve_thinking`), 3.8 keeps them unless told otherwise, takes thoughts from their own
+field alone, and begins its system text with how much to think unless thinking is off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("peft", reason="needs the extra distill")
+
+from specimens_students import FAST, load, make_place, samples_of  # noqa: E402
+
+from cosfly.errors import InputError  # noqa: E402
+from distill.student.encoding import END_OF_ANSWER, chat_text, encode_text, prompt_text, special_token_in  # noqa: E402
+from distill.student.model import END_OF_TURN, Processor  # noqa: E402
+from distill.training import stage as train  # noqa: E402
+from distill.training.settings import TrainConfig  # noqa: E402
+
+WORDS = """
+{%- macro words(content) -%}
+    {%- if content is string -%}{{ content }}
+    {%- else -%}
+        {%- for part in content -%}
+            {%- if part.type == 'image' or 'image' in part or 'image_url' in part -%}<|vision_start|><|image_pad|><|vision_end|>
+            {%- elif 'text' in part -%}{{ part.text }}
+            {%- else -%}{{ raise_exception('Unexpected item type in content.') }}
+            {%- endif -%}
+        {%- endfor -%}
+    {%- endif -%}
+{%- endmacro -%}
+{%- set place = namespace(last_question=-1) -%}
+{%- for message in messages if message.role == 'user' -%}{%- set place.last_question = messages.index(message) -%}{%- endfor -%}
+"""
+END = """
+{%- if add_generation_prompt -%}
+    {{- '<|im_start|>assistant\\n' -}}
+    {%- if enable_thinking is defined and enable_thinking is false -%}{{- '<think>\\n\\n</think>\\n\\n' -}}
+    {%- else -%}{{- '<think>\\n' -}}
+    {%- endif -%}
+{%- endif -%}
+"""
+
+
+def turns(keeps_thoughts: str, reads_thoughts: bool) -> str:
+    """The turns of a chat. keeps_thoughts: when thoughts of earlier answers stay. reads_thoughts: also from the text."""
+    from_text = """
+            {%- elif '</think>' in text -%}
+                {%- set thought = text.split('</think>')[0].rstrip('\\n').split('<think>')[-1].lstrip('\\n') -%}
+                {%- set text = text.split('</think>')[-1].lstrip('\\n') -%}"""
+    return (
+        """
+{%- for message in messages -%}
+    {%- set text = words(message.content) | trim -%}
+    {%- if message.role == 'system' -%}
+        {%- if not loop.first -%}{{ raise_exception('System message must be at the beginning.') }}{%- endif -%}
+        {%- if effort -%}{%- set text = effort + '\\n\\n' + text -%}{%- endif -%}
+        {{- '<|im_start|>system\\n' + text + '<|im_end|>\\n' -}}
+    {%- elif message.role == 'user' -%}
+        {{- '<|im_start|>user\\n' + text + '<|im_end|>\\n' -}}
+    {%- else -%}
+        {%- set thought = '' -%}
+        {%- if message.reasoning_content is string -%}{%- set thought = message.reasoning_content -%}"""
+        + (from_text if reads_thoughts else "")
+        + """
+        {%- endif -%}
+        {%- if KEEPS or loop.index0 > place.last_question -%}
+            {{- '<|im_start|>assistant\\n<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -}}
+        {%- else -%}{{- '<|im_start|>assistant\\n' + text -}}
+        {%- endif -%}
+        {{- '<|im_end|>\\n' -}}
+    {%- endif -%}
+{%- endfor -%}""".replace("KEEPS", keeps_thoughts)
+    )
+
+
+EFFORT = """
+{%- set effort = '' -%}
+{%- if enable_thinking is undefined or enable_thinking is true -%}
+    {%- set wanted = reasoning_effort | default('xhigh') -%}
+    {%- if wanted not in ('xhigh', 'medium', 'low') -%}{{ raise_exception('Unexpected reasoning effort ' ~ wanted) }}{%- endif -%}
+    {%- if wanted != 'medium' -%}{%- set effort = 'Reasoning effort is set to ' ~ wanted ~ '.' -%}{%- endif -%}
+{%- endif -%}
+"""
+TEMPLATES = {
+    "3.5": WORDS + turns("false", reads_thoughts=True) + END,
+    "3.6": WORDS + turns("(preserve_thinking is defined and preserve_thinking)", reads_thoughts=True) + END,
+    "3.8": WORDS + EFFORT + turns("(preserve_thinking | default(true))", reads_thoughts=False) + END,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return make_place(tmp_path_factory.mktemp("templates"))
+
+
+@pytest.fixture
+def processor(place) -> Processor:
+    own = load(place)
+    return Processor(own.tokenizer, own.image_processor)
+
+
+@pytest.mark.parametrize("version", TEMPLATES)
+def test_prompt_answer_and_end_are_the_whole_chat(place, processor, version):
+    processor.tokenizer.chat_template = TEMPLATES[version]
+    for sample in samples_of(place)[:4]:
+        prompt = prompt_text(processor, sample, [1] * len(sample.images))
+        assert prompt + sample.answer + END_OF_ANSWER == chat_text(processor, sample)
+        assert prompt.endswith("<|im_start|>assistant\n<think>\n\n</think>\n\n")  # the thought is over before it begins
+        assert "Reasoning effort" not in prompt
+        assert prompt.count("<|image_pad|>") == len(sample.images) == 5
+        row = encode_text(processor, sample)
+        counts = (row.image_grids.prod(axis=1) // 4).tolist()
+        taught = processor.tokenizer.decode([*row.prompt_ids, *row.answer_ids])
+        assert taught == prompt_text(processor, sample, counts) + sample.answer + END_OF_TURN
+
+
+def test_thinking_would_be_another_prompt(place, processor):
+    """The templates do branch: what the tests above hold is not an accident of templates that ignore it."""
+    messages = [{"role": "system", "content": "Fly."}, {"role": "user", "content": "Now?"}]
+    for version, template in TEMPLATES.items():
+        processor.tokenizer.chat_template = template
+        text = processor.tokenizer.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+        assert text.endswith("<think>\n")
+        assert ("Reasoning effort is set to xhigh." in text) is (version == "3.8")
+
+
+@pytest.mark.parametrize("field", ["system", "user", "answer"])
+@pytest.mark.parametrize("token", ["<|im_end|>", "<|image_pad|>", "<|im_start|>"])
+def test_tokens_of_the_chat_in_a_text_are_found(place, processor, field, token):
+    sample = samples_of(place)[0]
+    assert special_token_in(processor, sample) is None
+    if field == "answer":
+        bad = sample.model_copy(update={"answer": f"{sample.answer}{token}"})
+    else:
+        prompt = sample.prompt.model_copy(update={field: f"a {token} b"})
+        bad = sample.model_copy(update={"prompt": prompt})
+    assert special_token_in(processor, bad) == token
+
+
+def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):
+    """One that signs every answer: what is taught would not be what the student's own template writes."""
+    import shutil
+
+    folder = shutil.copytree(place / "student", tmp_path / "student")
+    path = folder / "chat_template.jinja"
+    text = path.read_text()
+    signed = text.replace(
+        "{{ '<|im_end|>\n' }}", "{%- if m.role == 'assistant' %}{{ ' -- end' }}{%- endif %}{{ '<|im_end|>\n' }}"
+    )
+    assert signed != text
+    path.write_text(signed)
+    with pytest.raises(InputError, match="chat template: prompt, answer and end are not what the template writes"):
+        train.run(TrainConfig(**FAST), place / "set", [place / "tree"], folder, tmp_path / "out")
+    assert "chat template" in (tmp_path / "out" / "preflight.json").read_text()

@@ -1,0 +1,266 @@
+"""distill: what goes wrong in a training ends in one clear line or a recorded skip, and the last good checkpoint stays."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from specimens_distill import write_set
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("peft", reason="needs the extra distill")
+
+from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, make_place, samples_of  # noqa: E402
+
+from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError  # noqa: E402
+from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
+from distill.student.model import load_student, student_folder  # noqa: E402
+from distill.training import fit, validation  # noqa: E402
+from distill.training import stage as train  # noqa: E402
+from distill.training.settings import TrainConfig  # noqa: E402
+
+RUN = """
+import json, os, pathlib, resource, sys
+import torch
+from cosfly.errors import CosflyError
+from distill.training import stage as train
+from distill.training.settings import TrainConfig
+settings, most_bytes, *paths = json.loads(sys.argv[1])
+if most_bytes:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+torch.set_num_threads(1)
+dataset, tree, student, out = paths
+try:
+    train.run(TrainConfig(**settings), pathlib.Path(dataset), [pathlib.Path(tree)], student, pathlib.Path(out))
+except CosflyError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return make_place(tmp_path_factory.mktemp("faults"))
+
+
+def run(
+    place: Path, out: Path, student: str | Path | None = None, dataset: Path | None = None, **settings: object
+) -> Path:
+    cfg = TrainConfig.model_validate({**TWELVE, **settings})
+    return train.run(cfg, dataset or place / "set", [place / "tree"], student or place / "student", out)
+
+
+def begun(place: Path, out: Path, num_steps: int = 7, **settings: object) -> None:
+    """Leave a training that was stopped after so many steps."""
+    steps, real = [], fit.train_step
+
+    def stop(*args):
+        if len(steps) == num_steps:
+            raise KeyboardInterrupt
+        steps.append(1)
+        return real(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "train_step", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(place, out, **settings)
+
+
+# --- samples that cannot be learnt from -------------------------------------------------------------------------------
+
+
+def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
+    good = samples_of(place)
+    long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
+    spoken = good[1].model_copy(update={"sample_id": "spoken", "answer": f"{good[1].answer}<|im_end|>"})
+    shown = good[2].prompt.model_copy(update={"user": "an <|image_pad|> stands here"})
+    pictured = good[2].model_copy(update={"sample_id": "pictured", "prompt": shown})
+    sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
+    dataset = write_set(
+        tmp_path / "set",
+        {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")},
+        [place / "tree"],
+    )
+    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
+    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
+    assert counts["kept"] == len(good)
+    assert counts["input"] == len(good) + 4
+    told = (tmp_path / "out" / "preflight.json").read_text()
+    assert "long/en" in told or "long/zh" in told
+    assert "at most 4096" in told
+
+
+def test_nothing_to_learn_from_is_an_error_with_the_counts(place, tmp_path):
+    with pytest.raises(NothingKept, match="too_long 12"):
+        run(place, tmp_path / "out", max_tokens=32)
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
+    """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the same."""
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    sample = samples_of(place)[0]
+    path = tree / sample.images[0]
+    path.write_bytes(path.read_bytes()[:60])
+    users = [s.key for s in samples_of(place) if sample.images[0] in s.images]
+    cfg = TrainConfig(**{**TWELVE, "epochs": 1, "samples_per_step": 3})
+    for name in ("one", "two"):
+        train.run(cfg, place / "set", [tree], place / "student", tmp_path / name)
+    counts = json.loads((tmp_path / "one" / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"unreadable_picture": len(users)}
+    assert counts["kept"] + len(users) == counts["input"] == 12
+    log = log_of(tmp_path / "one")
+    assert sum(record["samples"] for record in log) == counts["kept"]
+    assert log == log_of(tmp_path / "two")
+
+
+def test_a_decision_that_train_never_shows_can_be_refused(place, tmp_path):
+    asked = [s.model_copy(update={"decision": "hover"}) for s in samples_of(place, "val")]
+    dataset = write_set(tmp_path / "set", {"train": samples_of(place), "val": asked}, [place / "tree"])
+    with pytest.raises(InputError, match="val asks for what train never shows: hover"):
+        run(place, tmp_path / "out", dataset=dataset, empty_decision="refuse")
+    run(place, tmp_path / "out", dataset=dataset, max_steps=1)  # nothing was begun, so the setting binds nobody
+    assert "never shows: hover" in (tmp_path / "out" / "preflight.json").read_text()
+
+
+# --- students that do not fit -----------------------------------------------------------------------------------------
+
+
+def test_a_tokenizer_without_a_needed_token_is_named(place, tmp_path):
+    folder = shutil.copytree(place / "student", tmp_path / "student")
+    for name in ("tokenizer.json", "tokenizer_config.json"):
+        path = folder / name
+        path.write_text(path.read_text().replace("<|vision_start|>", "<|vision_begin|>"))
+    with pytest.raises(InputError, match=r"lacks tokens.*<\|vision_start\|>"):
+        run(place, tmp_path / "out", folder)
+
+
+def test_a_tokenizer_of_another_model_is_named(place, tmp_path):
+    from distill.student.random_student import RandomStudent, make_random_student
+
+    folder = shutil.copytree(place / "student", tmp_path / "student")
+    other = make_random_student(tmp_path / "other", RandomStudent(vocabulary=1200), 0, ["one two three " * 50])
+    shutil.copy(other / "tokenizer.json", folder / "tokenizer.json")
+    with pytest.raises(InputError, match=r"knows more tokens than the model|call .* differently"):
+        load_student(folder, device="cpu", max_pixels=MAX_PIXELS)
+
+
+def test_a_repository_that_cannot_be_had_is_one_line(monkeypatch):
+    import huggingface_hub.constants
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(InputError, match=r"--student: no such folder.*Qwen/Qwen3\.5-none"):
+        student_folder("Qwen/Qwen3.5-none")
+
+
+def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):
+    begun(place, tmp_path / "out")
+    newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
+    assert newest is not None
+    other = train.add_adapter(load(place), TrainConfig(**{**FAST, "lora_rank": 8}), 0)
+    with pytest.raises(InputError, match="checkpoint is of another student"):
+        load_checkpoint(newest, other)
+
+
+def test_presets_and_other_names(place, tmp_path):
+    with pytest.raises(InputError, match=r"no such student.*tiny:small"):
+        run(place, tmp_path / "out", "tiny:huge")
+    with pytest.raises(InputError, match="student model"):
+        run(place, tmp_path / "out", tmp_path / "nowhere")
+
+
+# --- machines ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_last_good_checkpoint(place, tmp_path):
+    """A real limit on the size of files, below that of a checkpoint: one line, and going on later gives the same training."""
+    out = tmp_path / "out"
+    begun(place, out)
+    settings = json.dumps([TWELVE, 40_000, *map(str, (place / "set", place / "tree", place / "student", out))])
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, settings], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 1
+    assert "StorageError" in done.stderr
+    assert "cannot write" in done.stderr
+    assert "Traceback" not in done.stderr
+    newest = newest_checkpoint(out / "checkpoints")
+    assert newest is not None
+    assert newest.name == "step_00000006"
+    assert not list(out.rglob("*.partial"))
+    run(place, out)
+    run(place, tmp_path / "whole")
+    assert log_of(out) == log_of(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["step", "validation"])
+def test_full_memory_gives_advice_that_is_taken(place, tmp_path, monkeypatch, where):
+    module = {"step": fit, "validation": validation}[where]
+    real, calls = module.answer_loss, []
+
+    def full(*args):
+        calls.append(1)
+        if len(calls) > 13:
+            raise torch.OutOfMemoryError("tried to allocate 3 GiB")
+        return real(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "answer_loss", full)
+        with pytest.raises(ConfigError, match=r"memory is full.*batch_size=1.*goes on from the last checkpoint"):
+            run(place, tmp_path / "out")
+    assert newest_checkpoint(tmp_path / "out" / "checkpoints") is not None
+    run(place, tmp_path / "out", batch_size=1)
+    assert len(log_of(tmp_path / "out")) == 12
+
+
+def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_path, monkeypatch):
+    real, calls = fit.answer_loss, []
+
+    def broken(*args):
+        total, nats = real(*args)
+        calls.append(1)
+        return (total * float("nan"), nats) if len(calls) > 13 else (total, nats)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "answer_loss", broken)
+        with pytest.raises(ConfigError, match="not finite"):
+            run(place, tmp_path / "out")
+    newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
+    assert newest is not None
+    assert newest.name == "step_00000006"
+
+
+def test_a_second_process_is_refused(place, tmp_path):
+    out = tmp_path / "out"
+    hold = "import pathlib, sys, time; from cosfly.folder_lock import hold_folder\n"
+    hold += "held = hold_folder(pathlib.Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", hold, str(out)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(ResumeError, match=f"another process.*process {holder.pid} "):
+            run(place, out)
+        holder.kill()
+
+
+def test_what_changes_the_result_is_refused_on_resume(place, tmp_path):
+    begun(place, tmp_path / "out")
+    with pytest.raises(ResumeError, match="samples_per_step was 4, is 8"):
+        run(place, tmp_path / "out", samples_per_step=8)
+    assert os.listdir(tmp_path / "out" / "checkpoints")
+    assert len(losses_of(tmp_path / "out")) == 7

@@ -1,0 +1,196 @@
+"""distill: many processes of one training, on a CPU over gloo, give what one gives; and what becomes of them when one dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("peft", reason="needs the extra distill")
+
+from safetensors.torch import load_file  # noqa: E402
+from specimens_students import TWELVE, log_of, losses_of, make_place  # noqa: E402
+
+from cosfly.errors import ConfigError, InputError  # noqa: E402
+from distill.training.ranks import Ranks, _buckets, joined  # noqa: E402
+from distill.training.settings import TrainConfig  # noqa: E402
+from distill.training.steps import Steps, share_of  # noqa: E402
+
+# A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
+SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
+RUN = """
+import json, pathlib, sys
+import torch
+from cosfly.errors import CosflyError
+from distill.training import stage as train
+from distill.training.settings import TrainConfig
+torch.set_num_threads(1)
+settings, dataset, tree, student, out = json.loads(sys.argv[1])
+try:
+    train.run(TrainConfig(**settings), pathlib.Path(dataset), [pathlib.Path(tree)], student, pathlib.Path(out))
+except CosflyError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return make_place(tmp_path_factory.mktemp("ranks"))
+
+
+@pytest.fixture(scope="module")
+def alone(place) -> Path:
+    """What one process gives."""
+    assert finish(start(place, place / "alone", 1)) == [0]
+    return place / "alone"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def start(place: Path, out: Path, size: int, **changes: object) -> list[subprocess.Popen]:
+    """Start the processes of a training as a launcher would."""
+    arguments = json.dumps(
+        [{**SETTINGS, **changes}, *map(str, (place / "set", place / "tree", place / "student", out))]
+    )
+    port = str(free_port())
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", RUN, arguments],
+            env={**os.environ, "OMP_NUM_THREADS": "1", "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(size),
+                 "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port},
+            stderr=subprocess.PIPE, text=True,
+        )
+        for rank in range(size)
+    ]  # fmt: skip
+
+
+def finish(processes: list[subprocess.Popen]) -> list[int]:
+    return [process.wait(timeout=180) for process in processes]
+
+
+def wait_for_steps(out: Path, count: int) -> None:
+    """Wait until the log tells of so many steps."""
+    deadline_s = time.monotonic() + 120
+    while not (out / "log.jsonl").exists() or len(losses_of_whole_lines(out)) < count:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def losses_of_whole_lines(out: Path) -> list[str]:
+    return [
+        line
+        for line in (out / "log.jsonl").read_text().splitlines(keepends=True)
+        if '"loss"' in line and "speed" in line
+    ]
+
+
+def test_one_process_needs_no_group(monkeypatch):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with joined("cpu") as ranks:
+        assert ranks == Ranks(0, 1, "cpu")
+        assert ranks.total([1.0, 2.0]) == [1.0, 2.0]
+        assert ranks.gathered("a") == ["a"]
+        with pytest.raises(InputError):
+            ranks.first_does(lambda: (_ for _ in ()).throw(InputError("no")))
+    monkeypatch.setenv("WORLD_SIZE", "two")
+    with pytest.raises(ConfigError, match="WORLD_SIZE"), joined("cpu"):
+        pass
+
+
+def test_gradients_are_added_up_in_bounded_pieces(monkeypatch):
+    monkeypatch.setattr("distill.training.ranks.BUCKET_NUMBERS", 10)
+    gradients = [torch.zeros(n) for n in (4, 4, 4, 30, 1)] + [torch.zeros(1, dtype=torch.float64)]
+    found = [[g.numel() for g in bucket] for bucket in _buckets(gradients)]
+    assert found == [[4, 4], [4], [30], [1], [1]]
+
+
+@pytest.mark.slow
+def test_two_processes_give_what_one_gives(place, alone, tmp_path):
+    assert finish(start(place, tmp_path / "out", 2)) == [0, 0]
+    assert losses_of(tmp_path / "out") == pytest.approx(losses_of(alone), rel=1e-5)
+    for mine, other in zip(log_of(tmp_path / "out", "validation"), log_of(alone, "validation"), strict=True):
+        assert mine["validation"] == pytest.approx(other["validation"], rel=1e-5)
+    adapters = [load_file(out / "adapter" / "adapter_model.safetensors") for out in (tmp_path / "out", alone)]
+    for name, tensor in adapters[0].items():
+        assert np.allclose(tensor, adapters[1][name], atol=1e-4), name
+    manifests = [json.loads((out / "manifest.json").read_text()) for out in (tmp_path / "out", alone)]
+    assert manifests[0]["counts"] == manifests[1]["counts"]
+
+
+@pytest.mark.slow
+def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
+    out = tmp_path / "out"
+    processes = start(place, out, 2)
+    wait_for_steps(out, 4)
+    processes[1].send_signal(signal.SIGKILL)
+    assert finish(processes) == [1, -signal.SIGKILL]  # within the time limit: nobody waits for the dead
+    assert processes[0].stderr is not None
+    told = processes[0].stderr.read()
+    assert "EnvironmentMissing: another process of this training has ended" in told
+    assert not (out / "manifest.json").exists()
+    assert finish(start(place, out, 1)) == [0]
+    assert losses_of(out) == pytest.approx(losses_of(alone), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_one_that_fails_is_everybodys_error(place, tmp_path):
+    """The first process finds the folder taken by another one: both end with its words, and what is there stays."""
+    from cosfly.folder_lock import hold_folder
+
+    with hold_folder(tmp_path / "out"):
+        processes = start(place, tmp_path / "out", 2)
+        assert finish(processes) == [1, 1]
+        for process in processes:
+            assert process.stderr is not None
+            assert "ResumeError" in process.stderr.read()
+
+
+@pytest.mark.slow
+def test_two_go_on_with_what_one_began(place, alone, tmp_path):
+    out = tmp_path / "out"
+    processes = start(place, out, 1)
+    wait_for_steps(out, 4)
+    processes[0].send_signal(signal.SIGKILL)
+    assert finish(processes) == [-signal.SIGKILL]
+    assert finish(start(place, out, 2)) == [0, 0]
+    assert losses_of(out) == pytest.approx(losses_of(alone), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_launcher_starts_them(place, tmp_path):
+    """`torchrun` on the command itself: one folder, one log, status 0; and status 1 where a setting is wrong."""
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port()), "-m", "cosfly",
+        "distill", "train", "--dataset", str(place / "set"), "--data", str(place / "tree"), "--student", "tiny",
+        "--out", str(tmp_path / "out"), "--set", "distill.train.max_steps=2", "--set", "distill.train.device=cpu",
+        "--set", "distill.train.data_workers=0", "--set", "distill.train.validation_samples=2", "--set", "distill.train.max_new_tokens=2",
+    ]  # fmt: skip
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(losses_of(tmp_path / "out")) == 2
+    wrong = [*command[:-1], "distill.train.max_tokens=16"]
+    wrong[wrong.index(str(tmp_path / "out"))] = str(tmp_path / "other")
+    done = subprocess.run(wrong, env=environment, capture_output=True, text=True, timeout=180, check=False)
+    assert done.returncode == 1
+    assert "kept nothing" in done.stderr
+
+
+def test_processes_share_a_step_that_is_smaller_than_their_number():
+    last = Steps.make(TrainConfig(samples_per_step=4), 10, 0).samples_of(2)
+    shares = [share_of(last, np.ones(10), rank, 8) for rank in range(8)]
+    assert sorted(index for share in shares for index in share) == sorted(last)
+    assert [] in shares
