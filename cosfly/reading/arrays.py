@@ -58,9 +58,9 @@ def array_header(path: Path, *, what: str = "array", tree: Path | None = None) -
         return _header(file, path, what)
 
 
-def parse_array_header(data: bytes, where: str | Path, *, what: str = "array") -> ArrayHeader:
-    """Read the header of the bytes of a `.npy` file; raises as `array_header`."""
-    return _header(io.BytesIO(data), where, what)
+def parse_array_header(data: memoryview, where: str | Path, *, what: str = "array") -> ArrayHeader:
+    """Read the header of the bytes of a `.npy` file, which are not copied; raises as `array_header`."""
+    return _header(io.BytesIO(data[: MOST_HEADER_BYTES + 12]), where, what, len(data))
 
 
 def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
@@ -92,9 +92,11 @@ def _array(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, d
     return values
 
 
-def _header(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str) -> ArrayHeader:
+def _header(
+    file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, whole_size: int | None = None
+) -> ArrayHeader:
     with disk_errors(Path(where), what):
-        size = file.seek(0, os.SEEK_END)
+        size = file.seek(0, os.SEEK_END) if whole_size is None else whole_size
         file.seek(0)
         start = file.read(12)
         form = "<H" if start[6:7] == b"\1" else "<I"

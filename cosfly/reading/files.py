@@ -13,7 +13,7 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from cosfly.errors import InputError
@@ -80,6 +80,31 @@ def read_bytes(
         if size > getattr(limits(), limit) * MB:
             raise over_limit(limit, path, f"{size / MB:,.0f} MB", " MB")
         return file.read(size)
+
+
+def read_into(
+    path: Path,
+    target: Callable[[int], memoryview],
+    *,
+    what: str = "file",
+    fix: str = CHECK_PATH,
+    tree: Path | None = None,
+) -> int:
+    """Read a whole file into memory that is used again and again; gives its size.
+
+    Args:
+        target: gives room for so many bytes.
+    Raises:
+        InputError: as `read_bytes`, and where the file becomes shorter meanwhile.
+    """
+    with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
+        size = os.fstat(file.fileno()).st_size
+        if size > limits().file_mb * MB:
+            raise over_limit("file_mb", path, f"{size / MB:,.0f} MB", " MB")
+        found = file.readinto(target(size))
+    if found != size:
+        raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{found} bytes", fix=fix)
+    return size
 
 
 def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str = CHECK_PATH) -> bytes:

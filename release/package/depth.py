@@ -37,16 +37,14 @@ class DepthErrors(BaseModel):
         )
 
 
-def encoded(data: bytes, coding: DepthCodingName, where: Path) -> tuple[bytes, DepthErrors]:
-    """Code a depth image: the bytes of its row, and what the coding costs; float32 is stored as it is and costs nothing.
+def encoded(data: memoryview, coding: DepthCodingName, where: Path) -> tuple[bytes, DepthErrors]:
+    """Code a depth image otherwise than float32, which needs none: the bytes of its row, and what the coding costs.
 
     Args:
         data: of a `.npy` file, checked.
     Raises:
         InputError: it holds a depth that the coding has no number for.
     """
-    if coding == "float32":
-        return data, DepthErrors()
     values = depth_values(data, where)
     is_measured = (values != SKY_DEPTH_M) & (values != INVALID_DEPTH_M)
     known = values[is_measured]

@@ -10,14 +10,14 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile
-from cosfly.reading.arrays import PNG_SIGNATURE, parse_array_header, png_size
+from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, parse_array_header, png_size
 
 CHUNK_FRAME_BYTES = 12  # of a PNG's chunk: length, name, checksum
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 RENDER = "render it again, or put the file back"
 
 
-def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
+def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
     """See that a file is whole and of its flight's size.
 
     Args:
@@ -28,8 +28,8 @@ def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where:
     if file == "depth":
         _check_depth(depth_values(data, where), size_px, where)
         return
-    found = png_size(data)
-    if found is None or not data.endswith(PNG_END):
+    found = png_size(bytes(data[:PNG_HEADER_BYTES]))
+    if found is None or data[-len(PNG_END) :] != PNG_END:
         got = f"{len(data)} bytes that do not {'begin' if found is None else 'end'} as a PNG"
         raise InputError("a picture is damaged or cut short", where=where, got=got, fix=RENDER)
     if found != size_px:
@@ -46,7 +46,7 @@ def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where:
         )
 
 
-def depth_values(data: bytes, where: Path) -> np.ndarray:
+def depth_values(data: memoryview, where: Path) -> np.ndarray:
     """Give the numbers of a depth image, (h, w) float32, as they stand in the bytes.
 
     Raises:
@@ -74,14 +74,14 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
         )
 
 
-def _broken_chunks(data: bytes) -> Iterator[str]:
+def _broken_chunks(view: memoryview) -> Iterator[str]:
     """Name the chunks of a PNG whose bytes are not those of their checksums."""
-    view, at = memoryview(data), len(PNG_SIGNATURE)
-    while at + CHUNK_FRAME_BYTES <= len(data):
+    at = len(PNG_SIGNATURE)
+    while at + CHUNK_FRAME_BYTES <= len(view):
         end = at + CHUNK_FRAME_BYTES + int.from_bytes(view[at : at + 4], "big")
         name = bytes(view[at + 4 : at + 8])
-        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
             yield repr(name.decode("latin-1"))
         at = end
-    if at != len(data):
+    if at != len(view):
         yield "after the last"

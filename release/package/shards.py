@@ -1,6 +1,6 @@
-"""One shard: the frames of some flights, read once, held against their digests and written as parquet while they are hashed.
+"""One shard: the frames of some flights, read once, held against their digests and written as parquet.
 
-A worker writes whole shards, so that no byte is written twice.
+A worker writes whole shards, so that no byte is written twice, and pictures are read into memory that is used again: parquet takes them from there.
 """
 
 from __future__ import annotations
@@ -10,19 +10,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, InputError, VerifyError
 from cosfly.items import advance
-from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name, tree_of
+from cosfly.products.frames import FILE_NAMES, FRAMES_DIR, FrameFile, frame_name, tree_of
 from cosfly.products.playback import Flight, sample_id
 from cosfly.provenance import FLIGHT, digest_of, folder_digests
-from cosfly.reading.files import read_bytes, sha256_file
-from cosfly.store import CHECKSUMS, atomic_file, read_checksums, sha256_bytes
+from cosfly.reading.files import check_stays_below, read_into, sha256_file
+from cosfly.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
 from release.columns import PICTURES, Placed, ReleasedCaption
 from release.package.captions import FlightCaptions, released
@@ -34,6 +35,9 @@ from release.record import DepthCodingName
 from release.subsample import is_whole, select_frames
 
 MB = 1024 * 1024
+VALUES_A_BATCH = (
+    4  # values between two looks at the size of a page: with more a page takes a whole row group, twice in memory
+)
 MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
 META = "meta.json"
 ANEW = "put the file back, or inspect and caption the tree as it is now"
@@ -88,8 +92,7 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Wri
     problems = _Problems()
     flights: list[ReleasedPart] = []
     with atomic_file(path) as file:
-        hashed = _Hashed(file)
-        with open_writer(hashed, columns.schema(plan.files)) as writer:
+        with open_writer(file.name, columns.schema(plan.files)) as writer:
             rows = _Rows(writer, plan)
             for part in parts:
                 with problems.collected():
@@ -99,7 +102,7 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Wri
     return Written(
         rows=sum(flight.frames for flight in flights),
         bytes=path.stat().st_size,
-        sha256=hashed.sha256.hexdigest(),
+        sha256=sha256_file(path),
         flights=flights,
         depth=rows.depth,
     )
@@ -112,13 +115,16 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: _Rows, problems: _Pro
     selected = select_frames(len(flight), plan.num_frames, plan.window_frames).tolist()
     captions, not_selected, not_whole = _captions_of(part.captions, set(selected))
     placing, tree = part.placing, tree_of(flight.frame_folder(0))
+    check_stays_below(folder / FRAMES_DIR, tree)
     for i in selected:
         with problems.collected():
+            if flight.frame_folder(i).is_symlink():
+                check_stays_below(flight.frame_folder(i), tree)
             _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
             placed = Placed(placing.walk, placing.split, placing.pair, look_of(flight, i))
-            pictures = {file: _read_picture(flight, i, file, digests, tree) for file in plan.files}
-            if not problems.errors:
-                rows.add(columns.scalar_row(flight, i, captions.get(i), placed), pictures, flight, i)
+            for file in plan.files:
+                _read_picture(flight, i, file, digests, tree, rows)
+            rows.add(columns.scalar_row(flight, i, captions.get(i), placed), flight, i, keep=not problems.errors)
         advance()
     return ReleasedPart(
         name=part.candidate.name,
@@ -191,7 +197,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
     return digests
 
 
-def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[str, str]) -> None:
+def _check_digest(folder: Path, name: str, data: memoryview | None, digests: Mapping[str, str]) -> None:
     """Compare a file, of which `data` was read, with its digest where there is one.
 
     Raises:
@@ -199,54 +205,72 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
     """
     if not digests or (data is None and not (folder / name).is_file()):
         return
-    got = sha256_file(folder / name) if data is None else sha256_bytes(data)
+    got = sha256_file(folder / name) if data is None else hashlib.sha256(data).hexdigest()
     if got != digests.get(name):
         expected = digests.get(name, "a digest on record")
         what = "a file is not the one that is on record"
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=ANEW)
 
 
-def _read_picture(flight: Flight, i: int, file: FrameFile, digests: Mapping[str, str], tree: Path) -> bytes:
+def _read_picture(flight: Flight, i: int, file: FrameFile, digests: Mapping[str, str], tree: Path, rows: _Rows) -> None:
+    """Read a picture into its column, and see that it is what it must be."""
     folder, name = flight.folder, f"{frame_name(i)}/{FILE_NAMES[file]}"
     assert folder is not None
-    data = read_bytes(folder / name, what="frame's file", fix="render it again", tree=tree)
+    path = folder / name
+    data = rows.pictures[file].read(path, tree if path.is_symlink() else None)  # its folder was looked at
     size_px = flight.camera.width_px, flight.camera.height_px
-    check_picture(file, data, size_px, folder / name, is_known=bool(digests))
+    check_picture(file, data, size_px, path, is_known=bool(digests))
     _check_digest(folder, name, data, digests)
-    return data
 
 
 # --- what is written --------------------------------------------------------------------------------------------------
 
 
-class _Hashed:
-    """A file that is hashed as it is written, and never read again."""
+class _Column:
+    """The files of one picture column of a row group, one after the other in memory that every row group uses again."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file, self.sha256 = file, hashlib.sha256()
-        self.closed = False
+    def __init__(self, num_bytes: int) -> None:
+        self._memory = np.empty(num_bytes, np.uint8)
+        self.ends = [0]  # of the files that are kept, from byte 0 on
+        self._last = 0  # end of the one that was read last
 
-    def write(self, data: bytes) -> int:
-        self.sha256.update(data)
-        return self._file.write(data)
+    def read(self, path: Path, tree: Path | None) -> memoryview:
+        """Read a file behind those that are kept; gives its bytes, which the next one replaces."""
+        size = read_into(path, self._room, what="frame's file", fix="render it again", tree=tree)
+        return self._set(size)
 
-    def tell(self) -> int:
-        return self._file.tell()
+    def replace(self, data: bytes) -> None:
+        """Put other bytes in the place of the file that was read last."""
+        self._room(len(data))[:] = data
+        self._set(len(data))
 
-    def flush(self) -> None:
-        self._file.flush()
+    def keep(self) -> int:
+        """Keep the file that was read last; gives its size."""
+        self.ends.append(self._last)
+        return self.ends[-1] - self.ends[-2]
 
-    def close(self) -> None:
-        """What opened the file closes it."""
+    def last(self) -> memoryview:
+        return self._memory.data[self.ends[-1] : self._last]
 
-    def readable(self) -> bool:
-        return False
+    def clear(self) -> None:
+        self.ends, self._last = [0], 0
 
-    def writable(self) -> bool:
-        return True
+    def array(self) -> pa.Array:
+        """Give the files as binary values; nothing is copied."""
+        offsets = pa.py_buffer(np.array(self.ends, np.int32))
+        return pa.Array.from_buffers(pa.binary(), len(self.ends) - 1, [None, offsets, pa.py_buffer(self._memory)])
 
-    def seekable(self) -> bool:
-        return False
+    def _room(self, size: int) -> memoryview:
+        begin = self.ends[-1]
+        if begin + size > len(self._memory):
+            grown = np.empty(2 * (begin + size), np.uint8)  # pages that nobody writes to take no memory
+            grown[:begin] = self._memory[:begin]
+            self._memory = grown
+        return self._memory.data[begin : begin + size]
+
+    def _set(self, size: int) -> memoryview:
+        self._last = self.ends[-1] + size
+        return self.last()
 
 
 class _Rows:
@@ -254,22 +278,24 @@ class _Rows:
 
     def __init__(self, writer: pq.ParquetWriter, plan: ShardPlan) -> None:
         self._writer, self._plan = writer, plan
+        self.pictures = {file: _Column(plan.row_group_bytes) for file in PICTURES if file in plan.files}
         self._scalars: list[dict[str, Any]] = []
-        self._pictures: dict[FrameFile, list[bytes]] = {file: [] for file in plan.files}
         self._paths: list[str] = []
         self._num_bytes = 0
         self.depth = DepthErrors()
 
-    def add(self, scalars: dict[str, Any], pictures: dict[FrameFile, bytes], flight: Flight, i: int) -> None:
-        if "depth" in pictures:
+    def add(self, scalars: dict[str, Any], flight: Flight, i: int, *, keep: bool) -> None:
+        """Add a frame whose pictures were read. keep: False where nothing will be written any more."""
+        if "depth" in self.pictures and self._plan.depth != "float32":
             where = flight.frame_folder(i) / FILE_NAMES["depth"]
-            pictures["depth"], cost = encoded(pictures["depth"], self._plan.depth, where)
+            coded, cost = encoded(self.pictures["depth"].last(), self._plan.depth, where)
+            self.pictures["depth"].replace(coded)
             self.depth = self.depth.merged(cost)
+        if not keep:
+            return
         self._scalars.append(scalars)
         self._paths.append(sample_id(flight.flight_id, i))
-        for file, data in pictures.items():
-            self._pictures[file].append(data)
-            self._num_bytes += len(data)
+        self._num_bytes += sum(column.keep() for column in self.pictures.values())
         if self._num_bytes >= self._plan.row_group_bytes:
             self.flush()
 
@@ -277,27 +303,26 @@ class _Rows:
         if not self._scalars:
             return
         schema = columns.schema(self._plan.files)
-        arrays: list[pa.Array] = []
-        for file in PICTURES:
-            if file in self._pictures:
-                arrays.append(self._column(file, schema.field(PICTURES[file].name).type))
-                self._pictures[file] = []
+        arrays = [
+            self._array(file, column, schema.field(PICTURES[file].name).type) for file, column in self.pictures.items()
+        ]
         scalars = pa.Table.from_pylist(
             self._scalars, schema=pa.schema([schema.field(name) for name in columns.SCALAR_NAMES])
         )
         table = pa.Table.from_arrays([*arrays, *scalars.columns], schema=schema)
         self._writer.write_table(table, row_group_size=table.num_rows)
+        for column in self.pictures.values():
+            column.clear()
         self._scalars, self._paths, self._num_bytes = [], [], 0
 
-    def _column(self, file: FrameFile, kind: pa.DataType) -> pa.Array:
-        data = pa.array(self._pictures[file], pa.binary())
+    def _array(self, file: FrameFile, column: _Column, kind: pa.DataType) -> pa.Array:
         if not pa.types.is_struct(kind):
-            return data
+            return column.array()
         paths = pa.array([f"{stem}_{FILE_NAMES[file]}" for stem in self._paths], pa.string())
-        return pa.StructArray.from_arrays([data, paths], fields=list(kind))
+        return pa.StructArray.from_arrays([column.array(), paths], fields=list(kind))
 
 
-def open_writer(file: IO[bytes] | _Hashed, schema: pa.Schema) -> pq.ParquetWriter:
+def open_writer(path: str, schema: pa.Schema) -> pq.ParquetWriter:
     """Open a parquet file whose bytes depend on the rows alone.
 
     PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
@@ -312,5 +337,12 @@ def open_writer(file: IO[bytes] | _Hashed, schema: pa.Schema) -> pq.ParquetWrite
     small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
     repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
     return pq.ParquetWriter(
-        file, schema, compression=compression, use_dictionary=repeated, write_statistics=small, version="2.6", write_page_index=True,
-    )  # fmt: skip
+        path,
+        schema,
+        compression=compression,
+        use_dictionary=repeated,
+        write_statistics=small,
+        version="2.6",
+        write_page_index=True,
+        write_batch_size=VALUES_A_BATCH,
+    )

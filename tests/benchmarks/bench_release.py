@@ -1,0 +1,174 @@
+"""How fast `release build` stores pictures, beside a plain copy of the same bytes, and how much memory it takes.
+
+    python tests/benchmarks/bench_release.py speed 4000             # 1280x720, two processes for either
+    python tests/benchmarks/bench_release.py memory 10000 100000    # small pictures
+
+The tree is made of few frames, linked many times, so that it needs little disk; release and copy are written in full. The copy reads the
+tree's files and writes them one after the other into one file a flight, flushed to disk at its end as a shard is: the least that any copy does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from specimens_distill import make_captions
+
+from cosfly.products.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
+from cosfly.products.playback import Flight, find_flights, write_flight
+from cosfly.store import CHECKSUMS, checksum_lines, sha256_bytes
+from release.package.sources import Source
+from release.package.stage import ReleaseConfig, run
+from specimens import Scene, make_flight, paint
+
+NUM_POOL, NUM_POINTS, NUM_WORKERS = (
+    8,
+    700,
+    2,
+)  # pictures; frames of a flight, as the paper's have, of which 400 are released
+FRAMES_RELEASED = 400
+STORED: tuple[FrameFile, ...] = ("rgb", "instance")  # as they are; depth is compressed
+SIZES = {"speed": (1280, 720), "memory": (32, 18)}
+MB = 1e6
+
+
+def make_tree(root: Path, num_released: int, size_px: tuple[int, int]) -> Path:
+    """Write a tree of pairs of flights, of which so many frames are released at FRAMES_RELEASED a flight; gives it."""
+    flight, scene = make_flight(NUM_POINTS, width_px=size_px[0], height_px=size_px[1])
+    pool = [_paint_files(root / f"pool/{k}", flight, scene, k * 30) for k in range(NUM_POOL)]
+    digests = [{name: sha256_bytes((folder / name).read_bytes()) for name in os.listdir(folder)} for folder in pool]
+    for number in range(max(1, num_released // (2 * FRAMES_RELEASED))):
+        away_m = np.array([0.0, 1000.0 * number, 0.0])  # a walk of its own
+        for variant in ("ORI", "aug_001"):
+            trajectory = f"trajectory_{1_776_000_000 + number}"
+            own = dataclasses.replace(
+                flight, trajectory=trajectory, variant=variant, is_original=variant == "ORI",
+                positions_m=flight.positions_m + away_m, targets_m=flight.targets_m + away_m,
+            )  # fmt: skip
+            folder = root / "tree/Town01" / trajectory / variant
+            write_flight(folder, own)
+            listed = {"trajectory.json": sha256_bytes((folder / "trajectory.json").read_bytes())}
+            for i in range(NUM_POINTS):
+                (folder / frame_name(i)).mkdir(parents=True)
+                for name, digest in digests[i % NUM_POOL].items():
+                    os.link(pool[i % NUM_POOL] / name, folder / frame_name(i) / name)
+                    listed[f"{frame_name(i)}/{name}"] = digest
+            (folder / CHECKSUMS).write_text(checksum_lines(listed))
+    make_captions(root / "captions.jsonl", root / "tree")
+    return root / "tree"
+
+
+def _paint_files(folder: Path, flight: Flight, scene: Scene, i: int) -> Path:
+    folder.mkdir(parents=True)
+    rgb, depth, kinds, ids = paint(scene, flight, i)
+    noise = np.random.default_rng(i).integers(-3, 4, rgb.shape)  # texture: without it a PNG packs to nothing
+    (folder / "rgb.png").write_bytes(rgb_bytes(np.clip(rgb + noise, 0, 255).astype(np.uint8), 1))
+    (folder / "depth.npy").write_bytes(depth_bytes(depth))
+    (folder / "instance.png").write_bytes(instance_bytes(kinds, ids, 1))
+    return folder
+
+
+def build(root: Path, out: Path, files: tuple[FrameFile, ...], workers: int) -> float:
+    """Build a release; gives the seconds."""
+    cfg = ReleaseConfig(licence="cc0-1.0", unbound="accept", modalities=files, num_frames=FRAMES_RELEASED)
+    start_s = time.perf_counter()
+    run(cfg, [Source("bench", root / "tree", root / "captions.jsonl")], out, workers=workers)
+    return time.perf_counter() - start_s
+
+
+def copy_flight(folder: Path, target: Path) -> int:
+    """Copy the first FRAMES_RELEASED frames of a flight into one file; gives its bytes."""
+    with open(target, "wb") as out:
+        for i in range(FRAMES_RELEASED):
+            for file in STORED:
+                with open(folder / frame_name(i) / FILE_NAMES[file], "rb") as picture:
+                    shutil.copyfileobj(picture, out, 1 << 20)
+        out.flush()
+        os.fsync(out.fileno())
+    return target.stat().st_size
+
+
+def plain_copy(tree: Path, out: Path, workers: int) -> tuple[float, int]:
+    """Copy the pictures; gives seconds and bytes."""
+    out.mkdir()
+    flights = find_flights(tree)
+    start_s = time.perf_counter()
+    with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
+        sizes = list(pool.map(copy_flight, flights, [out / str(k) for k in range(len(flights))]))
+    return time.perf_counter() - start_s, sum(sizes)
+
+
+def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
+    tree = make_tree(folder, num_frames, SIZES["speed"])
+    print(f"{'':24}{'seconds':>9}{'MB':>9}{'MB/s':>9}{'frames/s':>10}")
+    shares = []
+    for number in range(rounds):
+        rows = []
+        for name in ("copy", "build") if number % 2 else ("build", "copy"):  # neither always has the quieter disk
+            out = folder / "out"
+            if name == "copy":
+                seconds, stored = plain_copy(tree, out, NUM_WORKERS)
+            else:
+                seconds = build(folder, out, STORED, NUM_WORKERS)
+                stored = sum(p.stat().st_size for p in (out / "dataset/data").iterdir())
+            rows.append((name, seconds, stored / MB))
+            shutil.rmtree(out)
+            os.sync()
+        for name, seconds, stored in rows:
+            print(f"{name:24}{seconds:9.2f}{stored:9.0f}{stored / seconds:9.0f}{num_frames / seconds:10.0f}")
+        rates = {name: stored / seconds for name, seconds, stored in rows}
+        shares.append(rates["build"] / rates["copy"])
+    print(f"stored as they are: {', '.join(f'{100 * share:.0f} %' for share in shares)} of a plain copy")
+    few = min(num_frames, 2 * FRAMES_RELEASED)
+    for path in find_flights(tree)[few // FRAMES_RELEASED :]:
+        shutil.rmtree(path.parent, ignore_errors=True)
+    make_captions(folder / "captions.jsonl", tree)
+    seconds = build(folder, folder / "depth", ("depth",), 1)
+    raw = few * SIZES["speed"][0] * SIZES["speed"][1] * 4 / MB
+    stored = sum(p.stat().st_size for p in (folder / "depth/dataset/data").iterdir()) / MB
+    print(
+        f"depth, one core: {raw / seconds:.0f} MB/s of float32, {few / seconds:.0f} frames/s, to {100 * stored / raw:.0f} % of its size"
+    )
+
+
+def measure_memory(num_frames: int, folder: Path) -> None:
+    make_tree(folder, num_frames, SIZES["memory"])
+    seconds = build(folder, folder / "out", ("rgb", "depth", "instance"), 1)
+    usage = [resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    print(f"{num_frames:9,} frames: main {usage[0]:6.0f} MiB, worker {usage[1]:6.0f} MiB, {seconds:7.1f} s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("speed", "memory"))
+    parser.add_argument("frames", type=int, nargs="+")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--scratch", type=Path, help="where the tree and both products are written")
+    given = parser.parse_args()
+    if given.what == "memory" and len(given.frames) > 1:  # each in a process of its own, which the peak is of
+        for count in given.frames:
+            subprocess.run([sys.executable, __file__, "memory", str(count)], check=True)
+        return
+    with tempfile.TemporaryDirectory(dir=given.scratch) as folder:
+        if given.what == "speed":
+            measure_speed(given.frames[0], Path(folder), given.rounds)
+        else:
+            measure_memory(given.frames[0], Path(folder))
+
+
+if __name__ == "__main__":
+    main()
