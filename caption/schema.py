@@ -21,6 +21,7 @@ from cosfly.config import Config, MayDiffer
 from cosfly.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.products.captions import KeyframeRecord, LabelFrom, TeacherKind, Verdict, Writing
 from cosfly.products.predictions import PREDICTIONS
+from cosfly.student_chat import MAX_ANSWER_TOKENS
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Treatment = Literal["keep", "repair", "drop"]
@@ -218,6 +219,21 @@ class RepairConfig(Config):
         return {"HARD_CONFLICT": self.hard_conflict, "SOFT_CONFLICT": self.soft_conflict}.get(str(verdict), "keep")
 
 
+class StudentConfig(Config):
+    """A student behind a server (or in vLLM) as a teacher, asked as it was taught; see caption/teachers/students.py."""
+
+    folder: Path | None = Field(
+        None,
+        description="what `distill train` or `distill merge` wrote; it decides windows, pictures, prompts and sampling. Empty: the teacher is none",
+    )
+    max_new_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
+    constrained: bool = Field(False, description="hold its answers to their JSON schema")
+
+    def recorded(self) -> dict[str, Any]:
+        """Where the folder stands does not decide what is asked: what it says stands in the other settings."""
+        return super().recorded() | {"folder": None if self.folder is None else "student"}
+
+
 class CaptionConfig(Config):
     """Settings of stage `caption`."""
 
@@ -236,6 +252,7 @@ class CaptionConfig(Config):
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
+    student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student, asked as it was taught")
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
@@ -255,6 +272,14 @@ class CaptionConfig(Config):
         if self.teacher == "rules" and self.writing != "slots":
             raise ValueError(
                 f"the rule teacher writes slots, got writing {self.writing!r}; give --teacher, or leave it out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _student_is_asked(self) -> Self:
+        if self.student.folder is not None and self.teacher_kind not in ("endpoint", "vllm"):
+            raise ValueError(
+                f"student.folder needs a teacher that is asked (a URL, vllm:MODEL_DIR), got {self.teacher!r}"
             )
         return self
 

@@ -12,7 +12,7 @@ from typing import Any
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.teacher import Teacher
+from caption.teachers.teacher import AskingTeacher, Teacher
 from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
@@ -100,6 +100,8 @@ def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, r
 def _terms(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
     if isinstance(teacher, FileTeacher | StudentTeacher):
         return teacher.terms(sample_id)
+    if isinstance(teacher, AskingTeacher) and teacher.student is not None:
+        return teacher.student.terms
     return Terms(cfg.writing, tuple(more_fields(way_of(cfg.writing))))
 
 
@@ -348,7 +350,7 @@ class _Loop:
 
     def _translated(self, english: Draft, chinese: Draft) -> Draft | Refused:
         """Hold what was asked for as a translation against its source; templates have been, and what was given is nobody's translation."""
-        if self.terms.is_given or chinese.template is not None:
+        if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
             return chinese
         found = check_translation(english.coc, chinese.coc)
         return Refused(*found, chinese) if found else chinese

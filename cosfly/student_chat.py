@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -24,6 +24,7 @@ from cosfly.products.captions import Language, Prompt
 from cosfly.reading.documents import read_model
 from cosfly.store import sha256_bytes, write_model
 
+IMAGE_ENCODING: Literal["png"] = "png"
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it
 MAX_ANSWER_TOKENS = 512  # unless told otherwise: an answer as long as is taught, and a half more
 
@@ -67,13 +68,13 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
     Args:
         max_pixels: most pixels that stay; 0: all.
     """
-    data = encode_picture(_bounded(rgb, max_pixels), "png", 0)
-    url = f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
+    data = encode_picture(_bounded(rgb, max_pixels), IMAGE_ENCODING, 0)
+    url = f"data:image/{IMAGE_ENCODING};base64,{base64.b64encode(data).decode('ascii')}"
     return SentPicture({"type": "image_url", "image_url": {"url": url}}, sha256_bytes(data))
 
 
 def student_request(
-    prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig
+    prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
     """Give what an engine is asked.
 
@@ -82,7 +83,7 @@ def student_request(
         schema: of the answer; `answer_schema(language=...)` for a free one.
     """
     messages = chat_messages(prompt, [[picture.part for picture in pictures] for pictures in frames])
-    return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, 0)
+    return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, seed)
 
 
 def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:

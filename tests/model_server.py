@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse
 from llguidance import LLMatcher
 from llguidance.hf import from_tokenizer
@@ -52,6 +52,7 @@ class ModelServer:
         self.student: Student = load_student(folder, device="cpu", max_pixels=max_pixels)
         self.student.model.eval()
         self.num_answers = self.num_images = 0
+        self.bodies: list[bytes] = []  # as they came
         self._grammar_tokenizer = from_tokenizer(
             self.student.tokenizer, n_vocab=self.student.model.config.text_config.vocab_size
         )
@@ -84,6 +85,12 @@ class ModelServer:
 
     def _app(self) -> FastAPI:
         app = FastAPI()
+
+        @app.middleware("http")
+        async def note(request: Request, answer: Any) -> Any:
+            if request.method == "POST":
+                self.bodies.append(await request.body())
+            return await answer(request)
 
         @app.get("/v1/models")
         def models() -> dict:

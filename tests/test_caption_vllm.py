@@ -246,7 +246,7 @@ def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
     student.mkdir()
     (student / "config.json").write_text(json.dumps({"model_type": MODEL_TYPE}))
     (student / "model.safetensors").touch()
-    cfg = infer.InferConfig(split="train", engine="vllm")
+    cfg = infer.InferConfig(split="train", engine="vllm", constrained=True)
     predictions = read_predictions(infer.run(cfg, training_set, [tree], student, tmp_path / "out"))
     assert len(predictions) == len(stand_in.asked) == len(list(open_split(training_set, "train")))
     assert all(prediction.coc is not None for prediction in predictions)

@@ -22,7 +22,8 @@ from cosfly.frame_views import PEDESTRIAN_RGB, VIEW_FILES, Pictures, depth_color
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight
-from distill.inference.stage import InferConfig, make_request
+from distill.inference.asking import make_request
+from distill.inference.stage import InferConfig
 from distill.prepare.samples import PrepareConfig, make_sample
 from distill.schema import Sample
 from distill.student.encoding import load_pictures
@@ -153,7 +154,7 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         expected = [teachers[i][view] for i in range(5) for view in views]
         for picture, wanted in zip(pictures, expected, strict=True):
             assert np.array_equal(picture, wanted)
-        request = make_request(sample, {"": tree}, InferConfig())  # engines `endpoint` and `vllm`
+        request = make_request(sample, {"": tree}, InferConfig().sampling, 0)  # engines `endpoint` and `vllm`
         kinds = [part.get("text", "picture") for part in request.messages[1]["content"]]
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):

@@ -20,6 +20,7 @@ from caption.run.progress import duration
 from caption.run.stage import open_stage
 from caption.schema import CaptionConfig, Window
 from caption.teachers.prompts import make_question
+from caption.teachers.students import as_taught
 from caption.teachers.teacher import AskingTeacher, first_budget
 from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
@@ -90,6 +91,7 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     """
     if cfg.teacher_kind != "endpoint":
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
+    cfg = as_taught(cfg)
     stage = open_stage(cfg, data, out, seed, resume)
     allotted, _ = allot(named_flights(data), cfg)
     left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]

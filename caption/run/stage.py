@@ -19,6 +19,7 @@ from caption.run.report import write_page
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import given_samples
 from caption.teachers.prompts import PROMPTS
+from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth import actions
 from caption.truth.glossary import GLOSSARY_FILE
@@ -68,6 +69,7 @@ def run(
         raise ConfigError(
             "this teacher never fails to answer", where="--retry-failed", got=cfg.teacher_kind, fix="leave it out"
         )
+    cfg = as_taught(cfg)
     foreign = None if cfg.caption_file is None else given_samples(cfg.caption_file, cfg.teacher_kind)
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)

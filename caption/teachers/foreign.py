@@ -37,12 +37,14 @@ class ForeignCaption(BaseModel):
 
 @dataclass(frozen=True)
 class Terms:
-    """How a window is answered. fields: of the answer beyond the paper's three. is_given: it can be asked for once only."""
+    """How a window is answered. fields: of the answer beyond the paper's three. is_given: it can be asked for once only. is_translated: the
+    Chinese is made from the English, not from the window."""
 
     writing: Writing
     fields: tuple[str, ...]
     is_given: bool = False
     has_mirror: bool = True
+    is_translated: bool = True
 
 
 def read_foreign(path: Path) -> dict[str, str]:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -33,19 +34,24 @@ class FrameSource(Protocol):
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
     """Tell what is shown of a window: the wanted views that every observed frame has (public trees can lack depth).
 
-    Without any, pixels are the camera's.
+    Without any, pixels are the camera's, or where none is wanted those that the settings name.
     """
     in_all = frozenset.intersection(*window.frame_files)
     views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all])
-    size_px = scaled_size(window.width_px, window.height_px, cfg.max_side_px if views else None)
+    size_px = scaled_size(window.width_px, window.height_px, cfg.max_side_px if views or not cfg.modalities else None)
     return Pictures(views, size_px, cfg.layout, cfg.depth_range_m)
 
 
 class FrameEncoder:
     """Reads and encodes frames; keeps the last `cache_frames` of them."""
 
-    def __init__(self, cfg: ImageConfig) -> None:
+    def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
+        """
+        Args:
+            encode: makes what is sent of a picture; None: as the settings say.
+        """
         self.cfg = cfg
+        self._encode = encode or (lambda rgb: encode_image(rgb, cfg))
         self.num_encoded = 0
         self._cache: OrderedDict[tuple[Path, Pictures], list[EncodedImage]] = OrderedDict()
         self._lock = threading.Lock()  # frames are encoded on several threads
@@ -65,7 +71,7 @@ class FrameEncoder:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        images = [encode_image(picture, self.cfg) for picture in pictures.read(frame)]
+        images = [self._encode(picture) for picture in pictures.read(frame)]
         with self._lock:
             self.num_encoded += 1
             self._cache[key] = images

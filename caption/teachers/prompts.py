@@ -85,10 +85,13 @@ def system_prompt(language: Language) -> str:
 def way_prompt(writing: Writing, decision: str | None = None) -> str:
     """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of sec:appendix_e)."""
     prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(ACTIONS))
-    if decision is None:
-        return prompt
+    return prompt if decision is None else f"{prompt}\n{decision_words(decision)}"
+
+
+def decision_words(decision: str) -> str:
+    """Give the words that tie an answer to a decision."""
     words = load_glossary().actions[decision]["en"]
-    return prompt + "\n" + read_prompt("anchored_en").substitute(decision=decision, decision_words=words)
+    return read_prompt("anchored_en").substitute(decision=decision, decision_words=words)
 
 
 def build_prompts(window: ObservedWindow, facts: Facts) -> dict[Language, Prompt]:

@@ -10,16 +10,20 @@ import asyncio
 import os
 import time
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.foreign import FileTeacher, StudentTeacher
-from caption.teachers.images import FrameEncoder
+from caption.teachers.images import EncodedImage, FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
+from caption.teachers.students import TaughtStudent
 from caption.teachers.trials import SCENES, Drawn, Scene, trial_question
 from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.chance import draws_for, rng_for
@@ -82,8 +86,8 @@ def _native(answer: dict[str, str]) -> Reply:
 class SharedFrames:
     """Encodes frames on threads, each once however many windows wait for it."""
 
-    def __init__(self, cfg: ImageConfig) -> None:
-        self.encoder = FrameEncoder(cfg)
+    def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
+        self.encoder = FrameEncoder(cfg, encode)
         self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
         self._underway: dict[tuple[Path, Pictures], asyncio.Future] = {}
 
@@ -93,12 +97,18 @@ class SharedFrames:
         Raises:
             InputError, RenderError: a picture cannot be read or encoded.
         """
-        if question.pictures.views:
-            frames = [(folder, question.pictures) for folder in question.window.frame_folders]
-            missing = [frame for frame in frames if not self.encoder.holds(*frame)]
-            if missing:
-                await asyncio.gather(*(self._encode(frame) for frame in missing))
+        await self.pictures(question)
         return question_messages(question, self.encoder)
+
+    async def pictures(self, question: Question) -> list[list[EncodedImage]]:
+        """Give the pictures of each frame of a question; raises as `messages`."""
+        if not question.pictures.views:
+            return [[] for _ in question.window.frame_folders]
+        frames = [(folder, question.pictures) for folder in question.window.frame_folders]
+        missing = [frame for frame in frames if not self.encoder.holds(*frame)]
+        if missing:
+            await asyncio.gather(*(self._encode(frame) for frame in missing))
+        return [self.encoder.encode(*frame) for frame in frames]
 
     async def _encode(self, frame: tuple[Path, Pictures]) -> None:
         underway = self._underway.get(frame)
@@ -146,7 +156,8 @@ class AskingTeacher:
         self.all_cfg, self.cfg, self.seed = cfg, cfg.endpoint, seed
         self.engine = make_engine(cfg, troubles)
         self.kept = KeptAnswers(self.engine, book, budget, only)
-        self.frames = SharedFrames(cfg.image)
+        self.student = None if cfg.student.folder is None else TaughtStudent(cfg)
+        self.frames = SharedFrames(cfg.image, self.student.encode if self.student else None)
         self._trying, self._sound_s = asyncio.Lock(), float("-inf")  # when a trial prompt was answered last
         self._num_answered = 0  # questions that the engine answered
         self._answered_before: dict[
@@ -161,7 +172,8 @@ class AskingTeacher:
             raise
         sampling = self.cfg.model_dump(include={"temperature", "top_p", "max_tokens", "extra_body"})
         settings = TeacherSettings(**sampling, seed=self.seed)
-        self.record = TeacherRecord(kind=self.engine.kind, model=self.engine.model, settings=settings)
+        kind = "student" if self.student else self.engine.kind
+        self.record = TeacherRecord(kind=kind, model=self.engine.model, settings=settings)
         return self
 
     async def __aexit__(self, *exc: object) -> None:
@@ -175,9 +187,13 @@ class AskingTeacher:
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
-        schema = answer_schema(english.coc.flight_decision, "zh")
-        messages = mirror_messages(english, question.writing, complaint)
-        request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
+        if self.student is not None:
+            frames = await self.frames.pictures(question)
+            request = self.student.mirror_request(question, english, frames, ask)
+        else:
+            schema = answer_schema(english.coc.flight_decision, "zh")
+            messages = mirror_messages(english, question.writing, complaint)
+            request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self._kept_answer(question, request, purpose)
 
     async def _kept_answer(self, question: Question, request: Request, purpose: str) -> Reply:
@@ -233,6 +249,9 @@ class AskingTeacher:
         Raises:
             InputError, RenderError: a picture cannot be read or encoded.
         """
+        if self.student is not None:
+            self.student.check(question)
+            return self.student.request(question, await self.frames.pictures(question), question.ask)
         messages, digests = await self.frames.messages(question)
         seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
         schema = answer_schema(question.decision, more=more_fields(way_of(question.writing)))

@@ -27,6 +27,12 @@ def caption(
             "student:PATH (what `distill infer` wrote). [default: rules]"
         ),
     ] = None,
+    as_student: Annotated[
+        Path | None,
+        typer.Option(
+            help="What `distill train` or `distill merge` wrote: the teacher is that student behind a server, and is asked as it was taught."
+        ),
+    ] = None,
     model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
     judge: Annotated[str | None, typer.Option(help="URL of an endpoint that judges conflicts.")] = None,
     keyframes: Annotated[
@@ -64,7 +70,12 @@ def caption(
     from caption.run import stage
 
     chosen: dict[str, Any] = {"caption.teacher": teacher, "caption.endpoint.model": model}
-    chosen |= {"caption.judge.url": judge, "caption.window.keyframes": keyframes, "caption.limit": limit}
+    chosen |= {
+        "caption.student.folder": as_student,
+        "caption.judge.url": judge,
+        "caption.window.keyframes": keyframes,
+        "caption.limit": limit,
+    }
     chosen |= {"caption.budget.max_cost": max_cost, "caption.budget.max_tokens": max_tokens}
     chosen |= {"seed": seed, "workers": workers}
     cfg = options.resolve(config, overrides, chosen)
@@ -72,7 +83,10 @@ def caption(
     target = out or tree.resolve().parent / "caption"
     options.set_aside(target, repair)
     options.verify_first(verify, tree, target)
-    if check and cfg.caption.teacher_kind == "endpoint" and not (target / "answers").exists():
+    is_teacher = (
+        cfg.caption.teacher_kind == "endpoint" and cfg.caption.student.folder is None
+    )  # a student knows one question
+    if check and is_teacher and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption, [cfg.caption.writing])
     if plan_only:
         from caption.run.forecast import make_forecast

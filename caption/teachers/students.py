@@ -1,0 +1,163 @@
+"""A student behind a server as a teacher (`--as-student FOLDER`): asked with the very prompts, pictures and sampling that it was taught with.
+
+That is the paper's stage 3: flights that nobody labelled get their captions from a student, judged and marked like any other teacher's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from caption.schema import CaptionConfig
+from caption.teachers.foreign import Terms
+from caption.teachers.images import EncodedImage
+from caption.teachers.prompts import Question, decision_words, read_prompt, system_prompt
+from caption.writing.contract import Draft
+from cosfly.chat.client import EndpointConfig
+from cosfly.chat.contract import Request
+from cosfly.errors import ConfigError, TeacherError
+from cosfly.frame_views import Pictures
+from cosfly.products.captions import Language, Prompt, answer_schema
+from cosfly.student_chat import (
+    IMAGE_ENCODING,
+    SentPicture,
+    StudentEndpointConfig,
+    Taught,
+    picture_to_send,
+    read_taught,
+    student_request,
+)
+
+
+def as_taught(cfg: CaptionConfig) -> CaptionConfig:
+    """Give the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing and sampling.
+
+    Where nobody is asked as a student they stay as they are.
+
+    Raises:
+        InputError: the folder does not say what the student was taught. ConfigError: it was taught something that cannot be asked here.
+    """
+    folder = cfg.student.folder
+    if folder is None:
+        return cfg
+    taught = read_taught(folder)
+    check_prompts(taught, folder)
+    views, ranges = {look.views for look in taught.looks}, {look.depth_range_m for look in taught.looks}
+    sides = {max(look.size_px) for look in taught.looks}
+    if not len(views) == len(ranges) == len(sides) == 1:
+        raise ConfigError(
+            "the student was taught with pictures of several kinds", where=folder, got=str(taught.looks)[:200]
+        )
+    picture = {
+        "modalities": views.pop(),
+        "layout": "separate",
+        "max_side_px": sides.pop(),
+        "depth_range_m": ranges.pop(),
+    }
+    sampling = StudentEndpointConfig(max_tokens=cfg.student.max_new_tokens, json_schema=cfg.student.constrained)
+    asked = sampling.model_dump(include={"temperature", "top_p", "max_tokens", "json_schema", "extra_body"})
+    return cfg.model_copy(update={
+        "writing": "prose",
+        "window": cfg.window.model_copy(update={"num_frames": taught.num_frames}),
+        "image": cfg.image.model_copy(update={**picture, "encoding": IMAGE_ENCODING}),
+        "endpoint": cfg.endpoint.model_copy(update=asked),
+        # Asked again it answers the same, and of corrections it was taught nothing.
+        "structure_asks": 1, "correction_asks": 0, "mirror_asks": 1,
+    })  # fmt: skip
+
+
+def check_prompts(taught: Taught, folder: Path) -> None:
+    """Check that prompts are written today as they were for the student.
+
+    Raises:
+        ConfigError: they are not, or it was taught no English, with which a caption begins.
+    """
+    if "en" not in taught.prompts:
+        raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
+    for language, prompt in taught.prompts.items():
+        if prompt.system != system_prompt(language) or not _is_of_template(prompt.user, language, taught):
+            raise ConfigError(
+                "the student was taught another version of the prompt", where=f"{folder}: {language}", got=prompt.user[:80],
+                fix="ask it with the version of cosfly that captioned its training set, or train it anew",
+            )  # fmt: skip
+
+
+def _is_of_template(user: str, language: Language, taught: Taught) -> bool:
+    told = {"num_frames": re.escape(str(taught.num_frames)), "pictures": "|".join(
+        re.escape(Pictures(look.views, look.size_px, "separate", look.depth_range_m).sentence(language)) for look in taught.looks
+    )}  # fmt: skip
+    pieces = re.split(r"\$(\w+)", read_prompt(f"user_{language}").template)
+    pattern = "".join(
+        f"(?:{told.get(piece, '.+?')})" if number % 2 else re.escape(piece) for number, piece in enumerate(pieces)
+    )
+    return re.fullmatch(pattern + r"(\n.+)?", user) is not None  # a mission's line may follow
+
+
+class TaughtStudent:
+    """What is asked of a student about a window, in the words that it was taught."""
+
+    def __init__(self, cfg: CaptionConfig) -> None:
+        """
+        Args:
+            cfg: as `as_taught` gives it.
+        """
+        assert cfg.student.folder is not None
+        self.taught = read_taught(cfg.student.folder)
+        self._sampling: EndpointConfig = cfg.endpoint
+        self.terms = Terms("prose", (), has_mirror="zh" in self.taught.prompts, is_translated=False)
+
+    def encode(self, rgb: np.ndarray) -> EncodedImage:
+        """Encode a picture as it was taught."""
+        sent = picture_to_send(rgb, self.taught.max_pixels)
+        return EncodedImage(sent.part["image_url"]["url"], sent.digest)
+
+    def check(self, question: Question) -> None:
+        """Check that a window is shown as those were that the student learnt from.
+
+        Raises:
+            TeacherError: the tree lacks a view, or its camera has another picture.
+        """
+        shown = question.pictures
+        if all((look.views, look.size_px) != (shown.views, shown.size_px) for look in self.taught.looks):
+            raise TeacherError(
+                "the student was taught with other pictures than this playback tree has",
+                where=question.window.sample_id,
+                got=f"{', '.join(shown.views) or 'none'} of {shown.size_px[0]} x {shown.size_px[1]} px",
+                expected=" or ".join(
+                    f"{', '.join(k.views)} of {k.size_px[0]} x {k.size_px[1]} px" for k in self.taught.looks
+                ),
+                fix="give flights of such a camera, or train a student on pictures like these",
+            )
+
+    def request(self, question: Question, frames: Sequence[Sequence[EncodedImage]], seed: int) -> Request:
+        """Give the English question."""
+        prompt = question.asked["en"]
+        return self._request(self._reworked(prompt, question), frames, answer_schema(question.decision), seed)
+
+    def mirror_request(
+        self, question: Question, english: Draft, frames: Sequence[Sequence[EncodedImage]], seed: int
+    ) -> Request:
+        """Give the Chinese question, which is of the window as the English one is: a student translates nothing.
+
+        The Chinese of an answer whose decision was given must hold that decision.
+        """
+        decision = english.coc.flight_decision if question.decision else None
+        return self._request(question.asked["zh"], frames, answer_schema(decision, "zh"), seed)
+
+    def _reworked(self, prompt: Prompt, question: Question) -> Prompt:
+        """Add what a repair says, as for any teacher: the student was not taught it, but may follow."""
+        more = []
+        if question.decision is not None:
+            more.append(decision_words(question.decision))
+        if question.rejected is not None:
+            more.append(read_prompt("hint_en").substitute(rejected=question.rejected))
+        return prompt.model_copy(update={"system": "\n".join([prompt.system, *more])})
+
+    def _request(self, prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, seed: int) -> Request:
+        parts = [
+            [SentPicture({"type": "image_url", "image_url": {"url": p.url}}, p.digest) for p in each] for each in frames
+        ]
+        return student_request(prompt, parts, schema, self._sampling, seed)

@@ -1,0 +1,241 @@
+"""A student behind a server as a teacher: asked as it was taught, to the byte; judged, repaired and marked like any other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from specimens_distill import prepared
+from teacher_server import TeacherServer
+from typer.testing import CliRunner
+
+from caption.run.stage import run
+from caption.schema import CaptionConfig
+from caption.teachers.students import as_taught
+from cosfly.cli import app
+from cosfly.errors import ConfigError, InputError, NothingKept, TeacherError
+from cosfly.products.captions import Caption, read_captions
+from cosfly.student_chat import TAUGHT, read_taught, write_taught
+from distill.inference import stage as infer
+from distill.schema import Sample, open_split
+from distill.student.taught import taught_by
+from specimens import make_playback_tree
+
+SIDE_PX = 40  # smaller than the camera's, so that pictures are scaled
+MAX_PIXELS = 600  # smaller than those, so that the server's pictures are once more
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("students")
+    tree = make_playback_tree(root / "tree", 3, 14)
+    captions = run(CaptionConfig.model_validate({"image": {"max_side_px": SIDE_PX}}), tree, root / "rules")
+    prepared(tree, captions, root / "set", modalities=("rgb", "depth"))
+    (root / "trained" / "adapter").mkdir(parents=True)
+    write_taught(root / "trained" / "adapter", taught_by(open_split(root / "set", "train"), MAX_PIXELS))
+    return root
+
+
+def label_of(place: Path) -> Callable[[dict], str]:
+    """What a student decides that learnt all: the label of the window whose prompt is asked, in either language."""
+    labels: dict[str, str] = {}
+    for caption in read_captions(place / "rules" / "captions.jsonl"):
+        for prompt in caption.prompt.values():
+            labels[key_of(prompt.user)] = caption.label or "track_straight"
+    return lambda body: labels[key_of(body["messages"][1]["content"][-1]["text"])]
+
+
+def key_of(user: str) -> str:
+    """A prompt without its first line, which names the pictures."""
+    return user.partition("\n")[2]
+
+
+def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:
+    return CaptionConfig.model_validate({
+        "teacher": url, "student": {"folder": folder}, "endpoint": {"max_tries": 1, "timeout_s": 30.0}, **changes,
+    })  # fmt: skip
+
+
+def captions_of(place: Path, out: Path, url: str, **changes: Any) -> list[Caption]:
+    return list(read_captions(run(settings(url, place / "trained", **changes), place / "tree", out)))
+
+
+def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
+    """Have every sample answered by `distill infer`; gives them."""
+    samples: list[Sample] = []
+    for split in ("train", "val", "test"):
+        cfg = infer.InferConfig.model_validate({
+            "split": split, "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 30.0}, **changes,
+        })  # fmt: skip
+        infer.run(cfg, place / "set", [place / "tree"], url, out / split)
+        samples += open_split(place / "set", split)
+    return samples
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
+    decide = label_of(place)
+    with TeacherServer(decision=decide) as server:
+        samples = infer_all(place, server.url, tmp_path / "infer", constrained=constrained)
+        asked = set(server.bodies)
+        assert len(asked) == len(samples) == len(server.bodies)
+        assert {sample.language for sample in samples} == {"en", "zh"}
+        server.bodies.clear()
+        student = {"folder": place / "trained", "constrained": constrained}
+        captions = captions_of(place, tmp_path / "captions", server.url, student=student)
+        windows = {sample.sample_id for sample in samples}
+        assert windows <= {caption.sample_id for caption in captions}
+        assert asked <= set(server.bodies)  # and further windows, which the training set left out
+        assert len(server.bodies) <= 2 * len(captions)
+        sent = [json.loads(body)["messages"][1]["content"] for body in server.bodies]
+        assert {sum(part["type"] == "image_url" for part in parts) for parts in sent} == {10}
+        assert all(("response_format" in json.loads(body)) == constrained for body in server.bodies)
+
+
+@pytest.mark.slow
+def test_a_real_model_is_asked_the_same(place, tmp_path):
+    """The same against a small random model behind a server of another make."""
+    pytest.importorskip("torch")
+    from model_server import ModelServer
+
+    from distill.student.random_student import make_tiny_student
+
+    with ModelServer(make_tiny_student(tmp_path / "student")) as server:
+        samples = infer_all(place, server.url, tmp_path / "infer", max_new_tokens=4)
+        asked = {body for body in server.bodies if json.loads(body)["messages"][0]["content"].isascii()}
+        assert len(asked) == sum(sample.language == "en" for sample in samples)
+        server.bodies.clear()
+        with pytest.raises(NothingKept, match="structure_"):  # noise is no caption: all windows are dropped
+            captions_of(
+                place, tmp_path / "captions", server.url, student={"folder": place / "trained", "max_new_tokens": 4}
+            )
+        assert asked <= set(server.bodies)
+    captions = list(read_captions(tmp_path / "captions" / "captions.jsonl"))
+    assert {caption.status for caption in captions} == {"dropped"}
+
+
+def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
+    with TeacherServer(decision=label_of(place)) as server:
+        words = ["caption", "--teacher", server.url, "--as-student", place / "trained", "--data", place / "tree"]
+        result = CliRunner().invoke(app, [str(word) for word in [*words, "--out", tmp_path / "out"]])
+        assert result.exit_code == 0, result.output
+        assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}
+    captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))
+    accepted = [caption for caption in captions if caption.status == "accepted"]
+    assert len(accepted) > len(captions) / 2
+    for caption in accepted:
+        assert (caption.teacher.kind, caption.teacher.model, caption.writing) == ("student", "test-teacher", "prose")
+        assert caption.teacher.settings.temperature == 0.0
+        assert caption.verdict in ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN")
+        assert caption.checks.sentences is not None
+        assert caption.zh is not None
+        assert caption.picture_px == read_taught(place / "trained").looks[0].size_px
+    told = (tmp_path / "out" / "stage.json").read_text()
+    assert str(place) not in json.dumps(json.loads(told)["config"])
+
+
+def test_a_conflict_is_repaired_and_marked(place, tmp_path):
+    """A student that is wrong at first and follows when it is told the decision."""
+    decide = label_of(place)
+    opposite = {"yaw_left_to_follow": "yaw_right_to_follow", "yaw_right_to_follow": "yaw_left_to_follow"}
+
+    def wrong_first(body: dict) -> str:
+        label = decide(body)
+        is_told = (
+            label.replace("_", " ") in body["messages"][0]["content"].partition("flight_decision")[2].partition("\n")[2]
+        )
+        return label if is_told else opposite.get(label, label)
+
+    with TeacherServer(decision=wrong_first) as server:
+        captions = captions_of(
+            place, tmp_path / "out", server.url, student={"folder": place / "trained", "constrained": True}
+        )
+    repaired = [caption for caption in captions if caption.repair is not None]
+    assert repaired
+    for caption in repaired:
+        assert caption.repair.strategy == "anchored"
+        assert caption.repair.first_verdict == "HARD_CONFLICT"
+        assert caption.repair.outcome == "repaired"
+        assert caption.en.flight_decision == caption.label
+        assert caption.zh is None or caption.zh.flight_decision == caption.label
+    untouched = [caption for caption in captions if caption.repair is None and caption.status == "accepted"]
+    assert untouched
+
+
+def test_two_languages_that_disagree_are_dropped(place, tmp_path):
+    decide = label_of(place)
+
+    def torn(body: dict) -> str:
+        return decide(body) if body["messages"][0]["content"].isascii() else "return_to_home"
+
+    with TeacherServer(decision=torn) as server:
+        with pytest.raises(NothingKept, match="bilingual_decision"):
+            captions_of(place, tmp_path / "out", server.url)
+        asked = [json.loads(body)["messages"][0]["content"].isascii() for body in server.bodies]
+    captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))
+    assert {caption.drop_reason for caption in captions if caption.checks.bilingual is not None} == {
+        "bilingual_decision"
+    }
+    assert {caption.status for caption in captions} == {"dropped"}
+    assert 0 < asked.count(False) <= len(captions)  # once each: asked again it would answer the same
+
+
+# --- what cannot be -----------------------------------------------------------------------------------------------------
+
+
+def taught_otherwise(place: Path, folder: Path, **changes: Any) -> Path:
+    folder.mkdir()
+    value = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
+    (folder / TAUGHT).write_text(json.dumps(value | changes))
+    return folder
+
+
+def test_another_version_of_the_prompt_is_refused(place, tmp_path):
+    taught = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
+    english = taught["prompts"]["en"]
+    for number, changed in enumerate([
+        {"system": english["system"] + " Be brief.", "user": english["user"]},
+        {"system": english["system"], "user": english["user"].replace("Altitude:", "Height:")},
+        {"system": english["system"], "user": english["user"].replace("5 observed", "7 observed")},
+        {"system": english["system"], "user": english["user"].replace("2 pictures", "3 pictures")},
+    ]):  # fmt: skip
+        folder = taught_otherwise(place, tmp_path / f"{number}", prompts=taught["prompts"] | {"en": changed})
+        with pytest.raises(ConfigError, match="another version of the prompt"):
+            as_taught(settings("http://127.0.0.1:1/v1", folder))
+    mission = {"system": english["system"], "user": english["user"] + "\nMission: the time of the mission is over."}
+    folder = taught_otherwise(place, tmp_path / "mission", prompts={"en": mission})
+    assert as_taught(settings("http://127.0.0.1:1/v1", folder)).endpoint.temperature == 0.0
+    folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
+    with pytest.raises(ConfigError, match="taught no English"):
+        as_taught(settings("http://127.0.0.1:1/v1", folder))
+
+
+def test_a_student_without_chinese_gives_english_captions(place, tmp_path):
+    taught = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
+    folder = taught_otherwise(place, tmp_path / "en", prompts={"en": taught["prompts"]["en"]})
+    with TeacherServer(decision=label_of(place)) as server:
+        captions = list(read_captions(run(settings(server.url, folder), place / "tree", tmp_path / "out")))
+    accepted = [caption for caption in captions if caption.status == "accepted"]
+    assert accepted
+    assert all(caption.zh is None and caption.checks.bilingual == "no_chinese" for caption in accepted)
+
+
+def test_a_tree_with_other_pictures_is_refused(place, tmp_path):
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    for path in tree.rglob("depth.npy"):
+        path.unlink()
+    with TeacherServer() as server:
+        with pytest.raises(TeacherError, match=r"taught with other pictures.*got rgb of.*expected rgb, depth of"):
+            run(settings(server.url, place / "trained"), tree, tmp_path / "out")
+        assert not server.bodies
+
+
+def test_a_folder_that_says_nothing_is_refused(place, tmp_path):
+    with pytest.raises(InputError, match="nothing here says what the student was taught"):
+        as_taught(settings("http://127.0.0.1:1/v1", tmp_path))
+    with pytest.raises(ValueError, match=r"student.folder needs a teacher that is asked"):
+        CaptionConfig.model_validate({"student": {"folder": place / "trained"}})
