@@ -41,7 +41,8 @@ class Shard(Strict):
 class ReleasedFlight(Strict):
     """One flight, `run/town/trajectory/variant`; `frames_available` is the length of the flight that was rendered.
 
-    pair: the other track's flight of the same trajectory, null where that is not released.
+    pair: the other track's flight of the same trajectory, null where that is not released. five_ray_mean: share of five rays that reach the
+    person, as the inspection measured it on the map, which the shards do not hold; null where nobody did.
     """
 
     flight: str
@@ -50,6 +51,7 @@ class ReleasedFlight(Strict):
     split: SplitName
     walk: str
     pair: str | None
+    five_ray_mean: float | None = None
 
 
 class ReleasedMap(TownMap):

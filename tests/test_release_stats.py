@@ -6,6 +6,7 @@ import gc
 import math
 import shutil
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +22,18 @@ from cosfly.errors import InputError
 from cosfly.flight_metrics import accel_rms, jerk_rms, length_m
 from cosfly.products.coverage import Coverage, default_coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.inspection import read_inspection, write_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.reading.documents import read_json
 from release.columns import BOX, POINT, POSE
 from release.record import read_record
 from release.stats.counting import Counts, overlap
+from release.stats.frame_tables import weather
 from release.stats.page import markdown, page_html
 from release.stats.pixels import BIN_M, Pixels
 from release.stats.schema import Absent, Stats, Table
 from release.stats.stats import run
-from release.stats.tables import _weather
+from specimens import make_flight
 
 BIG = dict(zip(BOX, (10.0, 10.0, 20.0, 30.0), strict=True))
 SMALL = dict(zip(BOX, (10.0, 10.0, 20.0, 20.0), strict=True))
@@ -249,9 +252,43 @@ def test_a_release_is_counted_again(dataset, tmp_path):
         assert outside not in page
 
 
+@pytest.mark.parametrize(
+    ("told", "preset", "time"),
+    [
+        ({"weather_name": "heavy rain", "tod_name": "noon", "mode": "fixed"}, "heavy rain", "noon"),
+        ("mist", "mist", None),
+        (None, None, None),
+        ({"params": {}}, None, None),
+    ],
+)
+def test_the_record_of_a_flights_weather_is_read(told, preset, time):
+    """The names of its fields are those of tab:weather_meta."""
+    flight = replace(make_flight(3)[0], raw={"weather": told})
+    assert flight.weather == {"weather": preset, "time_of_day": time}
+
+
+def test_five_ray_visibility_is_what_the_inspection_measured(tmp_path):
+    inputs = make_inputs(tmp_path / "inputs")
+    inspected = read_inspection(inputs / "inspect.json")
+    values = {}
+    for k, flight in enumerate(inspected.flights):
+        values[flight.folder] = flight.metrics["five_ray_mean"] = 0.3 + 0.1 * k
+    write_inspection(inputs / "inspect.json", inspected)
+    dataset = build(inputs, tmp_path / "release")
+    record = read_record(dataset / "release.json")
+    for flight in record.flights:
+        assert flight.five_ray_mean == values[flight.flight.partition("/")[2]]
+    written = read_json(run(dataset, tmp_path / "stats", pixels=0).with_name("stats.json"))
+    rows = {row[0]: row[1:] for table in written["tables"] if table["key"] == "dist_stats" for row in table["rows"]}
+    clean = [flight.five_ray_mean for flight in record.flights if flight.flight.endswith("ORI")]
+    assert rows["five-ray visibility, as inspected"][0] == pytest.approx(np.mean(clean), abs=1e-4)
+    assert rows["five-ray visibility, as inspected"][-1] == len(clean)
+    assert "five-ray visibility of the planner" not in {one["what"] for one in written["absent"]}
+
+
 def test_weather_is_counted_where_frames_name_it():
     rows = [make_row(i, weather="heavy rain" if i < 3 else "green sky", time_of_day="noon") for i in range(5)]
-    (table,) = [table for table in _weather(counted(rows)) if table.key == "weather"]
+    (table,) = [table for table in weather(counted(rows)) if table.key == "weather"]
     grid = {row[0]: row[1:] for row in table.rows}
     assert table.head == ["preset", "morning", "noon", "dusk", "night"]
     assert len(grid) == 15 + 1

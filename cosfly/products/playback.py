@@ -43,7 +43,10 @@ ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
 # What the record of a flight's presets may be called: the paper names it, no public file shows it.
-WEATHER_KEYS = {"weather": ("weather", "preset", "name"), "time_of_day": ("time_of_day", "tod")}
+WEATHER_KEYS = {
+    "weather": ("weather_name", "weather", "preset", "name"),
+    "time_of_day": ("tod_name", "time_of_day", "tod"),
+}
 TWIN_TOLERANCE_S = 1e-3
 # Whither a person walks: the way from so many frames before to so many after; who goes less than so far stands.
 HEADING_FRAMES, STANDS_M = 2, 0.1

@@ -134,7 +134,7 @@ def limits(record: ReleaseRecord) -> str:
     repaired = sum(count for name, count in captions.repair_strategy.items() if name != "none")
     if repaired:
         lines.append(
-            f"{repaired:,} captions ({repaired / captions.frames_with:.1%}) are not their teacher's first answer, which the flight contradicted; `repair_strategy` says how they were mended."
+            f"{repaired:,} captions ({repaired / captions.frames_with:.1%}) are not their teacher's first answer, which was rejected; `repair_strategy` says how they were mended."
         )
     noisy = captions.label_from.get("perturbed", 0)
     if noisy:

@@ -72,7 +72,7 @@ class Candidate:
     """A flight that a source has: where it stands and what it is called.
 
     left_out: why the inspection leaves it out, None where it does not. sha256: of its files as they were inspected; None where no
-    inspection says, or it saw the tree in its older form.
+    inspection says, or it saw the tree in its older form. five_ray_mean: as it was inspected.
     """
 
     source: int
@@ -81,6 +81,7 @@ class Candidate:
     flight_id: str
     left_out: str | None = None
     sha256: str | None = None
+    five_ray_mean: float | None = None
 
     @property
     def name(self) -> str:
@@ -114,7 +115,7 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
         InputError: a file cannot be read, two flights cannot be told apart, or nobody says of which tree the captions were made.
     """
     wanted = ("accepted", "review") if include_review else ("accepted",)
-    found: list[tuple[int, Place, Path, str | None, str | None]] = []
+    found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []
     inspections: list[Inspection] = []
     for number, source in enumerate(sources):
         if not accept_unbound and not is_bound(source.captions):
@@ -125,7 +126,7 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
             )  # fmt: skip
         if source.inspect is None:
             for folder in find_flights(source.data):
-                found.append((number, _place(source, folder.relative_to(source.data)), folder, None, None))
+                found.append((number, _place(source, folder.relative_to(source.data)), folder, None, None, None))
             continue
         inspection = read_inspection(source.inspect)
         inspections.append(inspection)
@@ -134,11 +135,12 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
             left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
             folder = stand(source.data, flight.folder)
             sha256 = None if saw_older else flight.sha256
-            found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256))
+            five_ray = flight.metrics.get("five_ray_mean")
+            found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256, five_ray))
     ids = flight_ids([place for _, place, *_ in found])
     candidates = [
-        Candidate(number, place, folder, ids[place], left_out, sha256)
-        for number, place, folder, left_out, sha256 in found
+        Candidate(number, place, folder, ids[place], left_out, sha256, five_ray)
+        for number, place, folder, left_out, sha256, five_ray in found
     ]
     num_inspected = sum(len(inspection.flights) for inspection in inspections)
     return Material(candidates, num_inspected, _sum_of(inspections) if inspections else None)

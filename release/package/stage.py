@@ -423,6 +423,7 @@ def make_record(
     out: Path,
 ) -> ReleaseRecord:
     """Give what release.json says of its shards."""
+    five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
     return ReleaseRecord(
         name=cfg.name,
         licence=licence,
@@ -451,6 +452,7 @@ def make_record(
                 split=plan.placings[flight.name].split,
                 walk=plan.placings[flight.name].walk,
                 pair=plan.placings[flight.name].pair,
+                five_ray_mean=five_ray[flight.name],
             )
             for result in written
             for flight in result.flights

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
-from statistics import fmean
 
 from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
-from cosfly.products.captions import ACTION_GROUPS, ACTIONS, FIELDS, MIN_CHARACTERS, MIN_CHARACTERS_ZH
-from release.card.numbers import Sum, spread_of
+from release.card.numbers import bounded, spread_of
 from release.columns import PICTURES
-from release.record import ReleaseRecord, Spread
-from release.stats.counting import ANNOTATIONS, LANGUAGES, STATES, TEXT_BIN, Counts, FlightSums
+from release.record import ReleaseRecord
+from release.stats import caption_tables, frame_tables
+from release.stats.cells import SPREAD, mean_cell, mean_over, pairs, percent, ratio, rounded, spread_over, spread_row
+from release.stats.counting import ANNOTATIONS, Counts, FlightSums
 from release.stats.pixels import Pixels
 from release.stats.schema import Absent, Cell, Stats, Table
 
-LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
 ZOOM_LEVELS = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
-# tab:weather_presets, tab:tod_presets
-WEATHER = {
-    "sky": ("clear", "fair", "partly_cloudy", "cloudy", "overcast"), "rain": ("drizzle", "light_rain", "medium_rain", "heavy_rain"),
-    "fog": ("thin_fog", "mist", "dense_fog"), "haze": ("smog", "dust_haze", "snow_haze"),
-}  # fmt: skip
-TIMES = ("morning", "noon", "dusk", "night")
 
 
 def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> Stats:
@@ -33,12 +25,13 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
         pixels: of some frames' pictures; None where nobody looked at them.
     """
     tables = [
-        _release(record, counts), _annotations(record, counts), _dist(counts), _frames(counts), _quality(record, counts), _zoom(counts),
-        *_fovs(counts), _decisions(counts), _confusion(counts), _verdicts(counts), _repairs(counts), *_teachers(record), *_evidence(counts),
-        _lengths(counts), *_length_bins(counts), _towns(record, counts), _splits(record), *_weather(counts), *_perturbation(counts), _files(record),
-        *_pixels(pixels),
+        _release(record, counts), _annotations(record, counts), _dist(record, counts), _frames(counts), _quality(record, counts), _zoom(counts),
+        _fovs(counts), *caption_tables.of_captions(record, counts), _towns(record, counts), _splits(record), *frame_tables.weather(counts),
+        *frame_tables.perturbation(counts), _files(record), *_pixels(pixels),
     ]  # fmt: skip
-    return Stats(name=record.name, content_digest=record.content_digest, tables=tables, absent=_absent(counts, pixels))
+    return Stats(
+        name=record.name, content_digest=record.content_digest, tables=tables, absent=_absent(record, counts, pixels)
+    )
 
 
 def _release(record: ReleaseRecord, counts: Counts) -> Table:
@@ -50,7 +43,7 @@ def _release(record: ReleaseRecord, counts: Counts) -> Table:
     steps = ", ".join(f"{step:g}" for step in sorted(counts.step_s))
     rows: list[list[Cell]] = [
         ["trajectories", numbers.trajectories],
-        *_pairs("flights, ", sorted(tracks.items())),
+        *pairs("flights, ", sorted(tracks.items())),
         ["walks", len({flight.walk for flight in flights})],
         ["frames", counts.frames],
         ["pictures (" + ", ".join(record.settings.modalities) + ")", counts.frames * len(record.settings.modalities)],
@@ -59,9 +52,9 @@ def _release(record: ReleaseRecord, counts: Counts) -> Table:
         ["frames of a flight as released, least", min(released, default=None)],
         ["frames of a flight as released, most", max(released, default=None)],
         ["time step, s", steps or None],
-        *_pairs("frames of ", counts.image_px.most_common()),
+        *pairs("frames of ", counts.image_px.most_common()),
         ["captions", numbers.captions.frames_with],
-        ["trajectories planned for one accepted", _ratio(planned.planned, planned.accepted) if planned else None],
+        ["trajectories planned for one accepted", ratio(planned.planned, planned.accepted) if planned else None],
     ]
     note = f"Frames of a flight: {record.frame_selection}."
     return Table(
@@ -79,7 +72,7 @@ def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
         [f"picture: {PICTURES[file].name}", counts.frames, 100.0 if counts.frames else None]
         for file in record.settings.modalities
     ]
-    rows += [[name, counts.annotated[name], _percent(counts.annotated[name], counts.frames)] for name in ANNOTATIONS]
+    rows += [[name, counts.annotated[name], percent(counts.annotated[name], counts.frames)] for name in ANNOTATIONS]
     return Table(
         key="annotations",
         title="Annotations of a frame",
@@ -90,7 +83,7 @@ def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
 
 
 def _trajectories(counts: Counts) -> list[FlightSums]:
-    """Give one flight of each trajectory: the clean one, else one whose plan is known."""
+    """Give one flight of each trajectory: the clean one where it is released."""
     chosen: dict[tuple[str, ...], FlightSums] = {}
     for place, flight in counts.flights.items():
         held = chosen.get(place[:-1])
@@ -99,14 +92,22 @@ def _trajectories(counts: Counts) -> list[FlightSums]:
     return list(chosen.values())
 
 
-def _dist(counts: Counts) -> Table:
+def _five_ray(record: ReleaseRecord, counts: Counts) -> list[float]:
+    """Give the five-ray visibility of the clean flights, of those that were inspected."""
+    means = {flight.flight: flight.five_ray_mean for flight in record.flights}
+    clean = (means.get("/".join(place)) for place, flight in counts.flights.items() if flight.track == "clean")
+    return [bounded(mean) for mean in clean if mean is not None]
+
+
+def _dist(record: ReleaseRecord, counts: Counts) -> Table:
     flights = _trajectories(counts)
     known = [flight for flight in flights if flight.is_known]
     rows = [
-        _spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
-        _spread_row("altitude over the person's ground, m", _means(known, lambda flight: flight.height)),
-        _spread_row("target distance, m", _means(known, lambda flight: flight.distance)),
-        _spread_row("rendered visibility", _means(flights, lambda flight: flight.visibility)),
+        spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
+        spread_row("altitude over the person's ground, m", spread_over(known, lambda flight: flight.height)),
+        spread_row("target distance, m", spread_over(known, lambda flight: flight.distance)),
+        spread_row("rendered visibility", spread_over(flights, lambda flight: flight.visibility)),
+        spread_row("five-ray visibility, as inspected", spread_of(_five_ray(record, counts))),
     ]
     note = (
         "Means of each trajectory, as flown without perturbation: of its clean flight, else its perturbed one less the recorded offsets. "
@@ -122,16 +123,13 @@ def _dist(counts: Counts) -> Table:
     )
 
 
-SPREAD = ["axis", "mean", "std", "least", "most", "values"]
-
-
 def _frames(counts: Counts) -> Table:
     titles = {
         "altitude": "altitude over the person's ground, m",
         "distance": "target distance, m",
         "visibility": "rendered visibility",
     }
-    rows = [_spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
+    rows = [spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
     note = "Both tracks, as the pictures show it, perturbation and all."
     return Table(
         key="dist_frames", title="The same over frames", paper="tab:dist_stats", note=note, head=SPREAD, rows=rows
@@ -153,10 +151,14 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
     known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
     scores = [smoothness_score(*pair) for pair in known]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
+    five_ray = _five_ray(record, counts)
+    below = sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray) if five_ray else None
     rows += [
-        ["mean RMS acceleration, m/s²", _mean(accel for accel, _ in known)],
-        ["mean RMS jerk, m/s³", _mean(jerk for _, jerk in known)],
-        ["mean smoothness score S", _mean(scores)],
+        ["mean five-ray visibility of clean flights, as inspected", mean_cell(five_ray)],
+        [f"of these below {FIVE_RAY_MEAN_MIN:.0%}", below],
+        ["mean RMS acceleration, m/s²", mean_cell(accel for accel, _ in known)],
+        ["mean RMS jerk, m/s³", mean_cell(jerk for _, jerk in known)],
+        ["mean smoothness score S", mean_cell(scores)],
         [f"trajectories within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³", within],
         [f"trajectories with S below {REVIEW_BELOW:g}", sum(score < REVIEW_BELOW for score in scores)],
         ["trajectories whose motion is known", len(known)],
@@ -179,13 +181,13 @@ def _zoom(counts: Counts) -> Table:
     rows: list[list[Cell]] = []
     for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-pair[0][0], pair[0][1])):
         means = [
-            _mean_of(flights, of)
+            mean_over(flights, of)
             for of in (lambda f: f.width_px, lambda f: f.height_px, lambda f: f.visibility, lambda f: f.iou)
         ]
         visibility = None if means[2] is None else 100.0 * means[2]
         level = ZOOM_LEVELS.get(round(fov), "")
-        focal_px = _mean(flight.focal_px for flight in flights if flight.focal_px is not None)
-        rows.append([level, fov, track, *_rounded(focal_px), len(flights), *_rounded(*means[:2], visibility, means[3])])
+        focal_px = mean_cell(flight.focal_px for flight in flights if flight.focal_px is not None)
+        rows.append([level, fov, track, *rounded(focal_px), len(flights), *rounded(*means[:2], visibility, means[3])])
     here = {round(fov) for fov, _ in groups}
     missing = ", ".join(f"{name} ({fov} deg)" for fov, name in ZOOM_LEVELS.items() if fov not in here)
     note = (
@@ -207,7 +209,7 @@ def _zoom(counts: Counts) -> Table:
     return Table(key="zoom_eval", title="Zoom", paper="tab:zoom_eval", note=note, head=head, rows=rows)
 
 
-def _fovs(counts: Counts) -> list[Table]:
+def _fovs(counts: Counts) -> Table:
     frames, trajectories = Counter[float](), Counter[float]()
     for flight in counts.flights.values():
         frames[round(flight.fov_deg, 1)] += flight.frames
@@ -215,181 +217,8 @@ def _fovs(counts: Counts) -> list[Table]:
         trajectories[round(flight.fov_deg, 1)] += 1
     rows: list[list[Cell]] = [[f"{fov:g}", trajectories[fov], frames[fov]] for fov in sorted(frames)]
     head = ["degrees", "trajectories", "frames"]
-    return [
-        Table(
-            key="fovs",
-            title="Fields of view",
-            paper="tab:zoom_config, sec:exp_release",
-            head=head,
-            rows=rows,
-            plot="bars",
-        )
-    ]
-
-
-# --- captions ---------------------------------------------------------------------------------------------------------
-
-
-def _decisions(counts: Counts) -> Table:
-    groups = {action: group for group, actions in ACTION_GROUPS.items() for action in actions}
-    total, labelled = counts.decisions.total(), counts.labels.total() - counts.labels["none"]
-    rows: list[list[Cell]] = [
-        [
-            name,
-            counts.decisions[name],
-            _percent(counts.decisions[name], total),
-            counts.labels[name],
-            _percent(counts.labels[name], labelled),
-            groups.get(name, ""),
-        ]
-        for name in (*ACTIONS, *sorted(counts.decisions.keys() - {*ACTIONS, "none"}))
-    ]
-    note = f"Decisions of {total:,} captions, and the labels that the later positions imply for {labelled:,} of them."
-    head = ["action", "decisions", "%", "labels", "% ", "group"]
-    return Table(
-        key="decisions", title="Decisions", paper="tab:coc_actions", note=note, head=head, rows=rows, plot="bars"
-    )
-
-
-def _confusion(counts: Counts) -> Table:
-    order = [name for name in (*ACTIONS, "none") if counts.labels[name] or counts.decisions[name]]
-    rows: list[list[Cell]] = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
-    return Table(
-        key="confusion",
-        title="Label (rows) against decision (columns)",
-        paper="fig:confusion_patterns",
-        head=["label", *order],
-        rows=rows,
-        plot="heat",
-    )
-
-
-def _verdicts(counts: Counts) -> Table:
-    tracks = sorted({track for _, track in counts.verdicts})
-    names = ["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
-    names += sorted({name for name, _ in counts.verdicts} - set(names))
-    total = counts.verdicts.total()
-    rows: list[list[Cell]] = []
-    for name in names:
-        own = [counts.verdicts[name, track] for track in tracks]
-        rows.append([name, sum(own), _percent(sum(own), total), *own])
-    note = "Of accepted captions, after repair: what the paper's figure shows is of first answers, before it."
-    head = ["verdict", "captions", "%", *tracks]
-    return Table(
-        key="verdicts",
-        title="Decision against the geometry",
-        paper="fig:consistency_verdict",
-        note=note,
-        head=head,
-        rows=rows,
-        plot="bars",
-    )
-
-
-def _repairs(counts: Counts) -> Table:
-    total = counts.repairs.total()
-    rows: list[list[Cell]] = [[name, count, _percent(count, total)] for name, count in counts.repairs.most_common()]
-    return Table(
-        key="repairs",
-        title="Repairs",
-        paper="fig:regen_strategy",
-        head=["strategy", "captions", "%"],
-        rows=rows,
-        plot="bars",
-    )
-
-
-def _teachers(record: ReleaseRecord) -> list[Table]:
-    made = record.provenance
-    rows: list[list[Cell]] = [
-        [f"captions of {teacher.kind}: {teacher.model}", teacher.captions] for teacher in made.teachers
-    ]
-    rows += [["asks", made.asks], *_pairs("", [(name.replace("_", " "), count) for name, count in made.tokens.items()])]
-    rows += [["first answers that stood", made.repairs.first_answers]]
-    rows += [[f"repaired by {rung}", count] for rung, count in made.repairs.repaired_by_rung.items()]
-    note = "As the record tells it, of all captions that were read."
-    return [
-        Table(key="teachers", title="Teachers", paper="tab:caption_pipeline", note=note, head=["", "number"], rows=rows)
-    ]
-
-
-def _evidence(counts: Counts) -> list[Table]:
-    tables = []
-    kinds = ("all proved", "a contradicted one", "some unread")
-    by_state: list[list[Cell]] = [
-        [LANGUAGE_NAMES[language], *(counts.sentences[language, state] for state in STATES)] for language in LANGUAGES
-    ]
-    by_caption: list[list[Cell]] = [
-        [LANGUAGE_NAMES[language], *(counts.whole[language, kind] for kind in kinds)] for language in LANGUAGES
-    ]
-    if counts.sentences:
-        note = "Sentences of the captions against the geometry of their flight."
-        tables.append(
-            Table(
-                key="evidence",
-                title="Evidence of sentences",
-                note=note,
-                head=["language", *STATES],
-                rows=by_state,
-                plot="stacked",
-            )
-        )
-        tables.append(
-            Table(
-                key="evidence_captions",
-                title="Evidence of captions",
-                head=["language", *kinds],
-                rows=by_caption,
-                plot="stacked",
-            )
-        )
-    return tables
-
-
-def _lengths(counts: Counts) -> Table:
-    rows = []
-    for language in LANGUAGES:
-        least = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
-        for name in FIELDS[:2]:
-            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-            rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least[name]])
-    note = "Characters. The last column is the least that an answer may have."
-    return Table(
-        key="text_lengths",
-        title="Length of the texts",
-        paper="fig:coc_lengths",
-        note=note,
-        head=["text", *SPREAD[1:], "floor"],
-        rows=rows,
-    )
-
-
-def _length_bins(counts: Counts) -> list[Table]:
-    tables = []
-    for language in LANGUAGES:
-        for name in FIELDS[:2]:
-            bins = [number for own, field, number in counts.length_bins if (own, field) == (language, name)]
-            width = TEXT_BIN[language]
-            rows: list[list[Cell]] = [
-                [f"{number * width} to {number * width + width - 1}", counts.length_bins[language, name, number]]
-                for number in range(min(bins, default=0), max(bins, default=-1) + 1)
-            ]
-            if rows:
-                title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters"
-                tables.append(
-                    Table(
-                        key=f"lengths_{language}_{name}",
-                        title=title,
-                        paper="fig:coc_lengths",
-                        head=["characters", "captions"],
-                        rows=rows,
-                        plot="bars",
-                    )
-                )
-    return tables
-
-
-# --- where, when, how -------------------------------------------------------------------------------------------------
+    paper = "tab:zoom_config, sec:exp_release"
+    return Table(key="fovs", title="Fields of view", paper=paper, head=head, rows=rows, plot="bars")
 
 
 def _towns(record: ReleaseRecord, counts: Counts) -> Table:
@@ -418,92 +247,6 @@ def _splits(record: ReleaseRecord) -> Table:
     )
 
 
-def _weather(counts: Counts) -> list[Table]:
-    """Frames by preset and time of day: no table where no frame names one, and sun and air where the frames tell these."""
-    tables = []
-    named = Counter(
-        {
-            (_token(weather), _token(time)): n
-            for (weather, time), n in counts.weather.items()
-            if weather is not None or time is not None
-        }
-    )
-    if named:
-        presets = [preset for group in WEATHER.values() for preset in group]
-        presets += sorted({weather for weather, _ in named} - set(presets))
-        times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
-        rows: list[list[Cell]] = [[preset, *(named[preset, time] for time in times)] for preset in presets]
-        note = f"Frames. Presets of the paper are all listed; {len(named)} of {len(presets) * len(times)} pairs are in this release."
-        tables.append(
-            Table(
-                key="weather",
-                title="Weather and time of day",
-                paper="tab:weather_coverage",
-                note=note,
-                head=["preset", *times],
-                rows=rows,
-                plot="heat",
-            )
-        )
-    if counts.looks:
-        rows = [[look, count] for look, count in counts.looks.most_common(40)]
-        tables.append(
-            Table(
-                key="looks",
-                title="Sun and air",
-                note="Of the renderer's own settings.",
-                head=["look", "frames"],
-                rows=rows,
-            )
-        )
-    return tables
-
-
-def _token(text: str | None) -> str:
-    return "not told" if text is None else text.strip().lower().replace(" ", "_").replace("-", "_")
-
-
-def _perturbation(counts: Counts) -> list[Table]:
-    tables = []
-    total = counts.states.total()
-    if total:
-        order = ("unperturbed", "position only", "rotation only", "full")
-        rows: list[list[Cell]] = [
-            [state, counts.states[state], _percent(counts.states[state], total)] for state in order
-        ]
-        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer are perturbed than were drawn."
-        tables.append(
-            Table(
-                key="augmentation_states",
-                title="Perturbation",
-                paper="tab:augmentation_states",
-                note=note,
-                head=["state", "frames", "%"],
-                rows=rows,
-                plot="bars",
-            )
-        )
-        names = [name for name in counts.over_frames if name.endswith((", m", ", deg"))]
-        spreads = [_spread_row(name, counts.over_frames[name].spread()) for name in names]
-        tables.append(
-            Table(
-                key="offsets", title="Size of the offsets", note="Where they are not zero.", head=SPREAD, rows=spreads
-            )
-        )
-    if counts.events:
-        rows = [[track, event, outcome, count] for (track, event, outcome), count in sorted(counts.events.items())]
-        tables.append(
-            Table(
-                key="events",
-                title="What became of each perturbation",
-                paper="sec:exp_zoom",
-                head=["track", "event", "outcome", "frames"],
-                rows=rows,
-            )
-        )
-    return tables
-
-
 def _files(record: ReleaseRecord) -> Table:
     files = record.numbers.files
     frames = max(1, record.numbers.frames)
@@ -520,7 +263,7 @@ def _pixels(pixels: Pixels | None) -> list[Table]:
     depths: list[list[Cell]] = [[f"{100 * share:g} %", metres] for share, metres in pixels.percentiles_m()]
     if depths:
         seen = int(pixels.depths.sum()) + pixels.sky + pixels.invalid
-        shares = f" Sky: {_percent(pixels.sky, seen)} % of the pixels, invalid: {_percent(pixels.invalid, seen)} %."
+        shares = f" Sky: {percent(pixels.sky, seen)} % of the pixels, invalid: {percent(pixels.invalid, seen)} %."
         tables.append(
             Table(
                 key="depth",
@@ -550,17 +293,18 @@ def _pixels(pixels: Pixels | None) -> list[Table]:
     return tables
 
 
-def _absent(counts: Counts, pixels: Pixels | None) -> list[Absent]:
+def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> list[Absent]:
     """Name what the paper has and this release cannot tell."""
     absent = [
-        Absent(
-            what=f"five-ray visibility of the planner, and who was rejected below {FIVE_RAY_MEAN_MIN:.0%} of it", paper="tab:dist_stats, tab:quality_stats",
-            why="a release holds what its pictures show, not what the planner computed: see inspect.json of the runs",
-        ),
         Absent(what="the same flights at four fields of view", paper="tab:zoom_eval", why="needs rendering: each flight of a release has one field of view"),
         Absent(what="boxes of the maps, before and after simplification", paper="sec:dataset_stats", why="a release holds no map: see simplify_report.json"),
         Absent(what="verdicts of first answers", paper="fig:consistency_verdict", why="a release holds accepted captions alone: see caption_report.json"),
     ]  # fmt: skip
+    if not _five_ray(record, counts):
+        why = "no flight of this release was inspected against its map"
+        absent.append(
+            Absent(what="five-ray visibility of the planner", paper="tab:dist_stats, tab:quality_stats", why=why)
+        )
     if all(weather is None and time is None for weather, time in counts.weather):
         absent.append(
             Absent(
@@ -586,42 +330,3 @@ def _absent(counts: Counts, pixels: Pixels | None) -> list[Absent]:
             )
         )
     return absent
-
-
-# --- cells ------------------------------------------------------------------------------------------------------------
-
-
-def _pairs(front: str, counted: Iterable[tuple[str, int]]) -> list[list[Cell]]:
-    """Give a row for each name and its count."""
-    return [[front + name, count] for name, count in counted]
-
-
-def _spread_row(title: str, spread: Spread) -> list[Cell]:
-    return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
-
-
-def _mean_of(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) -> float | None:
-    """Mean over flights of a flight's mean, of those that have one."""
-    return _means(flights, of).mean
-
-
-def _means(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) -> Spread:
-    means = (of(flight).spread().mean for flight in flights)
-    return spread_of(mean for mean in means if mean is not None)
-
-
-def _mean(values: Iterable[float]) -> float | None:
-    known = list(values)
-    return round(fmean(known), 4) if known else None
-
-
-def _rounded(*values: float | None) -> list[Cell]:
-    return [None if value is None else round(value, 3) for value in values]
-
-
-def _percent(count: int, total: int) -> float | None:
-    return round(100.0 * count / total, 2) if total else None
-
-
-def _ratio(whole: int, part: int) -> float | None:
-    return round(whole / part, 2) if part else None
