@@ -1,0 +1,230 @@
+"""How fast a student of Qwen3.5's 2 B shape is trained, and in how much memory, with random weights and made-up samples.
+
+    python tests/benchmarks/bench_training.py --shape 2b --batch 16              on an accelerator
+    python tests/benchmarks/bench_training.py --shape tiny --batch 2 --steps 3   on a CPU, to see that it runs
+    python tests/benchmarks/bench_training.py --shape 2b --batch 8 --way plain   plain transformers and peft, for comparison
+    torchrun --nproc-per-node 4 tests/benchmarks/bench_training.py --shape 2b --batch 64 --micro 16
+    python tests/benchmarks/bench_training.py --shape 2b --check                 loss and gradients against plain, in float32
+
+`--way ours` takes the project's own steps: features of pictures kept, logits for a few answer tokens at a time, rows by length; pictures
+are noise in memory, so what it takes to read them is not in these figures: `cosfly distill train` on a playback tree tells that
+(`waited_share` in its log). The first steps compile kernels and are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
+from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+from distill.student.encoding import Encoded, padded
+from distill.student.features import Loaded, Picture, VisionFeatures
+from distill.student.model import Student, compute_dtype
+from distill.training.fit import make_optimizer
+from distill.training.loss import answer_loss
+from distill.training.memory import used_gb
+from distill.training.ranks import Ranks, joined
+from distill.training.settings import TrainConfig
+from distill.training.stage import add_adapter
+
+# Width, layers, heads of full attention, key-value heads, head width, linear heads (keys, values, width), MLP, tower (width, layers).
+SHAPES: dict[str, dict[str, Any]] = {
+    "2b": {"hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2, "head_dim": 256,
+           "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128, "linear_value_head_dim": 128,
+           "intermediate_size": 6144, "vocab_size": 248_320, "tower": (1024, 24, 4096), "size_px": (640, 352), "words": (660, 250)},
+    "tiny": {"hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
+             "linear_num_key_heads": 2, "linear_num_value_heads": 4, "linear_key_head_dim": 16, "linear_value_head_dim": 16,
+             "intermediate_size": 128, "vocab_size": 5000, "tower": (32, 2, 64), "size_px": (64, 64), "words": (80, 40)},
+}  # fmt: skip
+PICTURES = 5
+IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
+WARM_UP = 3
+
+
+class Words:
+    """Stands where a tokenizer stands; texts are numbers from the start."""
+
+    pad_token_id = PAD
+
+    def convert_tokens_to_ids(self, token: str) -> int:
+        return {"<|image_pad|>": IMAGE}.get(token, END)
+
+
+def make_student(shape: dict[str, Any], device: str, dtype: Any, seed: int = 0) -> Student:
+    width, depth, inner = shape["tower"]
+    head = shape["head_dim"]
+    section = head // 32  # as Qwen3.5: a quarter of a head turns, 11 + 11 + 10 of 32 pairs in the real one
+    text = {key: value for key, value in shape.items() if key not in ("tower", "size_px", "words")} | {
+        "layer_types": (["linear_attention"] * 3 + ["full_attention"]) * (shape["num_hidden_layers"] // 4),
+        "tie_word_embeddings": True, "eos_token_id": END, "pad_token_id": PAD,
+        "rope_parameters": {"rope_type": "default", "rope_theta": 1e7, "partial_rotary_factor": 0.25 if head > 16 else 0.5,
+                            "mrope_section": [11, 11, 10] if head == 256 else [head // 4 - 2 * section, section, section],
+                            "mrope_interleaved": True},
+    }  # fmt: skip
+    vision = {"depth": depth, "hidden_size": width, "intermediate_size": inner, "num_heads": max(2, width // 64),
+              "out_hidden_size": shape["hidden_size"]}  # fmt: skip
+    config = Qwen3_5Config(
+        text_config=text, vision_config=vision, image_token_id=IMAGE, video_token_id=4, vision_start_token_id=5, vision_end_token_id=6,
+        tie_word_embeddings=True,
+    )  # fmt: skip
+    torch.manual_seed(seed)
+    with torch.device(device):
+        model = Qwen3_5ForConditionalGeneration(config).to(dtype)
+    images = Qwen2VLImageProcessorPil(
+        patch_size=16, merge_size=2, temporal_patch_size=2, size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}
+    )
+    return Student(Words(), images, model, device, dtype)
+
+
+def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[Encoded, list[Picture]]]:
+    """Samples whose lengths differ by a few per cent, as captions' do; a frame stands in five windows."""
+    rng, (width_px, height_px) = np.random.default_rng(seed), shape["size_px"]
+    grid = (1, height_px // 16, width_px // 16)
+    rows = []
+    for number in range(count):
+        prompt, answer = (int(length * rng.uniform(0.9, 1.1)) for length in shape["words"])
+        ids: list[int] = []
+        for _ in range(PICTURES):
+            ids += [5, *[IMAGE] * (grid[1] * grid[2] // 4), 6]
+        ids += rng.integers(FIRST_WORD, shape["vocab_size"], prompt).tolist()
+        answers = rng.integers(FIRST_WORD, shape["vocab_size"], answer)
+        encoded = Encoded(
+            str(number),
+            np.array(ids, np.int64),
+            np.append(answers, END),
+            None,
+            np.array([grid] * PICTURES, np.int64),
+            1.0,
+        )
+        rows.append(
+            (
+                encoded,
+                [
+                    Picture("run", str(seed * count + number + i), "rgb", shape["size_px"], 100.0)
+                    for i in range(PICTURES)
+                ],
+            )
+        )
+    return rows
+
+
+def noise_of(picture: Picture, dtype: Any) -> Loaded:
+    width_px, height_px = picture.size_px
+    values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
+    return Loaded(picture, picture.frame, patches=torch.from_numpy(values).to(dtype))
+
+
+def plain_loss(student: Student, rows: list[Encoded], patches: Any) -> Any:
+    """What plain transformers does: every token's logits, the tower in every step, a padding mask."""
+    ids, labels, _ = padded(student, rows)
+    mask = np.zeros_like(ids)
+    for i, row in enumerate(rows):
+        mask[i, : len(row)] = 1
+    arrays = {
+        "input_ids": ids, "labels": labels, "attention_mask": mask, "mm_token_type_ids": (ids == IMAGE).astype(np.int64),
+        "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
+    }  # fmt: skip
+    inputs = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
+    count = sum(len(row.answer_ids) for row in rows)
+    return student.model(**inputs, pixel_values=patches.to(student.device), use_cache=False).loss * count
+
+
+def backward(student: Student, way: str, rows: list, features: VisionFeatures, cfg: TrainConfig) -> float:
+    """Compute loss and gradients of a micro-batch."""
+    encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
+    if way == "plain":
+        with student.computing():
+            loss = plain_loss(student, encoded, torch.cat([noise_of(p, student.dtype).patches for p in pictures]))
+    else:
+        plan = features.plan()
+        features.take([noise_of(picture, student.dtype) for picture in features.wanted(plan, pictures)])
+        loss, _ = answer_loss(student, encoded, features.of(pictures), cfg.logit_chunk)
+    loss.backward()
+    features.end_step()
+    return float(loss.detach())
+
+
+def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
+    shape, dtype = SHAPES[arguments.shape], compute_dtype(arguments.dtype, ranks.device)
+    cfg = TrainConfig(
+        batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch, logit_chunk=arguments.chunk,
+        gradient_checkpointing=arguments.checkpointing,
+    )  # fmt: skip
+    student = add_adapter(make_student(shape, ranks.device, dtype), cfg, 0)
+    if cfg.gradient_checkpointing:
+        student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+    student.model.train()
+    optimizer, parameters = make_optimizer(student, cfg), [p for p in student.model.parameters() if p.requires_grad]
+    features = VisionFeatures(student, memory_bytes=int(64e9))
+    seconds, tokens = 0.0, 0
+    for step in range(WARM_UP + arguments.steps):
+        rows = make_rows(shape, arguments.batch, 0 if arguments.same else step)
+        rows = sorted(rows, key=lambda row: -len(row[0]))[ranks.rank :: ranks.size]
+        ranks.wait_for_all()
+        begun_s = time.perf_counter()
+        for start in range(0, len(rows), cfg.batch_size):
+            backward(student, arguments.way, rows[start : start + cfg.batch_size], features, cfg)
+        ranks.add_gradients(parameters)
+        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        if ranks.device == "cuda":
+            torch.cuda.synchronize()
+        if step >= WARM_UP:
+            seconds += time.perf_counter() - begun_s
+            tokens += sum(len(row) for row, _ in rows)
+    (all_tokens,) = ranks.total([float(tokens)])
+    return {
+        "way": arguments.way, "shape": arguments.shape, "parameters": sum(p.numel() for p in student.model.parameters()),
+        "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size, "dtype": str(dtype),
+        "step_s": round(seconds / arguments.steps, 4), "tokens_per_s": round(all_tokens / seconds, 1),
+        "memory_gb": round(used_gb(ranks.device), 2), "pictures_looked_at": features.num_encoded,
+    }  # fmt: skip
+
+
+def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
+    """Hold our loss and gradients against plain transformers, in float32 on the same weights and samples."""
+    cfg = TrainConfig(logit_chunk=arguments.chunk)
+    student = add_adapter(make_student(SHAPES[arguments.shape], ranks.device, torch.float32), cfg, 0)
+    with torch.no_grad():
+        for name, parameter in student.model.named_parameters():
+            if "lora_B" in name:
+                parameter.normal_(0, 0.02)
+    rows, losses, gradients = make_rows(SHAPES[arguments.shape], 2, 0), [], []
+    for way in ("plain", "ours"):
+        losses.append(backward(student, way, rows, VisionFeatures(student), cfg))
+        gradients.append(torch.cat([p.grad.reshape(-1) for p in student.model.parameters() if p.grad is not None]))
+        student.model.zero_grad(set_to_none=True)
+    difference = (gradients[0] - gradients[1]).norm() / gradients[0].norm()
+    return {"loss_plain": losses[0], "loss_ours": losses[1], "relative_difference_of_gradients": float(difference)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shape", choices=SHAPES, default="tiny")
+    parser.add_argument("--way", choices=("ours", "plain"), default="ours")
+    parser.add_argument("--batch", type=int, default=4, help="samples of a step, over all processes")
+    parser.add_argument("--micro", type=int, default=0, help="samples of a forward pass; 0: all of the step")
+    parser.add_argument("--chunk", type=int, default=512, help="answer tokens whose logits exist at a time")
+    parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
+    parser.add_argument("--checkpointing", action="store_true")
+    parser.add_argument(
+        "--same", action="store_true", help="the same samples in every step: all features are kept from the first on"
+    )
+    parser.add_argument("--check", action="store_true")
+    arguments = parser.parse_args()
+    with joined("auto") as ranks:
+        found = (check if arguments.check else measure)(arguments, ranks)
+        if ranks.is_first:
+            print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
