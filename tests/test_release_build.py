@@ -1,0 +1,475 @@
+"""Building a release: what goes together, what is refused, what a kill and a mended flight leave, and what its readers get."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from specimens_foreign import write_foreign_tree
+from test_release_package import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
+
+from caption.run import stage as caption_stage
+from caption.schema import CaptionConfig
+from cosfly.errors import ConfigError, InputError, NothingKept, VerifyError
+from cosfly.products.captions import read_captions, write_captions
+from cosfly.products.frames import depth_bytes, read_depth
+from cosfly.products.inspection import write_inspection
+from cosfly.products.playback import Flight, find_flights, read_flight, write_flight
+from release.package.depth import encoded
+from release.package.publishable import published, published_name
+from release.package.sources import Source
+from release.package.stage import ReleaseConfig, run
+from release.record import ReleaseRecord, read_record
+from specimens import make_playback_tree
+
+POINTS = 14
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory) -> Path:
+    """tree/ of eight walks in four towns, each clean and perturbed, with captions and an inspection that accepts all."""
+    root = tmp_path_factory.mktemp("material")
+    towns = ("Town01", "Town02", "Town02_Opt", "Town03")
+    tree = make_playback_tree(root / "tree", 8, POINTS, width_px=48, height_px=27, towns=towns)
+    captions = [
+        make_caption(flight, i) for flight in map(read_flight, find_flights(tree)) for i in range(4, POINTS - 1)
+    ]
+    write_captions(root / "captions.jsonl", captions)
+    write_inspection(root / "inspect.json", make_inspection(tree, {}))
+    return root
+
+
+@pytest.fixture
+def copy(material, tmp_path) -> Path:
+    """A copy that may be changed."""
+    return shutil.copytree(material, tmp_path / "material")
+
+
+def split_cfg(**changes) -> ReleaseConfig:
+    changes = {"validation_fraction": 0.25, "test_fraction": 0.25, "num_frames": 8} | changes
+    return ReleaseConfig(**{**FREE, "pairs": "both", "shard_mb": 1, "row_group_mb": 1, **changes})
+
+
+def record_of(material: Path, out: Path, cfg: ReleaseConfig | None = None) -> ReleaseRecord:
+    return read_record(run(cfg or split_cfg(), [source_of(material)], out) / "release.json")
+
+
+def table_of(folder: Path, columns: list[str]) -> list[dict]:
+    record = read_record(folder / "release.json")
+    return [row for shard in record.shards for row in pq.read_table(folder / shard.path, columns=columns).to_pylist()]
+
+
+# --- what goes together -----------------------------------------------------------------------------------------------
+
+
+def test_splits_share_no_walk_and_no_twins(material, tmp_path):
+    record = record_of(material, tmp_path / "r")
+    assert {name: len(split.walks) for name, split in record.splits.splits.items()} == {
+        "train": 4, "validation": 2, "test": 2,
+    }  # fmt: skip
+    walks = [walk for split in record.splits.splits.values() for walk in split.walks]
+    assert len(walks) == len(set(walks)) == 8
+    by_name = {flight.flight: flight for flight in record.flights}
+    for flight in record.flights:
+        twin = by_name[flight.pair or ""]
+        assert (twin.pair, twin.split, twin.walk) == (flight.flight, flight.split, flight.walk)
+    rows = table_of(tmp_path / "r/dataset", ["run", "town", "trajectory", "variant", "split", "walk", "pair"])
+    for row in rows:
+        entry = by_name["/".join(row[name] for name in ("run", "town", "trajectory", "variant"))]
+        assert (row["split"], row["walk"], row["pair"]) == (entry.split, entry.walk, entry.pair)
+    for shard in record.shards:
+        assert f"data/{shard.split}-{record.content_digest[:12]}-" in shard.path
+
+
+def test_splits_by_town_keep_the_builds_of_a_town_together(material, tmp_path):
+    record = record_of(material, tmp_path / "r", split_cfg(split_by="town"))
+    towns = [{town.removesuffix("_Opt") for town in split.towns} for split in record.splits.splits.values()]
+    assert sum(map(len, towns)) == len(set.union(*towns)) == 3
+
+
+def test_a_tiny_release_has_as_many_splits_as_walks(material, tmp_path):
+    for count, names in ((1, ["train"]), (2, ["train", "validation"]), (3, ["train", "validation", "test"])):
+        root = tmp_path / str(count)
+        shutil.copytree(material, root)
+        for folder in sorted((root / "tree").glob("*/*"))[count:]:
+            shutil.rmtree(folder)
+        write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+        kept = {folder.parent.name for folder in find_flights(root / "tree")}
+        write_captions(
+            root / "captions.jsonl", [c for c in read_captions(root / "captions.jsonl") if c.trajectory in kept]
+        )
+        assert list(record_of(root, tmp_path / f"r{count}", split_cfg()).splits.splits) == names
+
+
+def test_neither_twin_goes_without_the_other_unless_asked(material, copy, tmp_path):
+    names = [folder.relative_to(copy / "tree").as_posix() for folder in find_flights(copy / "tree")]
+    write_inspection(copy / "inspect.json", make_inspection(copy / "tree", {names[0]: ("rejected", "jerk")}))
+    record = record_of(copy, tmp_path / "both")
+    assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: jerk": 1}
+    assert len(record.flights) == 14
+    alone = record_of(copy, tmp_path / "any", split_cfg(pairs="any"))
+    assert len(alone.flights) == 15
+    assert [flight.pair for flight in alone.flights].count(None) == 1
+    clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
+    assert len(clean.flights) == 7
+    assert {flight.pair for flight in clean.flights} == {None}
+
+
+def test_every_released_caption_has_its_whole_window(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
+    captions = [make_caption(f, i) for f in map(read_flight, find_flights(tree)) for i in range(4, 90)]
+    write_captions(tmp_path / "captions.jsonl", captions)
+    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
+    folder = run(split_cfg(num_frames=60), [source_of(tmp_path)], tmp_path / "r")
+    rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
+    for variant in ("ORI", "aug_001"):
+        own = [row for row in rows if row["variant"] == variant]
+        frames = {row["frame_index"] for row in own}
+        assert len(frames) == 60
+        assert sum(b - a > 1 for a, b in pairwise(sorted(frames))) == 1  # two runs of thirty
+        released = [row for row in own if row["has_caption"]]
+        assert all(set(row["caption_window"]) <= frames for row in released)
+        assert len(released) >= 0.8 * len([index for index in frames if 4 <= index < 90])
+    everything = run(split_cfg(num_frames=None), [source_of(tmp_path)], tmp_path / "all")
+    assert read_record(everything / "release.json").history.captions.released == 2 * 86
+
+
+def test_a_public_tree_without_an_inspection_is_released(tmp_path):
+    tree = write_foreign_tree(tmp_path / "tree", num_points=13)
+    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
+    cfg = ReleaseConfig(licence="cc-by-4.0", num_frames=None)
+    record = read_record(run(cfg, [Source("theirs", tree, captions)], tmp_path / "r") / "release.json")
+    assert (record.history.flights.found, record.history.flights.inspected) == (2, 0)
+    assert record.history.trajectories is None
+    assert record.provenance.sources[0].inspect_sha256 is None
+    assert record.history.captions.released > 0
+
+
+# --- what a row and the record hold -----------------------------------------------------------------------------------
+
+
+def test_rows_hold_prompts_and_the_state_of_each_sentence(material, tmp_path):
+    run(split_cfg(), [source_of(material)], tmp_path / "r")
+    names = ["has_caption", "frame_index", "system_en", "prompt_zh", "sentence_states_en", "sentence_states_zh"]
+    counts = ["proved_sentences_en", "contradicted_sentences_en", "unread_sentences_en", "proved_sentences_zh"]
+    for row in table_of(tmp_path / "r/dataset", names + counts):
+        if not row["has_caption"]:
+            assert all(row[name] is None for name in names[2:] + counts)
+            continue
+        assert (row["system_en"], row["prompt_zh"]) == ("s", "u")
+        if row["frame_index"] % 2:
+            assert row["sentence_states_en"] == ["proved", "unread", "proved", "proved"]
+            assert [row[name] for name in counts] == [3, 0, 1, None]
+        assert row["sentence_states_zh"] is None
+
+
+def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(material, copy, tmp_path):
+    def local(lines):
+        for line in lines:
+            line["teacher"].update(model="/home/somebody/models/teacher-7", kind="endpoint")
+            line["usage"] = {"prompt_tokens": 100, "completion_tokens": 10}
+
+    rewrite_captions(copy, local)
+    run(split_cfg(), [source_of(copy)], tmp_path / "r")
+    record = read_record(tmp_path / "r/dataset/release.json")
+    origin = record.provenance
+    assert [(one.kind, one.model) for one in origin.teachers] == [("endpoint", "teacher-7")]
+    assert origin.tokens == {"completion_tokens": 10 * 16 * 9, "prompt_tokens": 100 * 16 * 9}
+    assert origin.repairs.accepted == 16 * 9
+    assert {"cosfly", "pyarrow"} <= origin.versions.keys()
+    for data in all_bytes(tmp_path / "r/dataset").values():
+        assert b"/home/somebody" not in data
+        assert str(tmp_path).encode() not in data
+    assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
+
+
+@pytest.mark.parametrize(
+    ("text", "public"),
+    [
+        ("/data/models/Qwen", "Qwen"), ("vllm:/data/models/Qwen", "vllm:Qwen"), ("Qwen/Qwen3.5-2B", "Qwen/Qwen3.5-2B"),
+        ("http://10.0.0.3:8000/v1", "an address"), ("C:\\Users\\me\\map.json", "map.json"), ("~/maps/town", "town"),
+        ("/home/John Doe/my map", "my map"), ("../up/map.json", "map.json"), ("a/b/c", "c"), ("base+/a/b", "base+b"),
+        ("and/or", "and/or"), ("rules-5", "rules-5"), ("/", "a path"),
+    ],
+)  # fmt: skip
+def test_published_names(text, public):
+    assert published_name(text) == public
+    assert published({"x": [text, 1, None]}) == {"x": [public, 1, None]}
+
+
+@pytest.mark.parametrize(("coding", "most_m"), [("float16", 0.02), ("millimetre_png", 0.00051)])
+def test_coded_depth_says_its_range_and_its_measured_error(coding, most_m):
+    values = np.full((9, 16), 1000.0, np.float32)
+    values[:5] = np.linspace(0.3, 60.0, 80, dtype=np.float32).reshape(5, 16)
+    values[7] = 0.0
+    data, cost = encoded(memoryview(depth_bytes(values)), coding, Path("x"))
+    assert cost.min_m == pytest.approx(0.3)
+    assert cost.max_m == pytest.approx(60.0)
+    assert 0 < cost.max_error_m <= most_m
+    assert len(data) < values.nbytes
+
+
+def test_depth_is_lossless_unless_asked_and_millimetres_end_at_65_5_m(material, tmp_path):
+    folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
+    row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
+    flight = read_flight(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
+    assert row["depth"] == depth_bytes(read_depth(flight.frame_folder(row["frame_index"])))
+    with pytest.raises(InputError, match=r"depth that a PNG of millimetres cannot hold.*at most 65\.5 m"):
+        run(split_cfg(depth="millimetre_png"), [source_of(material)], tmp_path / "mm")
+    record = record_of(material, tmp_path / "half", split_cfg(depth="float16"))
+    assert record.depth is not None
+    assert (record.depth.coding, record.depth.unit) == ("float16", "metre")
+    assert 0 < record.depth.max_error_m < 0.3
+
+
+# --- what is refused, with all that is wrong --------------------------------------------------------------------------
+
+
+def first_flight(root: Path) -> Path:
+    return find_flights(root / "tree")[0]
+
+
+def change_json(path: Path, change) -> None:
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def cut(path: Path, num_bytes: int) -> None:
+    path.write_bytes(path.read_bytes()[:-num_bytes])
+
+
+def other_size(root: Path) -> None:
+    """One trajectory of a tree of another size in the place of the first."""
+    other = make_playback_tree(root / "other", 1, POINTS, width_px=64, height_px=36)
+    for variant in ("ORI", "aug_001"):
+        target = first_flight(root).parent / variant
+        shutil.rmtree(target)
+        shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
+
+
+def captions_of(change):
+    return lambda root: rewrite_captions(root, change)
+
+
+def not_finite(root: Path) -> None:
+    path = first_flight(root) / "trajectory.json"
+    text = path.read_text()
+    number = json.dumps(json.loads(text)["points"][3]["drone_pose"]["x"])
+    path.write_text(text.replace(number, "1e999", 1))
+
+
+DAMAGES = {
+    "depth cut by 100 bytes": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/depth.npy", 100), "depth.npy"),
+    "a picture cut short": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/rgb.png", 20), "rgb.png"),
+    "a frame that is missing": (lambda r: shutil.rmtree(first_flight(r) / "frames_playback/frame_00005"), "frames are missing"),
+    "a picture that is missing": (lambda r: (first_flight(r) / "frames_playback/frame_00005/instance.png").unlink(), "missing or empty"),
+    "1e999 in a trajectory": (not_finite, "not finite"),
+    "1e999 in an annotation": (
+        lambda r: (p := first_flight(r) / "frames_playback/frame_00005/meta.json").write_text(p.read_text().replace('"time_s": 2.5', '"time_s": 1e999')),
+        "not finite",
+    ),
+    "pictures of two sizes": (other_size, "more than one size of pictures"),
+    "another version": (lambda r: change_json(first_flight(r) / "trajectory.json", lambda v: v.update(schema_version="8.0.0")), "schema_version"),
+    "a caption of no frame": (captions_of(lambda lines: lines[0].update(frame_index=99, sample_id=lines[0]["sample_id"][:-5] + "00099", window=[99])), "belongs to no frame"),
+    "a caption of no flight": (captions_of(lambda lines: lines[0].update(trajectory="trajectory_1", sample_id="trajectory_1_ORI_frame_00004")), "a flight that is not there"),
+    "an id of another frame": (captions_of(lambda lines: lines[0].update(sample_id=lines[1]["sample_id"])), "not that of its frame"),
+    "two captions of a frame": (captions_of(lambda lines: lines.append(lines[0])), "two accepted captions"),
+    "a window in the future": (captions_of(lambda lines: lines[0].update(window=[1, 2, 3, 4, 5])), "not the window"),
+    "a future that has begun": (captions_of(lambda lines: lines[0].update(future=[4])), "has begun"),
+    "a label of no action": (captions_of(lambda lines: lines[0].update(label="land")), "closed set"),
+    "consistent with another": (captions_of(lambda lines: lines[0].update(label="hover", verdict="CONSISTENT")), "consistent with another label"),
+    "captions of another version": (captions_of(lambda lines: lines[0].update(schema_version="1.0")), "another version"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_material_that_cannot_be_released_is_refused_by_name(copy, tmp_path, damage):
+    break_it, word = DAMAGES[damage]
+    break_it(copy)
+    with pytest.raises((InputError, VerifyError), match=word):
+        run(split_cfg(), [source_of(copy)], tmp_path / "r")
+    assert not (tmp_path / "r/dataset").exists()
+    assert not (tmp_path / "r/manifest.json").exists()
+
+
+def test_all_that_is_wrong_is_listed(copy, tmp_path):
+    for folder in find_flights(copy / "tree")[:3]:
+        (folder / "frames_playback/frame_00005/rgb.png").unlink()
+    rewrite_captions(copy, lambda lines: None)
+    with pytest.raises(InputError, match="nothing is released: 3 things are wrong") as caught:
+        run(split_cfg(), [source_of(copy)], tmp_path / "r")
+    assert str(caught.value).count("rgb.png: a frame's file is missing") == 3
+    assert len((tmp_path / "r/failures.jsonl").read_text().splitlines()) == 3
+
+
+def test_captions_that_nothing_binds_to_the_tree_are_refused(material, tmp_path):
+    with pytest.raises(InputError, match=r"no record says of which tree.*release\.unbound=accept"):
+        run(split_cfg(unbound="refuse"), [source_of(material)], tmp_path / "r")
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(material, tmp_path):
+    (tmp_path / "r/dataset").mkdir(parents=True)
+    (tmp_path / "r/dataset/README.md").write_text("mine")
+    with pytest.raises(Exception, match="not cosfly's"):
+        run(split_cfg(), [source_of(material)], tmp_path / "r")
+    record_of(material, tmp_path / "one")
+    with pytest.raises(Exception, match="other settings"):
+        record_of(material, tmp_path / "one", split_cfg(num_frames=6))
+    assert (tmp_path / "r/dataset/README.md").read_text() == "mine"
+    assert (tmp_path / "one/dataset/release.json").is_file()
+
+
+def test_splits_of_nothing_are_refused():
+    with pytest.raises(ValueError, match="nothing is left to train on"):
+        ReleaseConfig(validation_fraction=0.5, test_fraction=0.5)
+
+
+# --- kills, and a second run ------------------------------------------------------------------------------------------
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_release_build import split_cfg, source_of
+from release.package import stage
+stage.MB = 20_000  # many shards
+from release.package.stage import run
+run(split_cfg(), [source_of(Path({material!r}))], Path({out!r}), workers={workers})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("has_failed_flight", [False, True])
+def test_ten_kills_leave_the_bytes_of_an_undisturbed_run(copy, tmp_path, monkeypatch, has_failed_flight):
+    from release.package import stage as package
+
+    monkeypatch.setattr(package, "MB", 20_000)
+    whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
+    assert len(read_record(whole / "release.json").shards) > 6
+    picture = find_flights(copy / "tree")[9] / "frames_playback/frame_00005/rgb.png"
+    data = picture.read_bytes()
+    if has_failed_flight:
+        picture.write_bytes(data[:-30])
+    out = tmp_path / "killed"
+    tests = str(Path(__file__).parent)
+    script = KILLED.format(tests=tests, material=str(copy), out=str(out), workers=2)
+    started_s = time.monotonic()
+    subprocess.run(
+        [sys.executable, "-c", script.replace(repr(str(out)), repr(str(tmp_path / "timed")))],
+        capture_output=True,
+        check=False,
+    )
+    typical_s = time.monotonic() - started_s
+    rng = np.random.default_rng(7)
+    for share in np.sort(rng.uniform(0.3, 1.0, 10)):
+        process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL, start_new_session=True)
+        time.sleep(share * typical_s)
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        assert has_failed_flight <= (not (out / "dataset").exists())
+    picture.write_bytes(data)
+    assert all_bytes(run(split_cfg(), [source_of(copy)], out)) == all_bytes(whole)
+
+
+def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_path, monkeypatch):
+    from release.package import stage as package
+
+    monkeypatch.setattr(package, "MB", 20_000)
+    whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
+    picture = find_flights(copy / "tree")[0] / "frames_playback/frame_00005/rgb.png"
+    data = picture.read_bytes()
+    picture.write_bytes(data[:-30])
+    with pytest.raises(InputError, match="nothing is released"):
+        run(split_cfg(), [source_of(copy)], tmp_path / "r")
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "r/parts").iterdir()}
+    assert before
+    picture.write_bytes(data)
+    kept: dict[str, int] = {}
+    real = package.name_shards
+
+    def look(planned, written, parts, folder):
+        kept.update({path.name: path.stat().st_mtime_ns for path in parts.iterdir()})
+        return real(planned, written, parts, folder)
+
+    monkeypatch.setattr(package, "name_shards", look)
+    assert all_bytes(run(split_cfg(), [source_of(copy)], tmp_path / "r")) == all_bytes(whole)
+    assert sum(kept.get(name) == time_ns for name, time_ns in before.items()) >= len(before) - 1
+
+
+# --- its readers ------------------------------------------------------------------------------------------------------
+
+
+def test_two_releases_opened_one_after_another_give_each_its_own_rows(material, copy, tmp_path):
+    """The library's cache goes by the name of the folder and the card's pattern: a digest in these tells releases apart."""
+    datasets = pytest.importorskip("datasets")
+    flight = read_flight(first_flight(copy))
+    write_flight(first_flight(copy), shifted(flight))
+    place, found = tmp_path / "dataset", []
+    for root in (material, copy):
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(run(split_cfg(), [source_of(root)], tmp_path / f"r{len(found)}"), place)
+        parts = datasets.load_dataset(str(place), cache_dir=str(tmp_path / "cache"))
+        assert sorted(parts) == ["test", "train", "validation"]
+        rows = [row for name in parts for row in parts[name].remove_columns(["image", "instance", "depth"])]
+        truth = table_of(place, ["sample_id", "time_s"])
+        assert {row["sample_id"]: row["time_s"] for row in rows} == {row["sample_id"]: row["time_s"] for row in truth}
+        found.append(sorted((row["sample_id"], row["time_s"]) for row in rows))
+    assert found[0] != found[1]
+
+
+def shifted(flight: Flight) -> Flight:
+    return replace(flight, time_s=flight.time_s + 0.25)
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_every_split_streams(material, tmp_path, split):
+    datasets = pytest.importorskip("datasets")
+    folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
+    rows = datasets.load_dataset(str(folder), split=split, streaming=True, cache_dir=str(tmp_path / "cache"))
+    own = read_record(folder / "release.json").splits.splits[split]  # type: ignore[index]
+    seen = list(rows)
+    assert len(seen) == own.frames
+    assert {row["walk"] for row in seen} == set(own.walks)
+    assert np.asarray(seen[0]["image"]).shape == (27, 48, 3)
+
+
+def test_shards_have_a_page_index_and_small_pages(material, tmp_path):
+    folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
+    for shard in read_record(folder / "release.json").shards:
+        group = pq.ParquetFile(folder / shard.path).metadata.row_group(0)
+        assert all(group.column(k).has_offset_index for k in range(group.num_columns))
+        by_path = {group.column(k).path_in_schema: group.column(k) for k in range(group.num_columns)}
+        assert by_path["image.bytes"].compression == "UNCOMPRESSED"
+        assert by_path["frame_index"].has_column_index
+
+
+def test_a_second_run_of_another_order_of_workers_gives_the_same(material, tmp_path):
+    one, two = (run(split_cfg(), [source_of(material)], tmp_path / str(n), workers=n) for n in (1, 2))
+    assert all_bytes(one) == all_bytes(two)
+
+
+def test_maps_of_unknown_licence_are_refused_before_the_work(material, tmp_path):
+    with pytest.raises(ConfigError, match="licence"):
+        run(split_cfg(licence=None), [source_of(material)], tmp_path / "r")
+    assert not (tmp_path / "r/parts").exists()
+
+
+def test_an_inspection_that_accepts_nothing_is_one_clear_error(copy, tmp_path):
+    names = [folder.relative_to(copy / "tree").as_posix() for folder in find_flights(copy / "tree")]
+    one_of_each = {name: ("rejected", "jerk") for name in names if name.endswith("ORI")}
+    write_inspection(copy / "inspect.json", make_inspection(copy / "tree", one_of_each))
+    with pytest.raises(NothingKept, match="release kept nothing"):
+        run(split_cfg(tracks=("clean",)), [source_of(copy)], tmp_path / "r")
