@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from cosfly.products.playback import find_flights, read_flight
 from cosfly.reading.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record
+from release.stats import stats
 from release.viewer.choosing import PATH_POINTS, boxes_of, choose_flights, choose_frames, path_of, spread
 from release.viewer.of_release import VIEW_OF, picture
 from release.viewer.page import page_html, run
@@ -127,7 +129,8 @@ def test_each_verdict_is_among_the_frames_while_there_is_room(num, captioned, mo
     chosen = choose_frames(frames, kinds, most)
     assert chosen == sorted(set(chosen))
     assert set(chosen) <= set(frames)
-    assert len(chosen) == min(most, len(kinds) or num)
+    assert len(chosen) == min(most, num)
+    assert len(set(chosen) & set(kinds)) == min(most, len(kinds))
     if most >= 6:
         assert {kinds[frame] for frame in chosen if frame in kinds} == set(kinds.values())
 
@@ -227,6 +230,24 @@ def test_a_release_is_shown_as_its_rows_say(dataset, tmp_path):
     two = data_of(run(dataset, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
     assert len(two["flights"]) <= 2
     assert any("flights are shown" in note for note in two["notes"])
+
+
+def test_a_snapshot_in_the_hubs_cache_is_shown(dataset, tmp_path):
+    """Its files are links to blobs beside it."""
+    snapshot, blobs = tmp_path / "datasets--a--b/snapshots/c0ffee", tmp_path / "datasets--a--b/blobs"
+    blobs.mkdir(parents=True)
+    for number, path in enumerate(path for path in sorted(dataset.rglob("*")) if path.is_file()):
+        (blobs / str(number)).write_bytes(path.read_bytes())
+        link = snapshot / path.relative_to(dataset)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
+    direct, linked = (
+        run(place, tmp_path / name, ViewerConfig(frames=2))
+        for place, name in ((dataset, "a.html"), (snapshot, "b.html"))
+    )
+    assert direct.read_bytes() == linked.read_bytes()
+    direct, linked = (stats.run(place, tmp_path / name, pixels=3) for place, name in ((dataset, "a"), (snapshot, "b")))
+    assert direct.read_bytes() == linked.read_bytes()
 
 
 def test_pictures_of_a_release_look_like_those_of_its_tree(dataset):

@@ -67,7 +67,8 @@ def _plain(table: Table) -> str:
 def _bar(table: Table, row: list[Cell], top: float) -> str:
     if table.plot == "bars":
         value = float(row[1]) if isinstance(row[1], int | float) else 0.0
-        return f'<td class="bar"><i style="width:{100 * value / top if top else 0:.1f}%"></i></td>'
+        bar = f'<i style="width:{100 * value / top:.1f}%"></i>' if value else ""
+        return f'<td class="bar">{bar}</td>'
     if table.plot == "stacked":
         values = [float(cell) for cell in row[1:] if isinstance(cell, int | float)]
         total = sum(values) or 1.0

@@ -45,15 +45,16 @@ def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: in
     Args:
         frames: all, ascending. kinds: of those with a caption what it says, such as (verdict, decision).
     Returns:
-        first one of each kind, until half of them; the rest evenly of those with captions, or of all where none has one.
+        first one of each kind, until half of them; then evenly of those with captions, then of the others.
     """
     firsts: dict[Hashable, int] = {}
     for frame in frames:
         if frame in kinds:
             firsts.setdefault(kinds[frame], frame)
     chosen = set(list(firsts.values())[: max(1, most // 2)])
-    others = [frame for frame in frames if frame not in chosen and (not kinds or frame in kinds)]
-    chosen |= {others[k] for k in spread(len(others), most - len(chosen))}
+    for wanted in (kinds, set(frames) - set(kinds)):
+        others = [frame for frame in frames if frame not in chosen and frame in wanted]
+        chosen |= {others[k] for k in spread(len(others), most - len(chosen))}
     return sorted(chosen)
 
 
