@@ -42,6 +42,24 @@ class Course:
     time_s: np.ndarray
     target_m: np.ndarray
 
+    def at_seconds(self) -> Course:
+        """Give the course at the full seconds that it knows, at most MOST_GAP_S between points apart: all that walks are told by."""
+        known = ~np.isnan(self.target_m[:, :2]).any(axis=1)
+        time_s, places_m = self.time_s[known], self.target_m[known]
+        begun = np.floor(time_s + ON_TIME_S)
+        seconds = np.unique(
+            begun[:, None] + np.arange(MOST_GAP_S + 1)
+        )  # those of the points and of the gaps behind them
+        before = np.searchsorted(time_s, seconds + ON_TIME_S, side="right") - 1
+        after = np.searchsorted(time_s, seconds - ON_TIME_S)
+        inside = (before >= 0) & (after < len(time_s))
+        seconds, before, after = seconds[inside], before[inside], after[inside]
+        seconds = seconds[time_s[after] - time_s[before] <= MOST_GAP_S]
+        found = np.empty((len(seconds), 3))
+        for axis in range(3) if len(seconds) else ():
+            found[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
+        return Course(self.name, self.town, seconds, found)
+
 
 def town_family(town: str) -> str:
     """Give the name that a town has in all of its builds: `Town03` and `Town03_Opt` are one map."""
@@ -75,7 +93,7 @@ def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     know and FEW_S at least, or in all of them; and all that are so joined one by one. A walk is called by the first of its names in the alphabet, so neither
     the order of the courses nor their number of flights matters.
     """
-    tracks = sorted((_at_seconds(course) for course in courses), key=lambda track: (track.name, track.key))
+    tracks = sorted((_track(course) for course in courses), key=lambda track: (track.name, track.key))
     groups = _Groups(track.name for track in tracks)
     once: dict[tuple[str, bytes, bytes], _Track] = {}
     for track in tracks:
@@ -106,20 +124,9 @@ class _Groups:
         self.first[second] = first
 
 
-def _at_seconds(course: Course) -> _Track:
-    known = ~np.isnan(course.target_m[:, :2]).any(axis=1)
-    time_s, places_m = course.time_s[known], course.target_m[known, :2]
-    begun = np.floor(time_s + ON_TIME_S)
-    seconds = np.unique(begun[:, None] + np.arange(MOST_GAP_S + 1))  # those of the points and of the gaps behind them
-    before = np.searchsorted(time_s, seconds + ON_TIME_S, side="right") - 1
-    after = np.searchsorted(time_s, seconds - ON_TIME_S)
-    inside = (before >= 0) & (after < len(time_s))
-    seconds, before, after = seconds[inside], before[inside], after[inside]
-    seconds = seconds[time_s[after] - time_s[before] <= MOST_GAP_S]
-    found = np.column_stack(
-        [np.interp(seconds, time_s, places_m[:, axis]) for axis in (0, 1)] if len(time_s) else [[], []]
-    )
-    return _Track(course.name, town_family(course.town), seconds, found)
+def _track(course: Course) -> _Track:
+    told = course.at_seconds()
+    return _Track(told.name, town_family(told.town), told.time_s, told.target_m[:, :2])
 
 
 def _near_pairs(tracks: list[_Track]) -> list[tuple[str, str]]:

@@ -72,6 +72,8 @@ from cosfly.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.store import CHECKSUMS, write_checksums, write_json
 from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.evaluation import stage as evaluate
+from distill.evaluation.measure import read_report
+from distill.evaluation.scores import read_scores
 from distill.inference.outcome import make_prediction
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
@@ -247,6 +249,12 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
     samples = list(open_split(root / "train", "val"))
     lines = [make_prediction(sample, "val", sample.answer, 20, True).model_dump_json() for sample in samples]
     (root / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    evaluate.run(
+        evaluate.EvaluateConfig(resamples=100, examples=2),
+        root / "predictions.jsonl",
+        root / "train",
+        root / "evaluation",
+    )
     step = root / "checkpoints/step_000002"
     step.mkdir(parents=True)
     write_json(step / "state.json", {"schema": "cosfly.checkpoint", "schema_version": "1.0", "step": 2})
@@ -517,6 +525,8 @@ READERS: dict[str, Reader] = {
         (f"answers/{journal_name('flight')}", f"answers/{journal_name('closed')}"),
         lambda root, _: AnswerBook(root / "answers").latency_s("flight", "s"),
     ),
+    "evaluation's scores": _one("evaluation/scores.parquet", read_scores),
+    "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
     "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
     "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
     "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated, hashes=True),

@@ -9,6 +9,9 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
@@ -16,9 +19,11 @@ from specimens_distill import make_caption, make_captions, prepared
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.captions import parse_answer, write_captions
 from cosfly.splits import SPLITS
+from distill.prepare import stage
 from distill.prepare.leaks import check_no_leak
 from distill.prepare.samples import PrepareConfig, make_sample
-from distill.schema import Sample, open_split, split_path
+from distill.prepare.sources import Source
+from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 
 
@@ -342,3 +347,167 @@ def test_imports_without_torch():
         "import distill.prepare.stage, distill.training.stage, distill.inference.stage, distill.evaluation.stage"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- several runs, walks, reading -------------------------------------------------------------------------------------
+
+
+def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
+    """The same walks under other timestamps, in another build of the town and in another run."""
+    runs = []
+    for number, (town, shift) in enumerate((("Town03", 0), ("Town03_Opt", 7), ("Town03", 9))):
+        run = tmp_path / f"run_{number}"
+        tree = make_playback_tree(run / "render", 4, 8, towns=(town,))
+        for folder in sorted(tree.glob(f"{town}/trajectory_*")):  # another second of the same walk
+            folder.rename(folder.with_name(f"trajectory_{int(folder.name[11:]) + shift}"))
+        make_captions(run / "captions.jsonl", tree)
+        runs.append(Source.of_files(tree, run / "captions.jsonl"))
+    cfg = PrepareConfig(unbound="accept", val_fraction=0.25, test_fraction=0.25)
+    out = stage.run(cfg, runs, tmp_path / "set")
+    samples = {split: list(open_split(out, split)) for split in SPLITS}
+    walks = {split: {sample.walk for sample in found} for split, found in samples.items()}
+    assert sorted(map(len, walks.values())) == [1, 1, 2]
+    assert len(set.union(*walks.values())) == 4
+    everyone = [sample for found in samples.values() for sample in found]
+    assert len({sample.key for sample in everyone}) == len(everyone) == 3 * 4 * 2 * 4 * 2
+    # A walk has the flights of three runs, clean and perturbed.
+    assert {
+        len({(s.run, s.trajectory, s.variant) for s in everyone if s.walk == walk})
+        for walk in set.union(*walks.values())
+    } == {6}
+    facts = json.loads((out / "manifest.json").read_text())["splits"]
+    assert sum(found["flights"] for found in facts.values()) == 24
+    trees = resolve_trees(out, [source.data for source in reversed(runs)])
+    assert trees == {source.run: source.data for source in runs}
+    for sample in everyone[::17]:
+        assert all((trees[sample.run] / image).is_file() for image in sample.images)
+
+
+def test_trees_that_a_set_was_not_made_of_are_refused_by_name(tree, captions, tmp_path):
+    out = prepared(tree, captions, tmp_path / "set")
+    other = make_playback_tree(tmp_path / "other", 5, 8, seed=1, with_images=False)
+    with pytest.raises(InputError, match=rf"not made of this playback tree.*{tree.parent.name}"):
+        resolve_trees(out, [other])
+    with pytest.raises(InputError, match=rf"is not given.*{tree.parent.name}"):
+        resolve_trees(out, [])
+
+
+def test_two_runs_of_one_name_are_refused(tree, captions, tmp_path):
+    source = Source.of_files(tree, captions)
+    with pytest.raises(InputError, match="two runs have one name"):
+        stage.run(PrepareConfig(unbound="accept"), [source, source], tmp_path / "set")
+
+
+def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
+    with pytest.raises(VerifyError, match=r"no record says of which playback tree.*unbound=accept"):
+        stage.run(PrepareConfig(), [Source.of_files(tree, captions)], tmp_path / "set")
+
+
+def test_captions_of_another_seed_are_refused(tmp_path):
+    """All names are the same in both runs; only the flights differ."""
+    from caption.run.stage import run as caption_run
+    from caption.schema import CaptionConfig
+
+    trees = [
+        make_playback_tree(tmp_path / name / "render", 3, 12, seed=seed, with_augmented=False)
+        for seed, name in enumerate("ab")
+    ]
+    names = [{path.relative_to(tree) for path in tree.rglob("*")} for tree in trees]
+    assert names[0] == names[1]
+    path = caption_run(CaptionConfig(), trees[0], tmp_path / "a/caption")
+    assert open_split(stage.run(PrepareConfig(), [Source.of_run(tmp_path / "a")], tmp_path / "set"), "train")
+    with pytest.raises(VerifyError, match="made of another input 'data'"):
+        stage.run(PrepareConfig(), [Source.of_files(trees[1], path)], tmp_path / "other")
+
+
+def test_frames_of_another_size_than_the_captions_say_are_left_out(tree, tmp_path):
+    records = make_captions(tmp_path / "captions.jsonl", tree)
+    records[0] = records[0].model_copy(update={"picture_px": (64, 40)})
+    write_captions(tmp_path / "captions.jsonl", records)
+    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
+    assert json.loads((out / "manifest.json").read_text())["counts"]["dropped"] == {"picture_of_another_size": 2}
+
+
+def test_a_limit_is_kept_and_counted(tree, captions, tmp_path):
+    out = prepared(tree, captions, tmp_path / "set", limit=13)
+    counts = json.loads((out / "manifest.json").read_text())["counts"]
+    samples = [sample for split in SPLITS for sample in open_split(out, split)]
+    assert len({sample.sample_id for sample in samples}) == 13
+    assert len(samples) == counts["kept"] == 26
+    assert counts["dropped"] == {"limit": counts["input"] - 26}
+
+
+def test_decisions_that_train_does_not_have_are_told(tree, tmp_path, caplog):
+    records = make_captions(tmp_path / "captions.jsonl", tree)
+    plain = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "plain")
+    tested = {sample.sample_id for sample in open_split(plain, "test")}
+    odd = [
+        record.model_copy(update={lang: getattr(record, lang).model_copy(update={"flight_decision": "ascend"}) for lang in ("en", "zh")})
+        if record.sample_id in tested
+        else record
+        for record in records
+    ]  # fmt: skip
+    write_captions(tmp_path / "captions.jsonl", odd)
+    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
+    facts = json.loads((out / "manifest.json").read_text())["splits"]
+    assert facts["test"]["not_in_train"] == {"ascend": facts["test"]["samples"]}
+    assert facts["val"]["not_in_train"] == {}
+    assert "decisions of test that train does not have: {'ascend'" in caplog.text
+
+
+def _keys(samples) -> list[str]:
+    return [sample.key for sample in samples]
+
+
+def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monkeypatch):
+    import multiprocessing
+    import pickle
+
+    monkeypatch.setattr("distill.schema.ROWS_AT_ONCE", 7)
+    samples = open_split(prepared(tree, captions, tmp_path / "set"), "train")
+    whole = list(samples)
+    assert len(whole) == len(samples) > 30
+    order = np.random.default_rng(0).permutation(len(samples)).tolist()
+    assert [samples[i] for i in order] == [whole[i] for i in order]
+    assert samples[-1] == whole[-1]
+    assert samples[3:9:2] == whole[3:9:2]
+    with pytest.raises(IndexError):
+        samples[len(samples)]
+    assert list(pickle.loads(pickle.dumps(samples))) == whole
+    for way in ("fork", "spawn"):  # a fork has its parent's open file
+        with multiprocessing.get_context(way).Pool(2) as pool:
+            found = pool.map(_keys, [samples] * 2)
+            assert found == [_keys(whole)] * 2
+    assert samples[order[0]] == whole[order[0]]
+
+
+def test_an_empty_split_is_empty(tree, captions, tmp_path):
+    samples = open_split(prepared(tree, captions, tmp_path / "set", val_fraction=0), "val")
+    assert (len(samples), list(samples), samples[:5]) == (0, [], [])
+
+
+def test_a_damaged_row_names_file_and_row(tree, captions, tmp_path):
+    out = prepared(tree, captions, tmp_path / "set")
+    path = split_path(out, "train")
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index("decision"), "decision", pa.array([3] * len(table))), path)
+    with pytest.raises(InputError, match=r"train\.parquet: row 0: decision"):
+        list(open_split(out, "train"))
+    pq.write_table(table.drop_columns(["walk"]), path)
+    with pytest.raises(InputError, match=r"columns are missing.*walk"):
+        len(open_split(out, "train"))
+
+
+def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):
+    datasets = pytest.importorskip("datasets", reason="needs the extra distill")
+    out = prepared(tree, captions, tmp_path / "set")
+    found = datasets.load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
+    assert set(found) == {"train", "validation", "test"}
+    systems = json.loads((out / RECORD).read_text())["systems"]
+    assert len(systems) == 2  # one a language, however many samples
+    for split, name in (("train", "train"), ("val", "validation")):
+        samples = open_split(out, split)
+        assert len(found[name]) == len(samples)
+        row, sample = found[name][3], samples[3]
+        assert (row["prompt"], row["answer"], row["window"]) == (sample.prompt.user, sample.answer, list(sample.window))
+        assert systems[row["system"]] == sample.prompt.system

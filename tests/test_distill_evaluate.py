@@ -23,7 +23,7 @@ from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
-from distill.evaluation.figures import differences_of, figures_of, macro_f1
+from distill.evaluation.figures import differences_of, draw_walks, figures_of, macro_f1
 from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
 from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_report, text_of
 from distill.evaluation.scores import VERDICTS, Answer, Scores, read_scores, score_answers, write_scores
@@ -77,7 +77,8 @@ def scores_of(samples, predictions=None, **more) -> Scores:
 
 
 def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
-    return figures_of(scores, resamples=resamples, confidence=confidence, rng=np.random.default_rng(0))
+    draws = draw_walks(len(set(scores.walk)), resamples, np.random.default_rng(0))
+    return figures_of(scores, draws, confidence=confidence)
 
 
 def test_measured_numbers_by_hand(samples):

@@ -17,7 +17,7 @@ from cosfly.errors import InputError
 from cosfly.escaping import for_html, for_markdown, html_page
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_model
-from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, Difference, differences_of
+from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, NEITHER, Difference, differences_of
 from distill.evaluation.measure import STUDENT, Measured, Report, read_report
 from distill.evaluation.pages import (
     NOTHING,
@@ -179,6 +179,7 @@ def _said(pairing: Pairing) -> list[list[str]]:
             is_clear = found.low is not None and found.high is not None and (found.low > 0 or found.high < 0)
             first_leads = (found.value > 0) != (name in LESS_IS_BETTER)
             better = (pairing.first if first_leads else pairing.second) if is_clear else "cannot be told"
+            better = NOTHING if name in NEITHER else better
             rows.append([FIGURES[name], *_difference(name, found), better])
     return rows
 

@@ -38,7 +38,8 @@ FIGURES: dict[str, str] = {
     "unread": "sentences that nobody can read",
     "tokens": "tokens of an answer",
 }
-LESS_IS_BETTER = ("soft_conflict", "hard_conflict", "contradicted", "unread", "tokens")
+LESS_IS_BETTER = ("hard_conflict", "contradicted", "unread")
+NEITHER = ("soft_conflict", "abstain", "tokens")  # more of it is neither better nor worse
 
 
 class Figure(BaseModel):
@@ -137,14 +138,12 @@ def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.n
     return rng.multinomial(num_walks, np.full(num_walks, 1.0 / num_walks), size=resamples).astype(float)
 
 
-def figures_of(
-    scores: Scores, *, resamples: int, confidence: float, rng: np.random.Generator
-) -> tuple[dict[str, Figure], dict[str, Figure]]:
-    """Give all figures, and the accuracy of each decision that the references have."""
+def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple[dict[str, Figure], dict[str, Figure]]:
+    """Give all figures, and the accuracy of each decision that the references have; draws: of the walks (`draw_walks`)."""
     names, walk = np.unique(scores.walk.astype(str), return_inverse=True)
     sums = _sums(scores, walk, len(names))
     whole = _values(sums, np.ones((1, len(names))))
-    drawn = _values(sums, draw_walks(len(names), resamples, rng))
+    drawn = _values(sums, draws)
     counts = dict(zip(sums.names, sums.denominators.sum(axis=0), strict=True))
     references = sums.confusion.sum(axis=(0, 2))
     counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(ACTIONS)}}

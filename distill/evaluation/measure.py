@@ -13,11 +13,11 @@ from pydantic import BaseModel, ConfigDict
 from cosfly.chance import rng_for
 from cosfly.errors import InputError
 from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, SentenceState, read_captions
-from cosfly.products.predictions import Prediction
+from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.documents import read_model
 from cosfly.splits import Split
 from distill.evaluation.bertscore import Metric, score_beside_floors
-from distill.evaluation.figures import Figure, figures_of
+from distill.evaluation.figures import Figure, draw_walks, figures_of
 from distill.evaluation.floors import Floors, coc_of
 from distill.evaluation.scores import UNPARSED, Answer, Scores, score_answers
 from distill.evaluation.speed import Speed
@@ -50,7 +50,7 @@ class Measurement(_Strict):
     walks: int
     failed: dict[str, int]
     unparsed: dict[str, int]
-    histogram_f1: list[int] | None  # of the student's parsed answers, in fiftieths from 0 to 1
+    histogram_f1: list[int] | None  # of the student's parsed answers, in hundredths from 0 to 1
     who: dict[str, Measured]
 
 
@@ -175,14 +175,14 @@ def measure(
     """Measure everyone on the same samples and the same draws."""
     student = scores[STUDENT]
     found = {}
+    draws = draw_walks(len(set(student.walk)), resamples, rng_for(seed, STAGE, "draws"))
     for name, own in scores.items():
-        rng = rng_for(seed, STAGE, "draws")
-        figures, decisions = figures_of(own, resamples=resamples, confidence=confidence, rng=rng)
+        figures, decisions = figures_of(own, draws, confidence=confidence)
         found[name] = Measured(figures=figures, by_decision=decisions, confusion=_confusion(own))
     reasons = Counter(p.reason or "unknown" for p in predictions if p.coc is None)
-    failed = {p.reason or "" for p in predictions if not Answer.of(p).is_answered}
+    failed = {reason for reason in reasons if reason.startswith(FAILED)}
     known = student.answered & (student.answer != UNPARSED) & ~np.isnan(student.f1)
-    histogram = np.histogram(np.clip(student.f1[known], 0, 1), bins=50, range=(0, 1))[0].tolist()
+    histogram = np.histogram(np.clip(student.f1[known], 0, 1), bins=100, range=(0, 1))[0].tolist()
     return Measurement(
         samples=len(student),
         walks=len(set(student.walk)),

@@ -273,7 +273,7 @@ def heat_map(who: Measured) -> str:
             if count:
                 ink = "#fff" if share > 0.55 else "#1a202c"
                 parts.append(
-                    f'<text x="{x + size / 2}" y="{y + 27}" text-anchor="middle" fill="{ink}">{_percent(share)}</text>'
+                    f'<text x="{x + size / 2}" y="{y + 27}" text-anchor="middle" style="fill:{ink}">{_percent(share)}</text>'
                 )
     width, height = left + len(columns) * size + 130, top + len(rows) * size + 10
     return f'<svg viewBox="0 0 {width} {height}" width="{width}">{"".join(parts)}</svg>'

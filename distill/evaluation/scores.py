@@ -101,7 +101,8 @@ def score_answers(
             if known
             else NONE
         )
-    bert = np.full((len(samples), 3), np.nan) if texts is None else texts
+    is_answered = np.array([answer.is_answered for answer in answers], dtype=bool)
+    bert = np.where(is_answered[:, None], np.nan if texts is None else texts, np.nan) * np.ones((1, 3))
     found = [(judged or {}).get(sample.key) for sample in samples]
     sentences = {
         state: np.array([np.nan if states is None else states.count(state) for states in found], dtype=float)  # type: ignore[attr-defined]
@@ -114,7 +115,7 @@ def score_answers(
         reference=np.array([_NUMBER[sample.decision] for sample in samples], dtype=np.int8),
         answer=np.array([_NUMBER[a.coc.flight_decision] if a.coc else UNPARSED for a in answers], dtype=np.int8),
         label=np.array([_NUMBER[s.label] if s.label else NONE for s in samples], dtype=np.int8),
-        answered=np.array([a.is_answered for a in answers], dtype=bool),
+        answered=is_answered,
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
         verdict=np.array(verdicts, dtype=np.int8),
         precision=bert[:, 0],

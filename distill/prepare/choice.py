@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.captions import ACTIONS
@@ -21,6 +22,10 @@ from cosfly.products.captions import ACTIONS
 
 def _rank(sample_id: str, seed: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
+
+
+def _numbers(ranks: array[int]) -> np.ndarray:
+    return np.frombuffer(ranks, dtype=np.uint64)
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,11 @@ class Ranks:
                 ranks[decision].extend(found)
         windows = {decision: len(found) for decision, found in sorted(ranks.items())}
         most = max(1, math.floor(ratio * sum(windows.values()) / len(windows)))
-        last_rank = {decision: sorted(found)[most - 1] for decision, found in ranks.items() if len(found) > most}
+        last_rank = {
+            decision: int(np.partition(_numbers(found), most - 1)[most - 1])
+            for decision, found in ranks.items()
+            if len(found) > most
+        }
         return Cut(self.seed, ratio, most, windows, last_rank)
 
 
@@ -91,12 +100,12 @@ def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> 
     Args:
         cuts: flight -> what has been cut of it already.
     """
-    left: dict[str, dict[str, list[int]]] = defaultdict(dict)  # decision -> flight -> ranks, in order
+    left: dict[str, dict[str, np.ndarray]] = defaultdict(dict)  # decision -> flight -> ranks, in order
     for flight, found in sorted(ranks.found.items()):
         for decision, all_ranks in found.items():
-            cut = cuts[flight]
-            last = math.inf if cut is None else cut.last_rank.get(decision, math.inf)
-            left[decision][flight] = sorted(rank for rank in all_ranks if rank <= last)
+            cut, own = cuts[flight], np.sort(_numbers(all_ranks))
+            last = None if cut is None else cut.last_rank.get(decision)
+            left[decision][flight] = own if last is None else own[own <= np.uint64(last)]
     counts = {decision: sum(map(len, flights.values())) for decision, flights in left.items()}
     total = sum(counts.values())
     if num_windows >= total:
@@ -108,14 +117,14 @@ def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> 
     last_rank: dict[tuple[str, str], int] = {}
     for decision in order:
         flights = sorted(left[decision], key=lambda flight: _rank(f"{decision}/{flight}", ranks.seed))
-        own = wanted[decision] / max(1, counts[decision])
+        fraction = wanted[decision] / max(1, counts[decision])
         have = {flight: len(left[decision][flight]) for flight in flights}
         for flight, number in _dealt(
-            wanted[decision], {flight: (own * have[flight] + carried[flight], have[flight]) for flight in flights}
+            wanted[decision], {flight: (fraction * have[flight] + carried[flight], have[flight]) for flight in flights}
         ).items():
             carried[flight] += share * have[flight] - number
             if number:
-                last_rank[flight, decision] = left[decision][flight][number - 1]
+                last_rank[flight, decision] = int(left[decision][flight][number - 1])
     return Limit(ranks.seed, last_rank)
 
 

@@ -91,7 +91,7 @@ def check_sources(sources: Sequence[Source], unbound: Literal["refuse", "accept"
 @dataclass(frozen=True)
 class CaptionedFlight:
     """A flight that captions are of. flight_id: unique among all runs, None for the captions' own. key: of its walk, before these
-    are known. size_px: (width, height) of its frames, None where it stands in no tree."""
+    are known. size_px: (width, height) of its frames, None where it stands in no tree; num_frames: of them."""
 
     source: Source
     town: str
@@ -99,6 +99,7 @@ class CaptionedFlight:
     variant: str
     flight_id: str | None
     size_px: tuple[int, int] | None
+    num_frames: int
 
     @property
     def key(self) -> str:
@@ -112,7 +113,9 @@ class CaptionedFlight:
         return caption.sample_id if self.flight_id is None else sample_id(self.flight_id, caption.frame_index)
 
     def whole_frames(self, views: Sequence[View]) -> set[int]:
-        """Give the frames that have the files of all views; of each flight read once, as samples share frames."""
+        """Give the frames that have the files of all views; without views, those of the flight's record."""
+        if not views:
+            return set(range(self.num_frames))
         found = set()
         for folder in (self.folder / frame_name(0)).parent.glob("frame_*"):
             if folder.name[6:].isdigit() and all((folder / VIEW_FILES[view]).is_file() for view in views):
@@ -145,15 +148,15 @@ class Flights:
 
     def _read(self, source: Source, folder: Path) -> CaptionedFlight:
         town, trajectory, variant = folder.parts[-3:]  # the tree may have been converted since
-        flight_id, size_px = None, None
+        flight_id, size_px, num_frames = None, None, 0
         if (folder / "trajectory.json").exists():
             flight = read_flight(folder, strict=False)
             name = f"{source.run}/{town}/{trajectory}"
-            self._courses.append(Course(name, town, flight.time_s, flight.walked_m))
-            size_px = (flight.camera.width_px, flight.camera.height_px)
+            self._courses.append(Course(name, town, flight.time_s, flight.walked_m).at_seconds())
+            size_px, num_frames = (flight.camera.width_px, flight.camera.height_px), len(flight)
         if self._ids is not None:
             flight_id = self._ids.get(Place(source.run, town, trajectory, variant))
-        return CaptionedFlight(source, town, trajectory, variant, flight_id, size_px)
+        return CaptionedFlight(source, town, trajectory, variant, flight_id, size_px, num_frames)
 
     def walks(self) -> dict[str, str]:
         """Tell the walks of the flights that were read, by their keys."""
