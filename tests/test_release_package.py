@@ -21,7 +21,7 @@ from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.issues import Issue
 from cosfly.products.boxes import MapHeader
-from cosfly.products.captions import Caption, Coc, Prompt, read_captions, write_captions
+from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, read_captions, write_captions
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
     FlightFunnel,
@@ -42,7 +42,7 @@ from release.package.plan import plan_shards
 from release.package.sources import Source
 from release.package.stage import ReleaseConfig, run
 from release.record import read_record
-from release.verify.verify import picture_problem, verify
+from release.verify.verify import verify
 from specimens import make_flight, make_playback_tree
 
 NUM_POINTS = 12
@@ -61,7 +61,7 @@ REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_v
 
 def make_caption(flight, index: int, **change) -> Caption:
     decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
-    prompt = Prompt(system="s", user="u")
+    prompt = Prompt(system="s", user=f"u {PICTURES_MARK}")
     values = {
         "sample_id": sample_id(flight.flight_id, index),
         "town": flight.town,
@@ -77,8 +77,8 @@ def make_caption(flight, index: int, **change) -> Caption:
         "usage": {"prompt_tokens": 0, "completion_tokens": 0},
         "attempts": 1,
         "en": Coc(
-            critical_components=f"A person {index} m ahead",
-            reasoning_trace="The person walks on, so go",
+            critical_components=f"A person walks {index} m ahead",
+            reasoning_trace="The person walks on, so fly on behind",
             flight_decision=decision,
         ),
         "zh": Coc(
@@ -86,12 +86,12 @@ def make_caption(flight, index: int, **change) -> Caption:
             reasoning_trace="行人继续直行, 因此跟随",
             flight_decision=decision,
         ),
-        "label_from": "flight",
+        "label_from": "flight" if flight.is_original else "twin",
         "label": "track_straight",
         "verdict": "CONSISTENT" if decision == "track_straight" else "SOFT_CONFLICT",
         "repair": REPAIR if index % 4 == 0 else None,
         "writing": "slots",
-        "checks": {"sentences": {"en": ["proved", "unread", "proved", "proved"]}} if index % 2 else {},
+        "checks": {"sentences": {"en": ["proved", "unread"]}} if index % 2 else {},
         "status": "accepted",
     }
     return Caption(**{**values, **change})
@@ -202,14 +202,14 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, inputs):
     captioned = loaded.filter(lambda row: row["has_caption"])
     row = captioned[0]
     assert "行人" in row["caption_zh_reasoning_trace"]
-    assert row["caption_en_critical_components"] == f"A person {row['frame_index']} m ahead"
+    assert row["caption_en_critical_components"] == f"A person walks {row['frame_index']} m ahead"
     assert row["caption_window"] == list(range(row["frame_index"] - 4, row["frame_index"] + 1))
     assert row["decision"] == row["caption_en_flight_decision"] == row["caption_zh_flight_decision"]
     assert row["teacher_kind"] == "rules"
     for row in captioned:
         assert row["writing"] == "slots"
         assert row["caption_picture_px"] == [96, 54]
-        assert row["proved_en"] == (0.75 if row["frame_index"] % 2 else None)
+        assert row["proved_en"] == (0.5 if row["frame_index"] % 2 else None)
         assert row["proved_zh"] is None
     bare = loaded.filter(lambda row: not row["has_caption"])
     assert bare[0]["caption_en_reasoning_trace"] is None
@@ -599,7 +599,7 @@ def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
     for place in places[:: max(1, len(places) // 12)]:
         digit = str((int(text[place]) + 1) % 10)
         card.write_text(text[:place] + digit + text[place + 1 :], encoding="utf-8")
-        report = verify(dataset, pixels="none")
+        report = verify(dataset, level="rows")
         line = text[:place].count("\n") + 1
         assert [i.where for i in report.issues if i.code == "card"] == [f"README.md:{line}"]
 
@@ -615,7 +615,7 @@ def test_a_changed_number_is_found_even_with_fresh_checksums(dataset):
         text = re.sub(rf"^\S+  {name}$", f"{sha256_file(dataset / name)}  {name}", text, flags=re.MULTILINE)
     (dataset / "checksums.sha256").write_text(text)
     report = verify(dataset)
-    assert {issue.code for issue in report.issues} == {"number", "sum"}
+    assert {issue.code for issue in report.issues} == {"number", "split", "sum"}
     assert "captions.frames_with" in str(report)
 
 
@@ -695,17 +695,7 @@ def test_planted_damage_is_found(dataset, damage):
 
 def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
     assert codes(tmp_path / "nowhere") == {"missing"}
-    assert codes(tmp_path) == {"record"}
-
-
-def test_pictures_of_the_wrong_size_are_named(inputs):
-    frame = find_flights(inputs / "tree")[0] / "frames_playback" / "frame_00000"
-    rgb = {"bytes": (frame / "rgb.png").read_bytes()}
-    assert picture_problem("rgb", rgb, (54, 96)) is None
-    assert picture_problem("rgb", rgb, (96, 54)) is not None
-    assert picture_problem("rgb", None, (54, 96)) is not None
-    assert picture_problem("depth", (frame / "depth.npy").read_bytes(), (54, 96)) is None
-    assert picture_problem("depth", b"", (54, 96)) is not None
+    assert codes(tmp_path) == {"missing"}
 
 
 def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):

@@ -96,15 +96,20 @@ def decision_words(decision: str) -> str:
 
 def build_prompts(window: ObservedWindow, facts: Facts) -> dict[Language, Prompt]:
     """Write the prompts of both languages from one window, with a mark for the sentence about the pictures."""
+    users = user_prompts(window, facts)
+    return {language: Prompt(system=system_prompt(language), user=user) for language, user in users.items()}
+
+
+def user_prompts(window: ObservedWindow, facts: Facts) -> dict[Language, str]:
+    """Write the questions alone, without what stands before all of them."""
     numbers = _numbers(window, facts)
     languages: tuple[Language, Language] = ("en", "zh")
-    return {
-        language: Prompt(
-            system=system_prompt(language),
-            user=_user_prompt(numbers, window, facts, language),
-        )
-        for language in languages
-    }
+    return {language: _user_prompt(numbers, window, facts, language) for language in languages}
+
+
+def mission_lines(language: Language) -> dict[str, str]:
+    """Give the last line of a prompt that tells of an order, by its kind."""
+    return _MISSION[language]
 
 
 def prompt_hash(question: Question) -> str:

@@ -70,16 +70,39 @@ def _frames_setting(frames: str | None) -> list[str]:
 
 @app.command("verify")
 def release_verify(
-    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Release folder, playback tree, or export of a release; the hub's cache too.")
+    ],
+    level: Annotated[
+        str,
+        typer.Option(
+            help="structure: names, sizes, records, card. rows: every row too. pixels: checksums and every picture too."
+        ),
+    ] = "pixels",
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the findings for machines here.")] = None,
+    repair_plan: Annotated[
+        bool, typer.Option("--repair-plan", help="Say what could be mended, and how; changes nothing.")
+    ] = False,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
+    workers: options.Workers = None,
 ) -> None:
-    """Check structure, checksums, every number of the card, and re-projection. Exit 1 if anything is wrong."""
-    from release.verify.verify import verify
+    """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
+    from caption.truth.released import read_released
+    from cosfly.store import write_json
+    from release.verify.repair import plan_of
+    from release.verify.verify import LEVELS, verify
 
-    options.resolve(config, overrides)
-    report = verify(folder)
+    if level not in LEVELS:
+        raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    num_workers = options.manner(cfg, "never")["workers"]
+    report = verify(folder, level=level, workers=num_workers, reader=read_released)
     typer.echo(str(report))
+    for line in plan_of(report) if repair_plan else []:
+        typer.echo(f"repair plan: {line}")
+    if json_file is not None:
+        write_json(json_file, report.as_json())
     if not report.is_ok:
         raise typer.Exit(1)
 

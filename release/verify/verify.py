@@ -1,318 +1,223 @@
-"""`cosfly release verify`: is a release folder what its records say? From cheap to dear, reading nothing but the folder.
+"""`cosfly release verify`: is a folder what its records say, and can it be true? From cheap to dear, reading nothing but the folder.
 
-Structure, names and sizes; checksums; every number of release.json and of the card computed again from the shards; the
-target projected again from pose and intrinsics; every picture decoded.
+    structure   names, sizes, links, records against each other and against the shards' footers, the card
+    rows        every row: ids, ranges, geometry, motion, captions; flights against each other; every number computed again
+    pixels      checksums of all files; every picture: whole, of its row, and one world with the pictures beside it
+
+A release, a playback tree (ours or the public one), and what `cosfly release export` writes.
 """
 
 from __future__ import annotations
 
-import itertools
+import tempfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
 
-import cv2
-import numpy as np
-
+from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.geometry import project, world_from_camera
-from cosfly.issues import Report
-from cosfly.products.captions import ACTIONS
-from cosfly.products.frames import FrameFile
-from cosfly.reading.arrays import parse_array, parse_picture
-from cosfly.reading.files import read_bytes, sha256_file
-from cosfly.reading.tables import open_table
-from cosfly.stage_folder import flattened
-from cosfly.store import CHECKSUMS, inside, read_checksums
-from release import columns
-from release.card.croissant import CROISSANT, render_croissant
-from release.card.numbers import compute_numbers, read_rows
-from release.card.render import render_card
-from release.columns import CAPTION_COLUMNS, CAPTION_FIELDS, CAPTION_LISTS, PICTURES, PLACE, POINT
+from cosfly.items import Item
+from cosfly.products.playback import ORIGINAL
+from cosfly.products.shown_captions import CaptionReader
+from cosfly.runner import run_items
+from cosfly.stage_folder import Failed, Kept, StageFolder
+from cosfly.store import CHECKSUMS
+from release.card.croissant import CROISSANT
 from release.record import ReleaseRecord, read_record
-from release.subsample import select_frames
+from release.verify import records
+from release.verify.across import Summary, check_across
+from release.verify.findings import Findings, Verified
+from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
+from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
+from release.verify.sources import Entry, FlightSource, Shards, Tree
 
-REPROJECTION_TOLERANCE_PX = 0.5
-RECORDS = ("README.md", "release.json", CROISSANT, CHECKSUMS)
-ALLOWED = (".git", ".gitattributes", ".cache")  # what the hub and its client put beside a data set
-NEVER_NULL = (
-    "decision",
-    "label_from",
-    "teacher_kind",
-    "writing",
-    *CAPTION_LISTS,
-    *CAPTION_FIELDS,
-)  # where there is a caption
-
-Pixels = Literal["all", "none"]
+RECORD = "release.json"
+RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
+LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
 
 
-def verify(folder: Path, *, pixels: Pixels = "all") -> Report:
-    """Check a release folder (or the `dataset` folder inside a release stage's).
+def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: CaptionReader | None = None) -> Verified:
+    """Check a folder (or the `dataset` folder inside a release stage's).
 
     Args:
-        pixels: `none` leaves out decoding the pictures, the dearest check.
+        level: how far to go; each level does what the ones before it do.
+        workers: processes; 0 works in this one.
+        reader: tells what the words of captions say; None: they are not read, which the report says.
     Returns:
-        Report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
+        the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
     """
-    if not (folder / "release.json").is_file() and (folder / "dataset" / "release.json").is_file():
+    findings = Findings()
+    if not (folder / RECORD).is_file() and (folder / "dataset" / RECORD).is_file():
         folder = folder / "dataset"
-    report = Report()
-    record = _read_record(folder, report)
-    if record is None:
-        return report
-    shards = _check_names_and_sizes(folder, record, report)
-    _check_checksums(folder, record, report)
-    readable = _readable(folder, shards, record, report)
-    _check_sums(record, report)
-    if readable == [entry.path for entry in record.shards]:
-        paths = [folder / name for name in readable]
-        checks = [_check_rows, _check_numbers, *([_check_pictures] if pixels == "all" else [])]
-        for check in checks:
-            try:
-                check(paths, record, report)
-            except (
-                InputError,
-                ValueError,
-                KeyError,
-                TypeError,
-            ) as error:  # a value of no sense, or none where one must be
-                report.error("unreadable", "data", f"{type(error).__name__}: {error}", "rows that can be read")
-    _check_card(folder, record, report)
+    if not folder.is_dir():
+        findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
+    elif (folder / RECORD).is_file() or ((folder / CHECKSUMS).is_file() and not _is_tree(folder)):
+        _verify_release(folder, level, workers, reader, findings)
+    else:
+        _verify_tree(folder, level, workers, findings)
+    report = findings.report()
+    report.level = level
     return report
 
 
-# --- the folder -------------------------------------------------------------------------------------------------------
+def _is_tree(folder: Path) -> bool:
+    return next(folder.glob("*/*/*/trajectory.json"), None) is not None
 
 
-def _read_record(folder: Path, report: Report) -> ReleaseRecord | None:
-    """Read release.json; None, with findings, when nothing else can be checked."""
-    if not folder.is_dir():
-        report.error("missing", folder, "no such folder", "a release folder")
-        return None
+# --- a release --------------------------------------------------------------------------------------------------------
+
+
+def _verify_release(folder: Path, level: Level, workers: int, reader: CaptionReader | None, findings: Findings) -> None:
     try:
-        return read_record(folder / "release.json")
+        record = read_record(folder / RECORD)
     except InputError as error:
         where = str(error.where).replace(f"{folder}/", "")
-        report.error("record", where, error.got or error.what, error.expected or "a release record")
-        return None
-
-
-def _check_names_and_sizes(folder: Path, record: ReleaseRecord, report: Report) -> list[str]:
-    """Compare the files that are there with those that should be; give the shards that are there."""
-    listed = {entry.path: entry for entry in record.shards}
-    paths = [path for path in folder.rglob("*") if not path.is_dir()]
-    paths = [path for path in paths if path.relative_to(folder).parts[0] not in ALLOWED]
-    names = {path.relative_to(folder).as_posix() for path in paths}
-    found = {
-        path.relative_to(folder).as_posix() for path in paths if path.is_file()
-    }  # neither a pipe nor a broken link
-    for name in sorted({*listed, *RECORDS} - found):
-        report.error("missing", name, "no such file", "a file of the release")
-    for name in sorted(names - {*listed, *RECORDS}):
-        report.error("unexpected", name, "a file", "nothing: release.json does not know it")
-    for name in sorted(listed.keys() & found):
-        size = (folder / name).stat().st_size
-        if size != listed[name].bytes:
-            report.error("size", name, f"{size} bytes", f"{listed[name].bytes} bytes")
-    report.facts.append(f"{len(found)} files, {sum((folder / name).stat().st_size for name in found):,} bytes")
-    return [name for name in listed if name in found]
-
-
-def _check_checksums(folder: Path, record: ReleaseRecord, report: Report) -> None:
-    try:
-        digests = read_checksums(folder)
-    except InputError as error:
-        report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+        findings.error("record", where, error.got or error.what, error.expected or "a release record")
         return
-    listed = {entry.path: entry.sha256 for entry in record.shards}
-    for name in sorted({*listed, "README.md", "release.json", CROISSANT} ^ set(digests)):
+    expected: dict[str, int | None] = dict.fromkeys(RECORDS)
+    good = check_names(folder, expected | {shard.path: shard.bytes for shard in record.shards}, findings)
+    digests = read_digests(folder, findings)
+    _check_lists(record, digests, findings)
+    small = [name for name in good if (folder / name).stat().st_size <= SMALL_BYTES and name in RECORDS]
+    check_digests(folder, digests, small, findings)
+    records.check_record(record, findings)
+    readable = records.check_footers(folder, record, good, findings)
+    records.check_card(folder, record, findings)
+    shards = [shard.path for shard in record.shards]
+    findings.facts.append(f"structure: {len(shards):,} shards, {record.numbers.frames:,} frames by their record")
+    if level != "structure":
+        _verify_rows(folder, record, readable == shards, level, workers, reader, findings)
+    if level == "pixels":
+        check_digests(folder, digests, [name for name in good if name not in small], findings)
+
+
+def _verify_rows(
+    folder: Path, record: ReleaseRecord, is_readable: bool, level: Level, workers: int, reader: CaptionReader | None,
+    findings: Findings,
+) -> None:  # fmt: skip
+    """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
+    shards = [shard.path for shard in record.shards]
+    source = Shards(folder, tuple(record.settings.modalities))
+    if not is_readable:
+        findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
+        return
+    try:
+        entries = source.entries(shards)
+    except InputError as error:
+        findings.error("unreadable", str(error.where).replace(f"{folder}/", ""), error.got or error.what, "rows")
+        return
+    available = {flight.flight: flight.frames_available for flight in record.flights}
+    entries = [Entry(e.name, e.parts, e.num_rows, e.given_id, available.get(e.name)) for e in entries]
+    flights = check_all(source, entries, level, _told(record), reader, workers, findings)
+    check_across(flights, by_town=record.splits.by == "town", both=_wants_both(record), findings=findings)
+    records.check_flights(record, flights, findings)
+    _check_shard_splits(record, entries, flights, findings)
+    try:
+        records.check_numbers(folder, record, findings)
+    except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
+        findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
+
+
+def _wants_both(record: ReleaseRecord) -> bool:
+    return record.settings.pairs == "both" and len(record.settings.tracks) == 2
+
+
+def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
+    """The list of checksums and release.json name the same files with the same digests."""
+    listed = {shard.path: shard.sha256 for shard in record.shards}
+    for name in sorted({*listed, *RECORDS} - {CHECKSUMS} ^ set(digests)):
         place = "only in release.json" if name in listed else "only in one of the lists"
-        report.error("checksum", f"{CHECKSUMS}: {name}", place, "one line per file")
-    for name, digest in sorted(digests.items()):
-        path = inside(folder, name)
-        if not path.is_file():
-            continue  # reported as missing
-        found = sha256_file(path)
-        if found != digest:
-            report.error("checksum", name, found, digest)
-        if listed.get(name, digest) != digest:
-            report.error("checksum", f"release.json: shards: {name}", listed[name], digest)
+        findings.error("checksum", f"{CHECKSUMS}: {name}", place, "one line per file")
+    for name, digest in listed.items():
+        if digests.get(name, digest) != digest:
+            findings.error("checksum", f"release.json: shards: {name}", digest, digests[name])
 
 
-def _readable(folder: Path, names: list[str], record: ReleaseRecord, report: Report) -> list[str]:
-    """Open every shard; give those that have the release's columns and number of rows."""
-    rows = {entry.path: entry.rows for entry in record.shards}
-    expected = columns.schema(record.settings.modalities)
-    good = []
-    for name in names:
-        try:
-            with open_table(folder / name, tree=folder) as table:
-                schema, num_rows = table.schema_arrow, table.metadata.num_rows
-        except InputError as error:
-            report.error("unreadable", name, error.got or error.what, "a parquet file")
-            continue
-        has_features = (schema.metadata or {}).get(b"huggingface") == expected.metadata[b"huggingface"]
-        if not schema.equals(expected) or not has_features:
-            wrong = ", ".join(m.name for m in schema if m not in list(expected))
-            got = wrong or "the order, or the features in the metadata"
-            report.error("columns", name, got, "the columns of the release")
-        elif num_rows != rows[name]:
-            report.error("rows", name, num_rows, str(rows[name]))
-        else:
-            good.append(name)
-    return good
+def _told(record: ReleaseRecord) -> Told:
+    """Give what of the record the checks of flights need."""
+    settings = {
+        (source.run, stage.stage): stage.config for source in record.provenance.sources for stage in source.stages
+    }
+    return Told(record.settings.window_frames, record.depth or LOSSLESS, settings)
 
 
-# --- the numbers ------------------------------------------------------------------------------------------------------
+def _check_shard_splits(
+    record: ReleaseRecord, entries: list[Entry], flights: list[Summary], findings: Findings
+) -> None:
+    """The rows of a shard are of its split, and a flight stands in one piece."""
+    split_of = {shard.path: shard.split for shard in record.shards}
+    splits = {flight.name: flight.split for flight in flights}
+    for entry in entries:
+        for shard in dict.fromkeys(part[0] for part in entry.parts):
+            if splits.get(entry.name, split_of[shard]) != split_of[shard]:
+                got = f"rows of {splits[entry.name]} in {shard}"
+                findings.error("leak", entry.name, got, f"{split_of[shard]}, the shard's split")
 
 
-def _check_numbers(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
-    """Compute every number again and compare."""
-    computed = flattened(compute_numbers(paths, record.settings.num_frames).model_dump())
-    written = flattened(record.numbers.model_dump())
-    for name in sorted(computed.keys() | written.keys()):
-        if computed.get(name) != written.get(name):
-            report.error("number", f"release.json: numbers.{name}", written.get(name), f"{computed.get(name)}")
-    report.facts.append(f"{len(computed)} numbers computed again from {len(paths)} shards")
+# --- a playback tree --------------------------------------------------------------------------------------------------
 
 
-def _check_sums(record: ReleaseRecord, report: Report) -> None:
-    """What the shards cannot tell must at least add up."""
-    planned, flights, captions = record.history.trajectories, record.history.flights, record.history.captions
-    sums = [
-        ("flights.found", flights.found, flights.released + sum(flights.left_out.values())),
-        ("flights.released", flights.released, record.numbers.flights),
-        ("captions.read", captions.read, captions.accepted + sum(captions.dropped.values())),
-        ("captions.accepted", captions.accepted,
-         captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out),
-        ("captions.released", captions.released, record.numbers.captions.frames_with),
-    ]  # fmt: skip
-    if planned is not None:
-        sums += (
-            ("trajectories.planned", planned.planned,
-             sum(planned.dropped.values()) + planned.not_rendered + planned.rendered),
-            ("trajectories.rendered", planned.rendered, planned.accepted + planned.review + planned.rejected),
-        )  # fmt: skip
-    for name, whole, parts in sums:
-        if whole != parts:
-            report.error("sum", f"release.json: history.{name}", whole, f"{parts}, the sum of its parts")
-
-
-def _check_card(folder: Path, record: ReleaseRecord, report: Report) -> None:
-    """The card must be the one that release.json gives, to the letter."""
-    path = folder / "README.md"
-    if not path.is_file():
-        return
+def _verify_tree(folder: Path, level: Level, workers: int, findings: Findings) -> None:
     try:
-        found = read_bytes(path, what="card", tree=folder).decode(errors="replace").split("\n")
+        source, entries = Tree.found(folder)
     except InputError as error:
-        report.error("card", "README.md", error.got or error.what, "the card")
+        what = f"{error.what}: {error.got}" if error.got else error.what
+        findings.error("missing", folder, what, "a release, a playback tree, or an export of a release")
         return
-    croissant = folder / CROISSANT
-    if croissant.is_file() and read_bytes(croissant, tree=folder) != render_croissant(record).encode():
-        report.error("card", CROISSANT, "other words", "what release.json gives")
-    wanted = render_card(record).split("\n")
-    for number, (line, expected) in enumerate(itertools.zip_longest(found, wanted, fillvalue="the end"), 1):
-        if line != expected:
-            report.error("card", f"README.md:{number}", repr(line[:120]), repr(expected[:120]))
-
-
-# --- the rows ---------------------------------------------------------------------------------------------------------
-
-
-def _check_rows(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
-    """Check ids, frame selection, captions and the projection of the target, flight by flight."""
-    flights = {entry.flight: entry for entry in record.flights}
-    frames: dict[str, list[int]] = {}
-    seen: set[str] = set()
-    num_projected, worst_px = 0, 0.0
-    for row in read_rows(paths):
-        flight, where = "/".join(row[name] for name in PLACE), row["sample_id"]
-        frames.setdefault(flight, []).append(row["frame_index"])
-        if row["sample_id"] in seen:
-            report.error("duplicate", where, "a second row", "one row per frame")
-        seen.add(row["sample_id"])
-        _check_caption(row, where, report)
-        distance_px = projection_error_px(row)
-        if distance_px is not None:
-            num_projected += 1
-            worst_px = max(worst_px, distance_px)
-            if distance_px > REPROJECTION_TOLERANCE_PX:
-                expected = f"at most {REPROJECTION_TOLERANCE_PX} px between target_uv and the projected target"
-                report.error("projection", where, f"{distance_px:.3f} px", expected)
-    for flight in sorted(flights.keys() ^ frames.keys()):
-        report.error("flight", flight, "only in one of release.json and the shards", "the same flights in both")
-    for flight, indices in frames.items():
-        if flight not in flights:
-            continue
-        entry = flights[flight]
-        expected_indices = select_frames(
-            entry.frames_available, record.settings.num_frames, record.settings.window_frames
-        ).tolist()
-        if indices != expected_indices or len(indices) != entry.frames:
-            got = f"{len(indices)} frames, first {indices[:3]}"
-            report.error("frames", flight, got, f"{len(expected_indices)} frames by the rule of release.json")
-    report.facts.append(
-        f"{len(seen):,} rows of {len(frames)} flights; {num_projected:,} targets projected, worst {worst_px:.4f} px"
-    )
-
-
-def _check_caption(row: dict[str, Any], where: str, report: Report) -> None:
-    """A row has a whole caption or none; its decision is of the closed set and the same in both languages."""
-    if not row["has_caption"]:
-        present = [name for name in CAPTION_COLUMNS if row[name] is not None]
-        if present:
-            report.error("caption", f"{where}: {present[0]}", "a value", "null: has_caption is false")
+    findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
+    digests = _tree_digests(folder, entries, findings)
+    if level == "structure":
         return
-    absent = [name for name in NEVER_NULL if not row[name]]
-    if absent:
-        report.error("caption", f"{where}: {absent[0]}", repr(row[absent[0]]), "a value: has_caption is true")
-    decisions = {row["decision"], row["caption_en_flight_decision"], row["caption_zh_flight_decision"]}
-    if len(decisions) != 1 or not decisions <= set(ACTIONS):
-        report.error("caption", f"{where}: decision", sorted(map(str, decisions)), "one action of the closed set")
+    flights = check_all(source, entries, level, Told(), None, workers, findings)
+    check_across(flights, by_town=False, both=False, findings=findings)
+    if level == "pixels":
+        for flight, own in digests.items():
+            check_digests(folder / flight, own, list(own), findings)
 
 
-def projection_error_px(row: dict[str, Any]) -> float | None:
-    """Project a row's target with its pose and intrinsics; give the distance to its target_uv, None where it has none."""
-    if row["target"] is None or row["target_uv"] is None:
-        return None
-    pose, k = row["pose"], row["intrinsics"]
-    rotation = np.array([pose[name] for name in ("pitch_deg", "yaw_deg", "roll_deg")])
-    camera = world_from_camera(np.array([pose[name] for name in POINT]), rotation)
-    intrinsic = np.array([[k["fx"], 0.0, k["cx"]], [0.0, k["fy"], k["cy"]], [0.0, 0.0, 1.0]])
-    uv, _ = project(np.array([[row["target"][name] for name in POINT]]), camera, intrinsic)
-    recorded = np.array([row["target_uv"]["u_px"], row["target_uv"]["v_px"]])
-    distance = float(np.hypot(*(uv[0] - recorded)))
-    return distance if np.isfinite(distance) else float("inf")
+def _tree_digests(folder: Path, entries: Iterable[Entry], findings: Findings) -> dict[str, dict[str, str]]:
+    """Read the flights' own lists of checksums, where they have them, and see that their files are there."""
+    found = {}
+    for entry in entries:
+        flight = folder / entry.parts[0]
+        if (flight / CHECKSUMS).is_file():
+            found[entry.parts[0]] = read_digests(flight, findings)
+            for name in found[entry.parts[0]]:
+                if not (flight / name).is_file():
+                    findings.error("missing", f"{entry.parts[0]}/{name}", "no such file", f"a file of {CHECKSUMS}")
+    return found
 
 
-# --- the pictures -----------------------------------------------------------------------------------------------------
+# --- all flights ------------------------------------------------------------------------------------------------------
 
 
-def _check_pictures(paths: list[Path], record: ReleaseRecord, report: Report) -> None:
-    """Decode every picture and compare its size with the row's."""
-    files = record.settings.modalities
-    count = 0
-    pictures = [PICTURES[file].name for file in files]
-    for row in read_rows(paths, ["sample_id", "width_px", "height_px", *pictures]):
-        size = (row["height_px"], row["width_px"])
-        for file, column in zip(files, pictures, strict=True):
-            problem = picture_problem(file, row[column], size)
-            count += 1
-            if problem:
-                expected = f"a {file} picture of {size[1]} x {size[0]} px"
-                report.error("picture", f"{row['sample_id']}: {column}", problem, expected)
-    report.facts.append(f"{count:,} pictures decoded")
+class _Settings(Config):
+    """A verification has no settings that a product would depend on."""
 
 
-def picture_problem(file: FrameFile, value: Any, size: tuple[int, int]) -> str | None:
-    """Say why a picture is not one of (height, width), None if it is."""
-    try:
-        if file == "depth":
-            found = parse_array(value or b"", "depth", dtype=np.float32, ndim=2).shape
-        else:
-            data = (value or {}).get("bytes") or b""
-            found = parse_picture(data, file, flags=cv2.IMREAD_UNCHANGED).shape[:2]
-    except InputError as error:
-        return f"{error.what}: {error.got}"
-    return None if found == size else f"{found[1]} x {found[0]} px"
+def check_all(
+    source: FlightSource, entries: list[Entry], level: Level, told: Told, reader: CaptionReader | None, workers: int,
+    findings: Findings,
+) -> list[Summary]:  # fmt: skip
+    """Check every flight, by several processes; gives what is kept of each to compare them."""
+    clean = {e.name.rpartition("/")[0]: e for e in entries if e.name.rpartition("/")[2] == ORIGINAL}
+    items = []
+    for entry in entries:
+        twin = clean.get(entry.name.rpartition("/")[0])
+        job = Job(entry, twin if twin is not None and twin is not entry else None)
+        items.append(Item(entry.name, job, entry.num_rows if level == "pixels" and entry.num_rows else None))
+    with tempfile.TemporaryDirectory(prefix="cosfly-verify-") as place:
+        stage = StageFolder.open(Path(place) / "verify", "verify", config=_Settings(), inputs={}, seed=0)
+        done = run_items(stage, items, make_worker, (source, level, told, reader), workers=workers, label="verify")
+    flights = []
+    for record in done.records:
+        if isinstance(record, Kept):
+            findings.merge(record.result["findings"])
+            if record.result["summary"] is not None:
+                flights.append(Summary(**record.result["summary"]))
+        elif isinstance(record, Failed):
+            findings.error("not_checked", record.id, record.message, "a flight that can be checked")
+    num_rows = sum(flight.num_rows for flight in flights)
+    words = "texts of captions read" if reader is not None else "texts of captions not read: no reader was given"
+    pictures = f", all their {', '.join(source.files)} pictures" if level == "pixels" else ""
+    findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
+    return flights

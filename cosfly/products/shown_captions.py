@@ -1,0 +1,65 @@
+"""A caption as a release shows it, and what a reader of captions says of it: what `release verify` and `caption` exchange.
+
+Release knows rows and pictures, caption knows what is true of a window; neither imports the other. The command line brings them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosfly.products.captions import Coc, Language
+from cosfly.products.playback import Flight
+
+
+@dataclass(frozen=True)
+class ShownCaption:
+    """One caption of a flight. frame_index: its current frame; window: indices of what its prompt shows, as it says.
+
+    prompts: user prompts by language, empty where none is shown. picture_px: (width, height). contradicted: by language, how many of its
+    sentences its record says the flight contradicts; empty where it does not say.
+    """
+
+    sample_id: str
+    frame_index: int
+    window: tuple[int, ...]
+    picture_px: tuple[int, int]
+    answers: dict[Language, Coc]
+    prompts: dict[Language, str]
+    decision: str
+    label: str | None
+    label_from: str
+    verdict: str | None
+    writing: str
+    contradicted: dict[Language, int]
+
+
+@dataclass(frozen=True)
+class ShownFlight:
+    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps; styles: (n,).
+
+    twin: the clean flight of a perturbed one, of the same frames; None where it is not released or shows others.
+    settings: the captions' own, as they are on record; empty: the defaults.
+    """
+
+    flight: Flight
+    frame_indices: np.ndarray
+    styles: Sequence[str | None]
+    captions: Sequence[ShownCaption]
+    twin: Flight | None = None
+    settings: dict[str, Any] | None = None
+
+
+class Lie(NamedTuple):
+    """Something that cannot be, in the words of a finding."""
+
+    code: str
+    where: str
+    got: str
+    expected: str
+
+
+CaptionReader = Callable[[ShownFlight], list[Lie]]

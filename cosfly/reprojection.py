@@ -1,0 +1,199 @@
+"""One frame seen from another: points of a depth image carried through both poses into the next picture, and what is found there.
+
+What stands still looks the same from both places: it has the depth that the poses give it, the same instance, and nearly the same
+colour. So pictures, poses, intrinsics and times bear witness against each other, whatever a file says of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosfly.compiled import njit
+
+COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
+NEAR_M = 0.3
+MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
+MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
+# Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
+TOLERANCE_SHARE, TOLERANCE_M = 0.02, 0.1
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame. depth (h, w) float32 m; instance (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) where there is none; colours (k, w, 3 or
+    4) uint8 of the first k of the grid's rows, None where there are none; rotation: world_from_camera (3, 3); position_m (3,).
+    """
+
+    depth: np.ndarray
+    instance: np.ndarray
+    colours: np.ndarray | None
+    rotation: np.ndarray
+    position_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there (agree), lie behind
+    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance. error: median of those on
+    planes, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
+    the three channels, less that of brightness, grey levels.
+    """
+
+    seen: int
+    agree: int
+    hidden: int
+    through: int
+    same: int
+    error: float
+    correlation: float
+    tint: float
+
+
+def grid_rows(height_px: int) -> np.ndarray:
+    """Rows of the grid, (ROWS,)."""
+    return ((np.arange(ROWS) + 0.5) * height_px / ROWS).astype(np.int64)
+
+
+def compare_views(one: View, other: View, intrinsics: np.ndarray) -> Agreement:
+    """Carry the grid's points of one frame into another.
+
+    Args:
+        intrinsics: (4,) fx, fy, cx, cy of both.
+    """
+    turn = other.rotation.T @ one.rotation
+    shift = other.rotation.T @ (one.position_m - other.position_m)
+    counts, errors, brightness = _carry(
+        one.depth, one.instance, other.depth, other.instance, intrinsics.astype(np.float64), turn, shift, MOVING
+    )
+    pairs: np.ndarray = np.empty((0, 2))
+    tint = np.nan
+    if one.colours is not None and other.colours is not None:
+        here, there = _colours_at(brightness, one.colours, other.colours, one.depth.shape[0])
+        pairs = np.stack([here.mean(axis=1), there.mean(axis=1)], axis=1)
+        if len(pairs) >= 60:
+            hue = (there - pairs[:, 1:]) - (here - pairs[:, :1])
+            tint = float(np.median(np.abs(hue).max(axis=1)))
+    correlation = np.nan
+    if len(pairs) >= 60 and (pairs.std(axis=0) > 4.0).all():  # grey levels: less is a wall or a fog
+        correlation = float(np.corrcoef(pairs.T)[0, 1])
+    error = float(np.median(errors)) if len(errors) >= 30 else np.nan
+    seen, agree, hidden, through, same = (int(n) for n in counts)
+    return Agreement(seen, agree, hidden, through, same, error, correlation, tint)
+
+
+def _colours_at(matches: np.ndarray, one: np.ndarray, other: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colours at points and where they came out, (k, 3) each; only those whose both rows of the grid were unpacked."""
+    rows = grid_rows(height)
+    nearest = np.clip(np.round((matches[:, 3] + 0.5) * ROWS / height - 0.5).astype(np.int64), 0, ROWS - 1)
+    # A point that comes out between two rows of the grid has no colour there.
+    usable = (matches[:, 1] < len(one)) & (nearest < len(other)) & (np.abs(rows[nearest] - matches[:, 3]) <= 1)
+    m, nearest = matches[usable], nearest[usable]
+    return one[m[:, 1], m[:, 0], :3].astype(np.float64), other[nearest, m[:, 2], :3].astype(np.float64)
+
+
+@njit(cache=True, nogil=True)
+def survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-def]
+    """Look at every pixel of a frame once.
+
+    Args:
+        depth: (h, w) float32, or (0, 0) where there is none; instance: (h, w, 3) uint8, or (0, 0, 3).
+    Returns:
+        range (2,) least and greatest depth, NaN where one is; counts (5,): pixels of sky by depth, by kind, by one alone; of the person;
+        of the person's id with another kind than Pedestrians. box (4,) of the person's pixels, edges at pixel borders; kinds (256,) pixels.
+    """
+    counts, kinds = np.zeros(5, np.int64), np.zeros(256, np.int64)
+    box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
+    least, greatest, is_finite = np.inf, -np.inf, True
+    has_depth, has_ids = depth.shape[0] > 0, instance.shape[0] > 0
+    height, width = depth.shape if has_depth else instance.shape[:2]
+    for y in range(height):
+        for x in range(width):
+            is_far = False
+            if has_depth:
+                d = depth[y, x]
+                if not np.isfinite(d):
+                    is_finite = False
+                least, greatest = min(least, d), max(greatest, d)
+                is_far = d == 1000.0
+                counts[0] += is_far
+            if has_ids:
+                kind = instance[y, x, 0]
+                kinds[kind] += 1
+                counts[1] += kind == sky_kind
+                counts[2] += has_depth and ((kind == sky_kind) != is_far)
+                if instance[y, x, 1] == (person_id & 255) and instance[y, x, 2] == (person_id >> 8):
+                    counts[3] += 1
+                    counts[4] += kind != 12
+                    box[0], box[1] = min(box[0], x), min(box[1], y)
+                    box[2], box[3] = max(box[2], x + 1), max(box[3], y + 1)
+    if not is_finite:
+        least, greatest = np.nan, np.nan
+    return np.array([least, greatest]), counts, box, kinds
+
+
+@njit(cache=True, nogil=True)
+def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, turn, shift, moving):  # type: ignore[no-untyped-def]
+    """Counts (5,), errors (k,), matches (k, 4): column, row of the grid, column and row in the other picture."""
+    height, width = depth_a.shape
+    fx, fy, cx, cy = intrinsics
+    has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
+    counts = np.zeros(5, np.int64)
+    errors, num_errors = np.empty(COLUMNS * ROWS), 0
+    matches, num_matches = np.empty((COLUMNS * ROWS, 4), np.int64), 0
+    for j in range(ROWS):
+        v = int((j + 0.5) * height / ROWS)
+        for i in range(COLUMNS):
+            u = int((i + 0.5) * width / COLUMNS)
+            d = float(depth_a[v, u])
+            if not (d > 0.0 and d < 999.0) or (has_ids and moving[inst_a[v, u, 0]]):
+                continue
+            x, y = (u + 0.5 - cx) / fx * d, (v + 0.5 - cy) / fy * d
+            px = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * d + shift[0]
+            py = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * d + shift[1]
+            z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
+            if z < NEAR_M:
+                continue
+            s, t = fx * px / z + cx, fy * py / z + cy
+            if not (s > 1.5 and t > 1.5 and s < width - 2.5 and t < height - 2.5):
+                continue
+            column, row = int(s), int(t)
+            best, is_through, is_same, is_free = 1e9, True, not has_ids, True
+            for dy in range(-1, 2):
+                for dx in range(-1, 2):
+                    off = float(depth_b[row + dy, column + dx]) - z
+                    best = min(best, abs(off))
+                    if off <= 0.05 * z + 0.3:
+                        is_through = False
+                    if has_ids:
+                        y1, x1 = row + dy, column + dx
+                        is_free &= not moving[inst_b[y1, x1, 0]]
+                        is_same |= (
+                            inst_b[y1, x1, 0] == inst_a[v, u, 0]
+                            and inst_b[y1, x1, 1] == inst_a[v, u, 1]
+                            and inst_b[y1, x1, 2] == inst_a[v, u, 2]
+                        )
+            if not is_free:
+                continue
+            counts[0] += 1
+            if best <= TOLERANCE_SHARE * z + TOLERANCE_M:
+                counts[1] += 1
+                counts[4] += is_same
+                matches[num_matches] = (u, j, column, row)
+                num_matches += 1
+                # Of a plane 1 / z is linear in the picture, so that between four pixels it is exact.
+                x0, y0 = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
+                a, b = s - 0.5 - x0, t - 0.5 - y0
+                q00, q01 = 1.0 / depth_b[y0, x0], 1.0 / depth_b[y0, x0 + 1]
+                q10, q11 = 1.0 / depth_b[y0 + 1, x0], 1.0 / depth_b[y0 + 1, x0 + 1]
+                is_plane = abs(q00 + q11 - q01 - q10) < 1e-5 / z
+                if is_plane:
+                    q = (1 - b) * ((1 - a) * q00 + a * q01) + b * ((1 - a) * q10 + a * q11)
+                    errors[num_errors] = abs(1.0 / q - z) / z
+                    num_errors += 1
+            elif is_through:
+                counts[3] += 1
+            else:
+                counts[2] += 1
+    return counts, errors[:num_errors], matches[:num_matches]

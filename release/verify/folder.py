@@ -1,0 +1,96 @@
+"""What stands in a folder of files with a list of checksums: names, sizes, links, and, dearest, the checksums themselves.
+
+Nothing is followed out of the folder but links of the hub client's cache into its blobs; a loop of links ends at its first link.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+from cosfly.errors import InputError
+from cosfly.reading.files import open_file, sha256_file
+from cosfly.store import CHECKSUMS, read_checksums
+from release.verify.findings import Findings
+
+ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
+SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap checks
+MOST_FILES = 5_000_000
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Yield the names of everything that is no folder, relative, without following links to folders."""
+    for place, folders, names in os.walk(folder, onerror=None, followlinks=False):
+        here = Path(place)
+        relative = here.relative_to(folder)
+        if not relative.parts:
+            folders[:] = [name for name in folders if name not in ALLOWED]
+            names = [name for name in names if name not in ALLOWED]
+        for name in sorted([*names, *(name for name in folders if (here / name).is_symlink())]):
+            yield (relative / name).as_posix()
+        folders[:] = sorted(name for name in folders if not (here / name).is_symlink())
+
+
+def check_names(folder: Path, expected: Mapping[str, int | None], findings: Findings) -> list[str]:
+    """Compare the files that are there with those that should be, by name and size; give those that are as they should.
+
+    Args:
+        expected: name -> size in bytes, None where nobody says.
+    """
+    found: dict[str, int] = {}
+    for name in files_below(folder):
+        if name not in expected:
+            findings.error("unexpected", name, "a file", "nothing: no record knows it")
+            continue
+        size = _size(folder, name, findings)
+        if size is not None:
+            found[name] = size
+    for name in expected:
+        if name not in found and not os.path.lexists(folder / name):
+            findings.error("missing", name, "no such file", "a file of the release")
+    good = []
+    for name, size in found.items():
+        wanted = expected[name]
+        if wanted is not None and size != wanted:
+            findings.error("size", name, f"{size:,} bytes", f"{wanted:,} bytes")
+        else:
+            good.append(name)
+    findings.facts.append(f"{len(found):,} files, {sum(found.values()):,} bytes")
+    return [name for name in expected if name in set(good)]
+
+
+def _size(folder: Path, name: str, findings: Findings) -> int | None:
+    """Give the size of a regular file that may be read; None, with a finding, for anything else."""
+    try:
+        with open_file(folder / name, tree=folder) as file:
+            about = os.fstat(file.fileno())
+    except InputError as error:
+        findings.error("unreadable", name, error.got or error.what, "a regular file of the folder")
+        return None
+    return about.st_size if stat.S_ISREG(about.st_mode) else None
+
+
+def read_digests(folder: Path, findings: Findings) -> dict[str, str]:
+    """Read the list of checksums; empty, with a finding, where there is none that can be read."""
+    try:
+        return read_checksums(folder)
+    except InputError as error:
+        findings.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+        return {}
+
+
+def check_digests(folder: Path, digests: Mapping[str, str], names: Collection[str], findings: Findings) -> None:
+    """Read files and compare their checksums with the list."""
+    for name in names:
+        digest = digests.get(name)
+        if digest is None:
+            continue
+        try:
+            found = sha256_file(folder / name, tree=folder)
+        except InputError as error:
+            findings.error("unreadable", name, error.got or error.what, "a file that can be read")
+            continue
+        if found != digest:
+            findings.error("checksum", name, found, digest)

@@ -1,0 +1,144 @@
+"""Is each row who it says it is, and is every value one that its column can hold? Relations inside a row that need no geometry."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any, get_args
+
+import numpy as np
+
+from cosfly.products.captions import ACTIONS, LabelFrom, TeacherKind, Verdict, Writing
+from cosfly.products.playback import EVENTS, ORIGINAL
+from release.columns import CAPTION_SHARES
+from release.verify.findings import Findings
+from release.verify.rows import FlightRows
+
+# What cannot change within a flight.
+CONSTANT = (
+    "run", "town", "trajectory", "variant", "track", "pace", "walk", "split", "pair", "weather", "time_of_day", "look",
+    "width_px", "height_px", "fov_deg", "intrinsics",
+)  # fmt: skip
+CLOSED: dict[str, tuple[str, ...]] = {
+    "track": ("clean", "perturbed"),
+    "decision": ACTIONS,
+    "label": ACTIONS,
+    "caption_en_flight_decision": ACTIONS,
+    "caption_zh_flight_decision": ACTIONS,
+    "verdict": get_args(Verdict),
+    "label_from": get_args(LabelFrom),
+    "teacher_kind": get_args(TeacherKind),
+    "writing": get_args(Writing),
+}
+# column -> members ("" for a plain number) -> least and greatest value.
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "visibility": {"": (0.0, 1.0)},
+    "fov_deg": {"": (1.0, 179.0)},
+    "time_s": {"": (0.0, 1e7)},
+    "width_px": {"": (1, 100_000)},
+    "height_px": {"": (1, 100_000)},
+    "target_heading_deg": {"": (-360.0, 360.0)},
+    "pose": {"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
+    "look": {"sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6), "exposure": (0.0, 100.0)},
+    **{name: {"": (0.0, 1.0)} for name in CAPTION_SHARES},
+}  # fmt: skip
+NEVER_NULL = (
+    "sample_id", "run", "town", "trajectory", "variant", "track", "frame_index", "time_s", "width_px", "height_px", "fov_deg",
+    "intrinsics", "pose", "target_in_view", "target_visible", "is_perturbed", "has_caption",
+)  # fmt: skip
+LARGEST = 1e6  # of a coordinate, m: farther than any town reaches
+# What became of a perturbation, in the words of docs/files.md.
+EVENT_WORDS = re.compile(
+    r"none|applied|fallback: (?:drone clearance|person in an obstacle|target out of view|target hidden)"
+)
+_TRAJECTORY = re.compile(r"[\w.-]+")
+
+
+def check_identity(flight: FlightRows, findings: Findings) -> None:
+    """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
+    _check_names(flight, findings)
+    _check_constants(flight, findings)
+    for i, row in enumerate(flight.rows):
+        for name in NEVER_NULL:
+            if name in row and row[name] is None:
+                findings.error("null", flight.where(i, name), "null", "a value in every row")
+        for name, allowed in CLOSED.items():
+            value = row.get(name)
+            if value is not None and value not in allowed:
+                findings.error(
+                    "closed_set",
+                    flight.where(i, name),
+                    repr(value),
+                    f"one of {len(allowed)} words: {', '.join(allowed[:4])} ...",
+                )
+        for name, value in row.items():
+            if isinstance(value, float | dict):
+                _check_numbers(flight, i, name, value, findings)
+        words = row.get("perturbation") or {}
+        for event in EVENTS:
+            if words.get(event) is not None and not EVENT_WORDS.fullmatch(words[event]):
+                findings.error("closed_set", flight.where(i, f"perturbation.{event}"), repr(words[event]), "none, applied, or fallback and why")  # fmt: skip
+
+
+def _check_names(flight: FlightRows, findings: Findings) -> None:
+    first = flight.rows[0]
+    is_original = first.get("variant") == ORIGINAL
+    if flight.name != "/".join(str(first.get(n)) for n in ("run", "town", "trajectory", "variant")):
+        findings.error("flight", flight.name, "rows of another flight", "rows of this one")
+    for name in ("town", "trajectory", "variant", "run"):
+        value = first.get(name)
+        if isinstance(value, str) and value and (not _TRAJECTORY.fullmatch(value) or value in (".", "..")):
+            findings.error("name", flight.where(0, name), repr(value), "a plain name, which leads nowhere")
+    track = first.get("track")
+    is_named = is_original or re.fullmatch(r"aug_\d+", str(first.get("variant")))
+    if is_named and track in ("clean", "perturbed") and (track == "clean") != is_original:
+        findings.error("track", flight.where(0, "track"), f"{track}, variant {first.get('variant')}", f"clean exactly where the variant is {ORIGINAL}")  # fmt: skip
+    for i, row in enumerate(flight.rows):
+        given, index = row.get("sample_id"), row.get("frame_index")
+        own = f"{row.get('trajectory')}_{row.get('variant')}_frame_{index:05d}" if isinstance(index, int) else ""
+        expected = own if flight.given_id is None else f"{flight.given_id}_frame_{index or 0:05d}"
+        fits = given == expected if flight.given_id is not None else str(given).endswith(own)
+        if "sample_id" in row and not fits:
+            findings.error("sample_id", flight.where(i, "sample_id"), repr(given), f"{expected}, of its own columns")
+    index = flight.index
+    if (np.diff(index) <= 0).any() or index[0] < 0:
+        k = int(np.argmax(np.diff(index) <= 0)) + 1 if len(index) > 1 else 0
+        findings.error(
+            "frame_index", flight.where(k), f"{index[k]} after {index[k - 1]}", "indices that grow, from 0 on"
+        )
+    if flight.num_frames is not None and index[-1] >= flight.num_frames:
+        findings.error("frame_index", flight.where(len(index) - 1), index[-1], f"less than {flight.num_frames}, the frames of the flight")  # fmt: skip
+
+
+def _check_constants(flight: FlightRows, findings: Findings) -> None:
+    for name in CONSTANT:
+        column = flight.column(name)
+        for i, value in enumerate(column):
+            if value != column[0]:
+                findings.error("constant", flight.where(i, name), value, f"{column[0]}, as in the flight's first row")
+                break
+
+
+def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: Findings) -> None:
+    """Check that numbers are finite, of a sane size, and within their range; a group is whole or null."""
+    members = value.items() if isinstance(value, dict) else (("", value),)
+    for member, number in members:
+        if isinstance(number, str | bool) or (
+            isinstance(value, dict) and name in ("perturbation", "image", "instance")
+        ):
+            continue
+        place = flight.where(i, f"{name}.{member}".rstrip("."))
+        if number is None:
+            findings.error("null", place, "null", "a number: the group is there")
+        elif not math.isfinite(number):
+            findings.error("not_finite", place, number, "a finite number")
+        elif abs(number) > LARGEST * 10:
+            findings.error("range", place, number, f"at most {LARGEST * 10:g}")
+        else:
+            low, high = RANGES.get(name, {}).get(member, (-math.inf, math.inf))
+            if not low <= number <= high:
+                findings.error("range", place, number, f"{low:g} to {high:g}")
+
+
+Check = Callable[[FlightRows, Findings], None]

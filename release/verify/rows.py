@@ -1,0 +1,196 @@
+"""The rows of one flight as arrays: what every check of rows stands on, whichever format they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, get_args
+
+import numpy as np
+
+from cosfly.geometry import BODY_FROM_CAMERA, rotation_matrices
+from cosfly.products.captions import FIELDS, Coc, Language
+from cosfly.products.frames import Camera
+from cosfly.products.playback import EVENTS, Flight
+from cosfly.products.shown_captions import ShownCaption, ShownFlight
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from release.columns import BOX, PICTURE_PX, POINT, POSE, WINDOW
+
+Row = dict[str, Any]
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+NEAR_M = 0.3  # the renderers' near plane
+INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True)
+class FlightRows:
+    """The rows of one flight in the order of their frames, with the columns of a release; a column that a format lacks is None everywhere.
+
+    name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows. is_foreign: nothing says
+    that cosfly drew it, so that its person may be of another size. num_frames: of the whole flight, None where nobody says.
+    """
+
+    name: str
+    rows: Sequence[Row]
+    given_id: str | None = None
+    num_frames: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def where(self, i: Any, column: str = "") -> str:
+        """Name a row, and a column of it."""
+        row = self.rows[int(i)]
+        place = row.get("sample_id") or f"{self.name} frame {row.get('frame_index')}"
+        return f"{place}: {column}" if column else str(place)
+
+    def column(self, name: str) -> list[Any]:
+        return [row.get(name) for row in self.rows]
+
+    def numbers(self, name: str) -> np.ndarray:
+        """A column of numbers, (n,) float64, NaN where null."""
+        return np.array([np.nan if value is None else value for value in self.column(name)], dtype=np.float64)
+
+    def vectors(self, name: str, members: tuple[str, ...]) -> np.ndarray:
+        """A column of groups, (n, members) float64, NaN where null or incomplete."""
+        nothing = (np.nan,) * len(members)
+        groups = [
+            nothing if group is None else [np.nan if group.get(m) is None else group[m] for m in members]
+            for group in self.column(name)
+        ]
+        return np.array(groups, dtype=np.float64).reshape(-1, len(members))
+
+    def flags(self, name: str) -> np.ndarray:
+        return np.array([bool(value) for value in self.column(name)])
+
+    @cached_property
+    def index(self) -> np.ndarray:
+        return np.array([-1 if value is None else value for value in self.column("frame_index")], dtype=np.int64)
+
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        return self.numbers("time_s")
+
+    @cached_property
+    def pose(self) -> np.ndarray:
+        return self.vectors("pose", POSE)
+
+    @cached_property
+    def target_m(self) -> np.ndarray:
+        return self.vectors("target", POINT)
+
+    @cached_property
+    def drone_offset(self) -> np.ndarray:
+        return self.vectors("drone_offset", POSE)
+
+    @cached_property
+    def target_offset(self) -> np.ndarray:
+        return self.vectors("target_offset", POINT)
+
+    @cached_property
+    def uv(self) -> np.ndarray:
+        return self.vectors("target_uv", ("u_px", "v_px"))
+
+    @cached_property
+    def box(self) -> np.ndarray:
+        return self.vectors("target_bbox", BOX)
+
+    @cached_property
+    def mask_box(self) -> np.ndarray:
+        return self.vectors("target_mask_bbox", BOX)
+
+    @cached_property
+    def intrinsics(self) -> np.ndarray:
+        return self.vectors("intrinsics", INTRINSICS)
+
+    @cached_property
+    def size_px(self) -> np.ndarray:
+        """(n, 2) width, height."""
+        return np.stack([self.numbers("width_px"), self.numbers("height_px")], axis=1)
+
+    @cached_property
+    def events(self) -> list[dict[str, str] | None]:
+        groups = self.column("perturbation")
+        return [group if group and all(group.get(event) for event in EVENTS) else None for group in groups]
+
+    @cached_property
+    def is_foreign(self) -> bool:
+        """Nothing in the rows is what only cosfly writes: the box of the person's pixels, or what became of a perturbation."""
+        return bool(np.isnan(self.mask_box).all()) and not any(self.events)
+
+    @cached_property
+    def rotations(self) -> np.ndarray:
+        """world_from_body, (n, 3, 3)."""
+        return rotation_matrices(np.radians(self.pose[:, 3:]))
+
+    @cached_property
+    def projected_corners(self) -> np.ndarray:
+        """The corners of a person of ours at each row's target, (n, 8, 2) px; NaN where one lies behind the camera."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
+        corners = self.target_m[:, None, :] + signs * np.array(PERSON_HALF_EXTENTS_M)
+        body = np.einsum("nji,nkj->nki", self.rotations, corners - self.pose[:, None, :3])
+        x, y, z = np.moveaxis(body @ BODY_FROM_CAMERA, 2, 0)
+        fx, fy, cx, cy = (values[:, None] for values in self.intrinsics.T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            uv = np.stack([fx * x / z + cx, fy * y / z + cy], axis=2)
+        uv[~(z > NEAR_M).all(axis=1)] = np.nan
+        return uv
+
+    @property
+    def is_clean(self) -> bool:
+        return self.rows[0].get("track") == "clean"
+
+    def steps(self) -> np.ndarray:
+        """Positions k of rows whose successor in the rows is the next frame of the flight."""
+        return np.flatnonzero(np.diff(self.index) == 1)
+
+    # --- for who reads captions -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def flight(self) -> Flight:
+        """The same as a flight of the playback tree, for those who know that."""
+        first = self.rows[0]
+        fx, fy, cx, cy = self.intrinsics[0]
+        camera = Camera(
+            int(self.size_px[0, 0]), int(self.size_px[0, 1]), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        )
+        has_mask = not np.isnan(self.mask_box).all()
+        return Flight(
+            town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
+            camera=camera, time_s=self.time_s, positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:],
+            targets_m=self.target_m, target_in_view=self.flags("target_in_view"),
+            target_visible=self.flags("target_visible"), target_depth_m=self.numbers("target_depth_m"),
+            target_uv=self.uv, target_bbox=self.box, visibility=self.numbers("visibility"),
+            is_perturbed=self.flags("is_perturbed"), drone_offsets_m=self.drone_offset[:, :3],
+            rotation_offsets_deg=self.drone_offset[:, 3:], target_offsets_m=self.target_offset,
+            target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
+        )  # fmt: skip
+
+    def shown(self, twin: FlightRows | None, settings: dict[str, Any] | None) -> ShownFlight:
+        """Give what a reader of captions gets. settings: of the captions, as the record has them."""
+        captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
+        same = twin is not None and np.array_equal(twin.index, self.index)
+        other = twin.flight if twin is not None and same else None
+        return ShownFlight(self.flight, self.index, self.column("style"), captions, other, settings)
+
+
+def shown_caption(row: Row) -> ShownCaption:
+    """Give the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found elsewhere."""
+    contradicted = {language: row.get(f"contradicted_sentences_{language}") for language in LANGUAGES}
+    return ShownCaption(
+        sample_id=row["sample_id"],
+        frame_index=row["frame_index"],
+        window=tuple(row[WINDOW]),
+        picture_px=tuple(row[PICTURE_PX]),
+        answers={
+            language: Coc(**{name: row[f"caption_{language}_{name}"] for name in FIELDS}) for language in LANGUAGES
+        },
+        prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
+        decision=row["decision"],
+        label=row["label"],
+        label_from=row["label_from"],
+        verdict=row["verdict"],
+        writing=row["writing"],
+        contradicted={language: count for language, count in contradicted.items() if count is not None},
+    )

@@ -1,0 +1,155 @@
+"""The pictures of a flight against each other: what stands still is carried from frame to frame through the poses (cosfly/reprojection.py).
+
+That is where exchanged pictures, poses and cameras come to light: each of them may be right alone. Thresholds lie between what honest
+flights of nine towns showed at worst and what the smallest exchange, that of two frames half a second apart, shows typically
+(docs/releases.md).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cosfly.items import advance
+from cosfly.products.frames import FrameFile
+from cosfly.reprojection import Agreement, View, compare_views
+from release.record import DepthCoding
+from release.verify.findings import Findings
+from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
+from release.verify.rows import FlightRows
+
+LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share to mean something
+NEAR_FRAMES = 2  # farther apart, more is hidden behind other things
+AGREE_LEAST = 0.5  # honest 0.81 and more
+THROUGH_MOST = 0.02  # points in front of what is drawn: honest 0.001
+ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of planes; honest below 1e-5 as float32
+SAME_LEAST = 0.95  # of the instances; honest 0.985
+COLOUR_DROP, COLOUR_LEAST = (
+    0.12,
+    0.3,
+)  # below the flight's median, honest 0.08; the median itself, honest 0.55 at 96 x 54
+TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
+BETTER_BY = 0.07  # how much better the next frame's place must explain a frame's colours to be where they are from
+# Flights of others: depth may be rough, but it is equally rough in all frames.
+ROUGH_ERROR, TIMES_ROUGH = 1e-3, 20.0
+
+
+@dataclass
+class _Pairs:
+    """What neighbouring frames say of each other: row of the later one, agreement, correlation of its colours at the next frame's place."""
+
+    rows: list[int] = field(default_factory=list)
+    gaps: list[int] = field(default_factory=list)
+    found: list[Agreement] = field(default_factory=list)
+    elsewhere: list[float] = field(default_factory=list)
+
+
+def check_pictures(
+    flight: FlightRows, pictures: Iterator[dict[FrameFile, bytes | None]], coding: DepthCoding, findings: Findings
+) -> list[tuple[int, int]]:
+    """Check all pictures of a flight, one after the other; memory holds three frames.
+
+    Args:
+        coding: of the depth.
+    Returns:
+        of each row a number that tells its colour picture from others, and one for its depth; 0 where it has none.
+    """
+    keys: list[tuple[int, int]] = []
+    pairs, kinds = _Pairs(), dict[int, int]()
+    before: list[tuple[int, View]] = []  # the two frames before
+    for i, files in enumerate(pictures):
+        advance()
+        decoded = decode(flight, i, files, coding, findings)
+        keys.append(_keys(files, decoded))
+        if decoded is None or not check_picture(flight, i, decoded, findings):
+            before = []
+            continue
+        if decoded[1].size and not flight.is_foreign:
+            _check_kinds(flight, i, decoded[1], kinds, findings)
+        view = view_of(flight, i, decoded)
+        if decoded[0].size:
+            _compare(flight, i, view, before, pairs)
+        before = [*before[-1:], (i, view)]
+    _judge(flight, pairs, coding, findings)
+    return keys
+
+
+def _keys(files: dict[FrameFile, bytes | None], decoded: object) -> tuple[int, int]:
+    """Numbers that are the same for the same pictures: the checksum of a PNG's pixels, and one of the depth's samples."""
+    colour, depth = files.get("rgb") or b"", files.get("depth") or b""
+    # The last bytes before the IEND chunk (12): the stream's own checksum and that of its chunk (4 each).
+    return int.from_bytes(colour[-20:-12], "big"), zlib.crc32(depth[:: max(1, len(depth) // 8192)]) if decoded else 0
+
+
+def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: dict[int, int], findings: Findings) -> None:
+    """An instance is of one kind in all frames."""
+    for code in grid_kinds(instance).tolist():
+        own, kind = code >> 8, code & 255
+        if own not in (NOBODY, SHARED_ID) and kinds.setdefault(own, kind) != kind:
+            findings.error("instance_kind", flight.where(i, "instance"), f"instance {own} of kind {kind}", f"kind {kinds[own]}, as before")  # fmt: skip
+
+
+def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, View]], pairs: _Pairs) -> None:
+    """Compare a frame with the one before; and the colours of that one, at this frame's place, with the one before it."""
+    if not before:
+        return
+    k, previous = before[-1]
+    pairs.rows.append(i)
+    pairs.gaps.append(int(flight.index[i] - flight.index[k]))
+    pairs.found.append(compare_views(previous, view, flight.intrinsics[i]))
+    pairs.elsewhere.append(np.nan)
+    if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
+        moved = replace(view, colours=previous.colours)
+        pairs.elsewhere[-2] = compare_views(before[0][1], moved, flight.intrinsics[i]).correlation
+
+
+def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Findings) -> None:
+    """Find the pairs of frames that do not show one world."""
+    if not pairs.found:
+        return
+    errors = np.array([pair.error for pair in pairs.found])
+    agree = np.array([pair.agree / max(pair.seen, 1) for pair in pairs.found])
+    limit, least = ERROR_MOST[coding.coding], AGREE_LEAST
+    if flight.is_foreign:
+        usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else np.inf
+        if usual > ROUGH_ERROR or np.median(agree) < 0.8:
+            findings.note("scene_not_judged", flight.name, f"depth that is {usual:.1%} beside the next frame's", "pictures of one world; of flights that cosfly drew this is an error")  # fmt: skip
+            return
+        limit, least = max(limit, TIMES_ROUGH * usual), AGREE_LEAST
+    colours = np.array([pair.correlation for pair in pairs.found])
+    usual_colour, drop = _usual(colours)
+    tints = np.array([pair.tint for pair in pairs.found])
+    usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
+    if usual_colour < COLOUR_LEAST and np.isfinite(colours).sum() >= 4:
+        findings.error("scene_colour", flight.name, f"colours that agree by {usual_colour:.2f} from frame to frame", "pictures of this flight")  # fmt: skip
+    for i, gap, pair, elsewhere in zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, strict=True):
+        if pair.seen < LEAST_SEEN:
+            continue
+        share, through = pair.agree / pair.seen, pair.through / pair.seen
+        where = flight.where(i)
+        if (gap <= NEAR_FRAMES and (share < least or through > THROUGH_MOST)) or pair.error > limit:
+            got = f"{share:.0%} of the points where the frame before has them, {through:.1%} before what is drawn, planes {pair.error:.2%} off"  # fmt: skip
+            findings.error("scene_depth", where, got, "depth, pose and camera that agree with the frame before")
+            continue
+        if pair.agree < LEAST_AGREE:
+            continue
+        if pair.same < SAME_LEAST * pair.agree:
+            findings.error("scene_instance", where, f"{pair.same / pair.agree:.1%} of the instances of the frame before", f"at least {SAME_LEAST:.0%} where the depth agrees")  # fmt: skip
+        if pair.correlation < usual_colour - drop:
+            findings.error("scene_colour", where, f"{pair.correlation:.2f} with the frame before", f"at least {usual_colour - drop:.2f}, by the flight's other frames")  # fmt: skip
+        elif pair.tint > usual_tint + TINT:
+            findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
+        elif elsewhere > pair.correlation + BETTER_BY:
+            findings.error("scene_colour", where, f"{pair.correlation:.3f} with the frame before", f"less than {elsewhere:.3f}, which these colours have at the next frame's place")  # fmt: skip
+
+
+def _usual(colours: np.ndarray) -> tuple[float, float]:
+    """The usual correlation of a flight's frames, and how much less is too little."""
+    known = colours[np.isfinite(colours)]
+    if not len(known):
+        return np.nan, np.nan
+    usual = float(np.median(known))
+    return usual, max(COLOUR_DROP, 8.0 * float(np.median(np.abs(known - usual))))

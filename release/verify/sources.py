@@ -1,0 +1,195 @@
+"""Where the rows and pictures of flights come from: the shards of a release, or a playback tree. Exports: exports.py.
+
+A source is small and pickles: worker processes open the files themselves.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from cosfly.errors import InputError
+from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.products.places import Place, flight_ids
+from cosfly.products.playback import find_flights, read_flight
+from cosfly.reading.files import read_bytes
+from cosfly.reading.tables import open_table, read_row_group
+from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed
+from release.verify.rows import FlightRows, Row
+
+Pictures = dict[FrameFile, bytes | None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A flight of a source. parts: where its rows are, in the source's own terms. num_frames: of the whole flight, None where nobody says."""
+
+    name: str
+    parts: tuple[Any, ...]
+    num_rows: int
+    given_id: str | None = None
+    num_frames: int | None = None
+
+    @property
+    def place(self) -> Place:
+        return Place(*self.name.split("/"))
+
+
+class FlightSource(Protocol):
+    """What gives the rows and pictures of flights. files: kinds of pictures that every row has."""
+
+    @property
+    def files(self) -> tuple[FrameFile, ...]: ...
+
+    def rows(self, entry: Entry) -> list[Row]:
+        """Give the rows of a flight, without pictures. Raises InputError where they cannot be read."""
+        ...
+
+    def pictures(self, entry: Entry) -> Iterator[Pictures]:
+        """Yield the pictures of each row, in their order. Raises InputError as `rows`."""
+        ...
+
+
+def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
+    return FlightRows(entry.name, source.rows(entry), entry.given_id, entry.num_frames)
+
+
+def with_ids(entries: list[Entry]) -> list[Entry]:
+    """Give the entries what their sample ids must begin with; None where two flights have one name."""
+    try:
+        ids = flight_ids([entry.place for entry in entries])
+    except (InputError, TypeError):
+        return entries
+    return [Entry(e.name, e.parts, e.num_rows, ids[e.place], e.num_frames) for e in entries]
+
+
+# --- shards -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shards:
+    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last)."""
+
+    folder: Path
+    files: tuple[FrameFile, ...]
+
+    def entries(self, names: list[str]) -> list[Entry]:
+        """Find which rows are of which flight, in the order in which they stand.
+
+        Raises:
+            InputError: a shard cannot be read.
+        """
+        parts: dict[str, list[tuple[str, int, int, int]]] = defaultdict(list)
+        for name in names:
+            path = self.folder / name
+            with open_table(path, tree=self.folder) as table:
+                for group in range(table.num_row_groups):
+                    places = read_row_group(path, table, group, list(PLACE))
+                    columns = [places.column(column).to_pylist() for column in PLACE]
+                    begin = 0
+                    flights = ["/".join(map(str, values)) for values in zip(*columns, strict=True)]
+                    for row, flight in enumerate([*flights, None]):
+                        if row and flight != flights[row - 1]:
+                            parts[flights[row - 1]].append((name, group, begin, row))
+                            begin = row
+        entries = [Entry(name, tuple(own), sum(end - begin for *_, begin, end in own)) for name, own in parts.items()]
+        return with_ids([entry for entry in entries if entry.name.count("/") == len(PLACE) - 1])
+
+    def rows(self, entry: Entry) -> list[Row]:
+        found: list[Row] = []
+        for table, begin, end, path in self._groups(entry, SCALAR_NAMES):
+            found += rows_of_table(table.slice(begin, end - begin), path)
+        return found
+
+    def pictures(self, entry: Entry) -> Iterator[Pictures]:
+        names = [PICTURES[file].name for file in self.files]
+        for table, begin, end, _ in self._groups(entry, names):
+            columns = {file: table.column(PICTURES[file].name) for file in self.files}
+            for row in range(begin, end):
+                yield {file: _bytes_at(column, row) for file, column in columns.items()}
+
+    def _groups(self, entry: Entry, names: list[str]) -> Iterator[tuple[Any, int, int, Path]]:
+        for shard, group, begin, end in entry.parts:
+            path = self.folder / shard
+            with open_table(path, tree=self.folder) as table:
+                yield read_row_group(path, table, group, names), begin, end, path
+
+
+def rows_of_table(table: Any, path: Path) -> list[Row]:
+    """Give a table's rows as plain values.
+
+    Raises:
+        InputError: text in it is none.
+    """
+    try:
+        return table.to_pylist()
+    except ValueError as error:
+        raise InputError("not text", where=path, got=str(error)) from None
+
+
+def _bytes_at(column: Any, row: int) -> bytes | None:
+    value = column[row].as_py()
+    return value.get("bytes") if isinstance(value, dict) else value
+
+
+# --- a playback tree --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A playback tree, ours or the public one. A part is the flight's folder, relative to the tree."""
+
+    folder: Path
+    files: tuple[FrameFile, ...]
+    broken: dict[str, str] = field(default_factory=dict)  # flights that could not be read -> why
+
+    @classmethod
+    def found(cls, folder: Path) -> tuple[Tree, list[Entry]]:
+        """Find the flights of a tree; of the kinds of pictures, those that any frame of it has.
+
+        Raises:
+            InputError: it is none.
+        """
+        folders = find_flights(folder)
+        has = {
+            file
+            for flight in folders
+            for frame in sorted(flight.glob("frames_playback/*"))[:1]
+            for file, name in FILE_NAMES.items()
+            if (frame / name).exists()
+        }
+        tree = cls(folder, tuple(file for file in FILE_NAMES if file in has))
+        entries = []
+        for path in folders:
+            *above, town, trajectory, variant = ("", "", "", *path.relative_to(folder).parts)
+            name = "/".join(("_".join(filter(None, above)), town, trajectory, variant))
+            entries.append(Entry(name, (path.relative_to(folder).as_posix(),), 0))
+        return tree, with_ids(entries)
+
+    def rows(self, entry: Entry) -> list[Row]:
+        flight = read_flight(self.folder / entry.parts[0], strict=False)
+        run, *_ = entry.name.split("/")
+        # Who made the split and told the walks is not said in a tree.
+        nobody = Placed(walk="", split="train")
+        given = entry.given_id
+        rows = []
+        for i in range(len(flight)):
+            row = {column.name: column.cell(flight, i, None, nobody) for column in SCALARS}
+            row |= {"run": run, "walk": None, "split": None, "look": None}
+            rows.append(row | ({"sample_id": f"{given}_frame_{i:05d}"} if given else {}))
+        return rows
+
+    def pictures(self, entry: Entry) -> Iterator[Pictures]:
+        folder = self.folder / entry.parts[0]
+        flight = read_flight(folder, strict=False)
+        for i in range(len(flight)):
+            frame = flight.frame_folder(i)
+            yield {
+                file: read_bytes(frame / FILE_NAMES[file], what="frame's file", tree=self.folder)
+                if (frame / FILE_NAMES[file]).is_file()
+                else None
+                for file in self.files
+            }

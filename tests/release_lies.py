@@ -1,0 +1,580 @@
+"""Lies about a release, each told with hashes, counts and card made right again. A lie changes the rows in place; `True`: pixels tell it."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from release_tampering import depth_of, pixels_of, png, set_depth
+
+Row = dict[str, Any]
+Lie = Callable[[list[Row]], None]
+
+
+def clean(rows: list[Row]) -> list[Row]:
+    """The rows of the first clean flight."""
+    first = next(row for row in rows if row["track"] == "clean")
+    return flight_of(rows, first)
+
+
+def flight_of(rows: list[Row], one: Row) -> list[Row]:
+    return [row for row in rows if (row["trajectory"], row["variant"]) == (one["trajectory"], one["variant"])]
+
+
+def perturbed(rows: list[Row]) -> list[Row]:
+    first = next(row for row in rows if row["track"] == "perturbed")
+    return flight_of(rows, first)
+
+
+def shifted(rows: list[Row]) -> Row:
+    return next(row for row in perturbed(rows) if row["perturbation"]["position"] == "applied")
+
+
+def captioned(rows: list[Row]) -> list[Row]:
+    return [row for row in rows if row["has_caption"]]
+
+
+def seen(rows: list[Row]) -> list[Row]:
+    return [row for row in clean(rows) if row["target_visible"]]
+
+
+def other_flight(rows: list[Row]) -> list[Row]:
+    """A clean flight of another trajectory; where there is none, the perturbed one."""
+    own = clean(rows)[0]
+    others = (row for row in rows if row["track"] == "clean" and row["trajectory"] != own["trajectory"])
+    one = next(others, None)
+    return perturbed(rows) if one is None else flight_of(rows, one)
+
+
+def swap(one: Row, other: Row, *names: str) -> None:
+    for name in names:
+        one[name], other[name] = other[name], one[name]
+
+
+def projected(row: Row) -> None:
+    """Make pixel, depth and boxes of the target those of its pose again."""
+    from cosfly.geometry import box_corners, project, world_from_camera
+    from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+
+    pose, k = row["pose"], row["intrinsics"]
+    camera = world_from_camera(
+        np.array([pose["x_m"], pose["y_m"], pose["z_m"]]),
+        np.array([pose["pitch_deg"], pose["yaw_deg"], pose["roll_deg"]]),
+    )
+    matrix = np.array([[k["fx"], 0, k["cx"]], [0, k["fy"], k["cy"]], [0, 0, 1.0]])
+    target = np.array([row["target"][axis] for axis in ("x_m", "y_m", "z_m")])
+    uv, z = project(target[None], camera, matrix)
+    corners, _ = project(box_corners(target, np.array(PERSON_HALF_EXTENTS_M)), camera, matrix)
+    if np.isnan(corners).any():
+        return
+    low = np.clip(corners.min(axis=0), 0, [row["width_px"], row["height_px"]])
+    high = np.clip(corners.max(axis=0), 0, [row["width_px"], row["height_px"]])
+    row["target_uv"] = {"u_px": float(uv[0, 0]), "v_px": float(uv[0, 1])}
+    row["target_depth_m"] = float(z[0])
+    if row["target_bbox"] is not None:
+        row["target_bbox"] = dict(
+            zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, (*low, *high)), strict=True)
+        )
+
+
+# --- identity ---------------------------------------------------------------------------------------------------------
+
+
+def sample_id_of_another_frame(rows):
+    clean(rows)[3]["sample_id"] = clean(rows)[3]["sample_id"][:-5] + "00999"
+
+
+def label_outside_the_set(rows):
+    captioned(rows)[0]["label"] = "fly_away"
+
+
+def verdict_outside_the_set(rows):
+    captioned(rows)[0]["verdict"] = "FINE"
+
+
+def consistent_with_another_decision(rows):
+    row = next(r for r in captioned(rows) if r["label"] and r["decision"] == r["label"])
+    row["label"] = "hover" if row["label"] != "hover" else "ascend"
+
+
+def visibility_above_one(rows):
+    clean(rows)[0]["visibility"] = 1.7
+
+
+def visible_but_not_in_view(rows):
+    seen(rows)[0]["target_in_view"] = False
+
+
+def perturbed_without_offsets(rows):
+    row = next(r for r in perturbed(rows) if not r["is_perturbed"])
+    row["is_perturbed"] = True
+
+
+def offsets_without_flag(rows):
+    shifted(rows)["is_perturbed"] = False
+
+
+def track_against_variant(rows):
+    for row in clean(rows):
+        row["track"] = "perturbed"
+
+
+def path_that_escapes(rows):
+    for row in clean(rows):
+        row["run"] = ".."
+
+
+def time_backwards(rows):
+    own = clean(rows)
+    swap(own[2], own[3], "time_s")
+
+
+def a_second_lost(rows):
+    for row in clean(rows)[5:]:
+        row["time_s"] += 1.0
+
+
+def time_stretched(rows):
+    for row in clean(rows):
+        row["time_s"] *= 1.5
+
+
+def all_targets_null(rows):
+    for row in rows:
+        for name in ("target", "target_uv", "target_bbox", "target_mask_bbox", "target_depth_m", "target_heading_deg"):
+            row[name] = None
+        row["target_in_view"] = row["target_visible"] = False
+        row["visibility"] = 0.0
+
+
+def infinite_angle(rows):
+    clean(rows)[1]["drone_offset"]["roll_deg"] = math.inf
+
+
+def field_of_view_against_focal_length(rows):
+    for row in clean(rows):
+        row["fov_deg"] = 75.0
+
+
+def focal_lengths_exchanged(rows):
+    for row in clean(rows):
+        row["intrinsics"]["fy"] *= 1.1
+        projected(row)
+
+
+def principal_point_moved(rows):
+    for row in clean(rows):
+        row["intrinsics"]["cx"] += 12.0
+        projected(row)
+
+
+def another_camera_all_along(rows):
+    """A field of view that fits its focal length, and everything projected anew."""
+    for row in clean(rows):
+        row["intrinsics"]["fx"] = row["intrinsics"]["fy"] = row["intrinsics"]["fx"] * 1.2
+        row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
+        projected(row)
+        row["target_mask_bbox"] = row["target_mask_bbox"] and dict(row["target_mask_bbox"])
+
+
+# --- geometry and motion ----------------------------------------------------------------------------------------------
+
+
+def target_pixel_moved(rows):
+    seen(rows)[1]["target_uv"]["u_px"] += 3.0
+
+
+def box_against_mask(rows):
+    box = seen(rows)[1]["target_mask_bbox"]
+    box["xmin_px"] += 2.0
+    box["xmax_px"] += 2.0
+
+
+def box_moved(rows):
+    box = seen(rows)[1]["target_bbox"]
+    for name in box:
+        box[name] += 4.0
+
+
+def target_depth_against_depth(rows):
+    seen(rows)[1]["target_depth_m"] += 5.0
+
+
+def target_far_behind_on_its_line(rows):
+    """The target moved along its line of sight: pixel right, depth made right, boxes made right."""
+    for row in seen(rows):
+        for axis in ("x_m", "y_m", "z_m"):
+            row["target"][axis] = row["pose"][axis] + 1.4 * (row["target"][axis] - row["pose"][axis])
+        projected(row)
+
+
+def pose_of_the_next_frame(rows):
+    own = clean(rows)
+    own[4]["pose"] = dict(own[5]["pose"])
+    projected(own[4])
+
+
+def poses_of_two_frames_exchanged(rows):
+    own = clean(rows)
+    swap(own[4], own[9], "pose")
+    projected(own[4])
+    projected(own[9])
+
+
+def poses_of_two_flights_exchanged(rows):
+    for one, other in zip(clean(rows), other_flight(rows), strict=False):
+        swap(one, other, "pose", "target", "target_uv", "target_bbox", "target_depth_m", "target_heading_deg")
+        swap(one, other, "intrinsics", "fov_deg")
+
+
+def pose_frozen(rows):
+    own = clean(rows)
+    for row in own[5:12]:
+        row["pose"] = dict(own[5]["pose"])
+        projected(row)
+
+
+def pose_jumps(rows):
+    row = clean(rows)[6]
+    row["pose"]["x_m"] += 20.0
+    projected(row)
+
+
+def world_turned(rows):
+    """North and east exchanged for one flight, everything projected anew: a mirror image."""
+    for row in clean(rows):
+        for place in (row["pose"], row["target"]):
+            if place:
+                place["x_m"], place["y_m"] = place["y_m"], place["x_m"]
+        row["pose"]["yaw_deg"] = 90.0 - row["pose"]["yaw_deg"]
+        if row["target_heading_deg"] is not None:
+            row["target_heading_deg"] = 90.0 - row["target_heading_deg"]
+        if row["target"]:
+            projected(row)
+
+
+def lower_than_it_was(rows):
+    """A flight three metres lower, target too: nothing of a row tells."""
+    for row in clean(rows):
+        row["pose"]["z_m"] -= 3.0
+
+
+def heading_backwards(rows):
+    for row in clean(rows):
+        if row["target_heading_deg"] is not None:
+            row["target_heading_deg"] = (row["target_heading_deg"] + 180.0 + 180.0) % 360.0 - 180.0
+
+
+def offsets_with_the_other_sign(rows):
+    for row in perturbed(rows):
+        row["drone_offset"] = {name: -value + 0.0 for name, value in row["drone_offset"].items()}
+
+
+def target_offset_lost(rows):
+    row = shifted(rows)
+    row["target_offset"] = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}
+
+
+def unperturbed_called_applied(rows):
+    row = next(r for r in perturbed(rows) if r["perturbation"]["rotation"] == "none")
+    row["perturbation"]["rotation"] = "applied"
+
+
+def clean_flight_from_another_time(rows):
+    for row in perturbed(rows):
+        row["time_s"] += 0.5
+
+
+# --- captions ---------------------------------------------------------------------------------------------------------
+
+
+def window_into_the_future(rows):
+    row = captioned(rows)[0]
+    row["caption_window"] = [index + 1 for index in row["caption_window"]]
+
+
+def window_with_a_gap(rows):
+    row = captioned(rows)[0]
+    row["caption_window"][0] -= 1
+
+
+def decision_differs_between_languages(rows):
+    captioned(rows)[0]["caption_zh_flight_decision"] = "hover"
+
+
+def number_differs_between_languages(rows):
+    for row in captioned(rows):
+        for name in ("caption_zh_reasoning_trace", "caption_zh_critical_components"):
+            text = re.sub(r"(\d+)\.(\d)", lambda m: f"{int(m[1]) + 3}.{m[2]}", row[name], count=1)
+            if text != row[name]:
+                row[name] = text
+                return
+    raise AssertionError("no number to change")
+
+
+def side_differs_between_languages(rows):
+    for row in captioned(rows):
+        for name in ("caption_zh_reasoning_trace", "caption_zh_critical_components"):
+            if "左" in row[name] or "右" in row[name]:
+                row[name] = row[name].translate(str.maketrans("左右", "右左"))
+                return
+    raise AssertionError("no side to change")
+
+
+def number_wrong_in_both_languages(rows):
+    for row in captioned(rows):
+        found = re.search(r"(\d+\.\d) m\b", row["caption_en_critical_components"])
+        if found and found[1] in row["caption_zh_critical_components"]:
+            wrong = f"{float(found[1]) + 7.3:.1f}"
+            for language in ("en", "zh"):
+                name = f"caption_{language}_critical_components"
+                row[name] = row[name].replace(found[1], wrong)
+            return
+    raise AssertionError("no number to change")
+
+
+CAPTION = [
+    "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing", "proved_en", "proved_zh",
+    *(f"{state}_sentences_{lang}" for state in ("proved", "contradicted", "unread") for lang in ("en", "zh")),
+    "sentence_states_en", "sentence_states_zh",
+    *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in ("critical_components", "reasoning_trace", "flight_decision")),
+    "system_en", "system_zh", "prompt_en", "prompt_zh",
+]  # fmt: skip
+TEXTS = [name for name in CAPTION if name.startswith(("caption_", "sentence", "proved_", "unread", "contradicted"))]
+
+
+def captions_of_two_windows_exchanged(rows):
+    """Everything of two captions but the window itself, of flights that go differently."""
+    own = captioned(rows)
+    swap(own[0], own[-1], *CAPTION)
+
+
+def texts_of_two_windows_exchanged(rows):
+    """Texts alone, of two windows with the same decision."""
+    own = captioned(rows)
+    for one in own:
+        for other in reversed(own):
+            if one["trajectory"] != other["trajectory"] and one["decision"] == other["decision"]:
+                swap(one, other, *TEXTS)
+                return
+    raise AssertionError("no such windows")
+
+
+def decision_and_label_changed_together(rows):
+    """The decision in the row and in both languages, label and verdict: all of it says hover."""
+    row = next(r for r in captioned(rows) if r["decision"] != "hover")
+    for name in ("decision", "label", "caption_en_flight_decision", "caption_zh_flight_decision"):
+        row[name] = "hover"
+    row["verdict"] = "CONSISTENT"
+
+
+def hard_conflict_called_soft(rows):
+    row = captioned(rows)[1]
+    wrong = "move_backward" if row["label"] != "move_backward" else "ascend"
+    for name in ("decision", "caption_en_flight_decision", "caption_zh_flight_decision"):
+        row[name] = wrong
+    row["verdict"] = "SOFT_CONFLICT"
+
+
+def prompt_that_holds_the_future(rows):
+    row = captioned(rows)[0]
+    row["prompt_en"] += "\nAfter the last frame the drone turns left."
+    row["prompt_zh"] += "\n最后一帧之后无人机向左转。"
+
+
+def prompt_of_the_next_window(rows):
+    own = captioned(rows)
+    own[0]["prompt_en"], own[0]["prompt_zh"] = own[1]["prompt_en"], own[1]["prompt_zh"]
+
+
+def all_sentences_called_proved(rows):
+    row = captioned(rows)[0]
+    row["proved_sentences_en"] = (row["proved_sentences_en"] or 0) + 1
+
+
+def text_about_something_else(rows):
+    row = captioned(rows)[0]
+    row["caption_en_critical_components"] = "The person is 97.5 m ahead of the drone."
+
+
+def chinese_in_english(rows):
+    row = captioned(rows)[0]
+    row["caption_zh_reasoning_trace"] = row["caption_en_reasoning_trace"]
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def colours_of_neighbours_exchanged(rows):
+    own = perturbed(rows)
+    swap(own[4], own[5], "image")
+
+
+def colours_of_two_flights_exchanged(rows):
+    for one, other in zip(clean(rows), other_flight(rows), strict=False):
+        swap(one, other, "image")
+
+
+def depth_of_neighbours_exchanged(rows):
+    own = perturbed(rows)
+    swap(own[4], own[5], "depth")
+
+
+def instances_of_neighbours_exchanged(rows):
+    own = perturbed(rows)
+    swap(own[4], own[5], "instance")
+
+
+def instances_exchanged_with_their_boxes(rows):
+    own = perturbed(rows)
+    swap(own[4], own[5], "instance", "target_mask_bbox")
+
+
+def depth_doubled(rows):
+    row = seen(rows)[2]
+    depth = depth_of(row)
+    set_depth(row, np.where(depth < 1000, np.minimum(depth * 2, 999), depth).astype(np.float32))
+
+
+def depth_doubled_but_at_the_person(rows):
+    row = clean(rows)[4]
+    depth = depth_of(row)
+    far = np.where(depth < 1000, np.minimum(depth * 1.3, 999), depth).astype(np.float32)
+    box = row["target_bbox"] or {"xmin_px": 0, "ymin_px": 0, "xmax_px": 1, "ymax_px": 1}
+    y, x = slice(int(box["ymin_px"]), int(box["ymax_px"]) + 1), slice(int(box["xmin_px"]), int(box["xmax_px"]) + 1)
+    far[y, x] = depth[y, x]
+    set_depth(row, far)
+
+
+def depth_not_a_number(rows):
+    depth = depth_of(clean(rows)[3])
+    depth[3, 3] = np.nan
+    set_depth(clean(rows)[3], depth)
+
+
+def distance_along_the_ray(rows):
+    """Depth as the length of the ray, not along the axis, in all of a flight."""
+    for row in clean(rows):
+        depth, k = depth_of(row), row["intrinsics"]
+        v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+        length = np.sqrt(((u - k["cx"]) / k["fx"]) ** 2 + ((v - k["cy"]) / k["fy"]) ** 2 + 1)
+        set_depth(row, np.where(depth < 1000, np.minimum(depth * length, 999), depth).astype(np.float32))
+
+
+def depth_in_centimetres(rows):
+    for row in clean(rows):
+        depth = depth_of(row)
+        set_depth(row, np.where(depth < 1000, np.minimum(depth / 10, 999), depth).astype(np.float32))
+
+
+def empty_instances(rows):
+    row = seen(rows)[2]
+    row["instance"]["bytes"] = png(np.zeros((row["height_px"], row["width_px"], 3), np.uint8))
+
+
+def person_painted_over(rows):
+    row = seen(rows)[2]
+    pixels = pixels_of(row, "instance")
+    pixels[(pixels[..., 1] == 255) & (pixels[..., 2] == 255)] = (1, 0, 0)
+    row["instance"]["bytes"] = png(pixels)
+
+
+def person_without_an_instance_of_a_person(rows):
+    row = seen(rows)[2]
+    pixels = pixels_of(row, "instance")
+    pixels[(pixels[..., 1] == 255) & (pixels[..., 2] == 255), 0] = 3
+    row["instance"]["bytes"] = png(pixels)
+
+
+def jpeg_under_a_png_name(rows):
+    import cv2
+
+    row = clean(rows)[2]
+    row["image"]["bytes"] = cv2.imencode(".jpg", pixels_of(row, "image"))[1].tobytes()
+
+
+def smaller_picture(rows):
+    import cv2
+
+    row = clean(rows)[2]
+    row["image"]["bytes"] = png(cv2.resize(pixels_of(row, "image"), (row["width_px"] // 2, row["height_px"] // 2)))
+
+
+def black_picture(rows):
+    row = clean(rows)[2]
+    row["image"]["bytes"] = png(np.zeros((row["height_px"], row["width_px"], 3), np.uint8))
+
+
+def mirrored_picture(rows):
+    row = clean(rows)[2]
+    row["image"]["bytes"] = png(np.ascontiguousarray(pixels_of(row, "image")[:, ::-1]))
+
+
+def colours_swapped_red_and_blue(rows):
+    """In one frame: the brightness of everything stays nearly what it was."""
+    row = clean(rows)[2]
+    row["image"]["bytes"] = png(np.ascontiguousarray(pixels_of(row, "image")[..., ::-1]))
+
+
+def one_picture_in_two_rows(rows):
+    own = clean(rows)
+    own[9]["image"] = copy.deepcopy(own[2]["image"])
+
+
+def other_visibility(rows):
+    row = next(r for r in seen(rows) if r["visibility"] > 0.6)
+    row["visibility"] = 0.3
+
+
+# --- between flights --------------------------------------------------------------------------------------------------
+
+
+def split_that_leaks(rows):
+    own = clean(rows)
+    for row in own:
+        row["split"] = "test" if row["split"] != "test" else "train"
+
+
+def walk_renamed(rows):
+    first = clean(rows)[0]
+    for row in rows:
+        if row["trajectory"] == first["trajectory"] and row["track"] == "perturbed":
+            row["walk"] = "another/walk"
+
+
+def pair_lost(rows):
+    for row in clean(rows):
+        row["pair"] = None
+
+
+LIES: dict[str, tuple[Lie, bool]] = {
+    lie.__name__: (lie, is_of_pixels)
+    for is_of_pixels, lies in (
+        (False, (
+            sample_id_of_another_frame, label_outside_the_set, verdict_outside_the_set, consistent_with_another_decision,
+            visibility_above_one, visible_but_not_in_view, perturbed_without_offsets, offsets_without_flag, track_against_variant,
+            path_that_escapes, time_backwards, a_second_lost, all_targets_null, infinite_angle,
+            field_of_view_against_focal_length, focal_lengths_exchanged, principal_point_moved, target_pixel_moved, box_moved,
+            target_depth_against_depth, pose_jumps, heading_backwards, offsets_with_the_other_sign, target_offset_lost,
+            unperturbed_called_applied, clean_flight_from_another_time, window_into_the_future, window_with_a_gap,
+            decision_differs_between_languages, number_differs_between_languages, side_differs_between_languages,
+            number_wrong_in_both_languages, captions_of_two_windows_exchanged, texts_of_two_windows_exchanged,
+            decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
+            all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
+            time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
+        )),
+        (True, (
+            another_camera_all_along, box_against_mask, target_far_behind_on_its_line, poses_of_two_flights_exchanged,
+            world_turned, colours_of_neighbours_exchanged, colours_of_two_flights_exchanged, depth_of_neighbours_exchanged,
+            instances_of_neighbours_exchanged, instances_exchanged_with_their_boxes, depth_doubled, depth_doubled_but_at_the_person,
+            depth_not_a_number, distance_along_the_ray, depth_in_centimetres, empty_instances, person_painted_over,
+            person_without_an_instance_of_a_person, jpeg_under_a_png_name, smaller_picture, black_picture, mirrored_picture,
+            colours_swapped_red_and_blue, one_picture_in_two_rows, other_visibility,
+        )),
+    )
+    for lie in lies
+}  # fmt: skip

@@ -1,0 +1,145 @@
+"""A forger's kit: change the rows of a release and make hashes, counts, splits and card right again, as somebody would who knows the format."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cosfly.reading.files import sha256_file
+from release import columns
+from release.card.numbers import compute_numbers
+from release.package.shards import open_writer
+from release.package.stage import write_records
+from release.record import (
+    ReleasedFlight,
+    ReleaseRecord,
+    Shard,
+    SplitNumbers,
+    content_digest,
+    read_record,
+    shard_path,
+)
+
+Row = dict[str, Any]
+
+
+def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
+    """Give the record, and of each shard all rows with their pictures."""
+    record = read_record(dataset / "release.json")
+    return record, [pq.read_table(dataset / shard.path).to_pylist() for shard in record.shards]
+
+
+def forge(
+    dataset: Path,
+    out: Path,
+    change: Callable[[list[Row]], None] = lambda rows: None,
+    change_record: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> Path:
+    """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them right again."""
+    record, shards = read_all(dataset)
+    change([row for rows in shards for row in rows])
+    shutil.rmtree(out, ignore_errors=True)
+    (out / "data").mkdir(parents=True)
+    schema = columns.schema(record.settings.modalities)
+    written = []
+    for old, rows in zip(record.shards, shards, strict=True):
+        path = out / "data" / f"{len(written)}.parquet"
+        with open_writer(str(path), schema) as writer:
+            for at in range(0, len(rows), 50):
+                writer.write_table(pa.Table.from_pylist(rows[at : at + 50], schema=schema))
+        written.append((path, old, len(rows)))
+    hashed = [(path, old.split, rows, sha256_file(path)) for path, old, rows in written]
+    digest = content_digest((split, sha256) for _, split, _, sha256 in hashed)
+    counts, numbers, entries = Counter(split for _, split, _, _ in hashed), Counter[str](), []
+    for path, split, rows, sha256 in hashed:
+        name = shard_path(split, digest, numbers[split], counts[split])
+        numbers[split] += 1
+        path.rename(out / name)
+        entries.append(Shard(path=name, split=split, rows=rows, bytes=(out / name).stat().st_size, sha256=sha256))
+    flights = _flights(record, [row for rows in shards for row in rows])
+    update: dict[str, Any] = {"shards": entries, "content_digest": digest, "flights": flights}
+    update["splits"] = record.splits.model_copy(
+        update={"splits": _splits(flights, [r for rows in shards for r in rows])}
+    )
+    captions = sum(bool(row["has_caption"]) for rows in shards for row in rows)
+    history = record.history.model_copy(deep=True)
+    history.captions.accepted += captions - history.captions.released
+    history.captions.read += captions - history.captions.released
+    history.captions.released = captions
+    update["history"] = history
+    record = record.model_copy(update=update)
+    computed = compute_numbers([out / shard.path for shard in entries], record.settings.num_frames)
+    values = record.model_copy(update={"numbers": computed}).model_dump(mode="json")
+    change_record(values)
+    finish(out, ReleaseRecord.model_validate_json(json.dumps(values)))
+    return out
+
+
+def finish(out: Path, record: ReleaseRecord) -> None:
+    """Write the records as a build does."""
+    write_records(out, record)
+
+
+def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:
+    known = {flight.flight: flight for flight in record.flights}
+    frames: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        frames["/".join(row[name] for name in columns.PLACE)].append(row)
+    return [
+        ReleasedFlight(
+            flight=name, frames=len(own), split=own[0]["split"], walk=own[0]["walk"], pair=own[0]["pair"],
+            frames_available=known[name].frames_available if name in known else len(own),
+        )
+        for name, own in frames.items()
+    ]  # fmt: skip
+
+
+def _splits(flights: list[ReleasedFlight], rows: list[Row]) -> dict[str, SplitNumbers]:
+    found = {}
+    for split in dict.fromkeys(flight.split for flight in flights):
+        own = [flight for flight in flights if flight.split == split]
+        found[split] = SplitNumbers(
+            frames=sum(flight.frames for flight in own),
+            captions=sum(bool(row["has_caption"]) for row in rows if row["split"] == split),
+            flights=len(own),
+            trajectories=len({flight.flight.rpartition("/")[0] for flight in own}),
+            walks=sorted({flight.walk for flight in own}),
+            towns=sorted({flight.flight.split("/")[1] for flight in own}),
+        )
+    return found
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def depth_of(row: Row) -> np.ndarray:
+    from io import BytesIO
+
+    return np.load(BytesIO(row["depth"]))
+
+
+def set_depth(row: Row, depth: np.ndarray) -> None:
+    from cosfly.products.frames import depth_bytes
+
+    row["depth"] = depth_bytes(depth)
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """PNG bytes of (h, w, 3) RGB."""
+    import cv2
+
+    return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
+
+
+def pixels_of(row: Row, column: str) -> np.ndarray:
+    import cv2
+
+    return cv2.imdecode(np.frombuffer(row[column]["bytes"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()

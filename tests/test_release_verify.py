@@ -1,0 +1,368 @@
+"""`release verify`: what honest releases get, what lies it finds that make everything else right again, and what hostile files do to it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from release_lies import LIES
+from release_tampering import forge, read_all, set_depth
+from specimens_foreign import write_foreign_tree
+from typer.testing import CliRunner
+
+from caption.truth.released import read_released
+from cosfly import pipeline
+from cosfly.cli import app
+from cosfly.config import load
+from cosfly.errors import InputError
+from cosfly.products.frames import instance_bytes
+from cosfly.products.playback import find_flights
+from cosfly.reading.documents import read_json
+from cosfly.settings import RunConfig
+from release.package import stage as package
+from release.package.sources import Source
+from release.package.stage import ReleaseConfig
+from release.verify.findings import EXAMPLES, Findings
+from release.verify.verify import verify
+
+TINY = [
+    "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=160",
+    "render.height_px=90", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def honest_run(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("verify") / "run"
+    pipeline.run(load(RunConfig, None, TINY), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def honest(honest_run, tmp_path_factory) -> Path:
+    """A small release of what the whole way makes: two walks, both tracks, twenty frames each."""
+    cfg = ReleaseConfig(num_frames=20, licence="cc-by-4.0")
+    return package.run(cfg, [Source.of_run(honest_run)], tmp_path_factory.mktemp("verify") / "release")
+
+
+@pytest.fixture
+def dataset(honest, tmp_path) -> Path:
+    return shutil.copytree(honest, tmp_path / "dataset")
+
+
+def errors(folder: Path, level: str = "pixels") -> dict[str, int]:
+    report = verify(folder, level=level, reader=read_released)
+    return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
+
+
+# --- honest -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", ["structure", "rows", "pixels"])
+def test_an_honest_release_passes(honest, level):
+    report = verify(honest, level=level, reader=read_released)
+    assert report.is_ok, str(report)
+    assert report.issues == []
+
+
+def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
+    """Else every lie below would be found for the kit's own faults."""
+    assert errors(forge(honest, tmp_path / "again")) == {}
+
+
+def test_processes_find_what_one_finds(honest, tmp_path):
+    forged = forge(honest, tmp_path / "forged", LIES["depth_doubled"][0])
+    one, two = (verify(forged, workers=workers, reader=read_released) for workers in (0, 2))
+    assert not one.is_ok
+    assert str(one) == str(two)
+
+
+def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
+    """Files are links into ../../blobs."""
+    snapshot, blobs = tmp_path / "datasets--me--flights/snapshots/0123", tmp_path / "datasets--me--flights/blobs"
+    blobs.mkdir(parents=True)
+    for number, path in enumerate(sorted(path for path in honest.rglob("*") if path.is_file())):
+        shutil.copy(path, blobs / str(number))
+        link = snapshot / path.relative_to(honest)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
+    assert errors(snapshot) == {}
+
+
+def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
+    assert errors(honest_run / "render") == {}
+    assert errors(write_foreign_tree(tmp_path / "public")) == {}
+
+
+# --- lies -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_lie_is_found(honest, tmp_path, name):
+    lie, is_of_pixels = LIES[name]
+    forged = forge(honest, tmp_path / "forged", lie)
+    assert errors(forged, "pixels" if is_of_pixels else "rows"), name
+
+
+RECORD_LIES = {
+    "axes of the other hand": lambda r: r["coordinates"].update(handedness="left"),
+    "no coordinates": lambda r: r["coordinates"].clear(),
+    "no maps": lambda r: r["maps"].clear(),
+    "another rule of frames": lambda r: r.update(frame_selection="the best ones"),
+    "nothing was repaired": lambda r: r["provenance"]["repairs"].update(accepted=0),
+    "another teacher": lambda r: r["provenance"]["teachers"][0].update(model="somebody"),
+    "fewer captions were read": lambda r: r["provenance"]["teachers"][0].update(captions=1),
+    "flights were left out": lambda r: r["history"]["flights"]["left_out"].update(bad=3),
+    "another version": lambda r: r.update(made_by="cosfly 99"),
+    "a run that is no source": lambda r: r["provenance"]["sources"][0].update(run="elsewhere"),
+    "fewer frames available": lambda r: r["flights"][0].update(frames_available=r["flights"][0]["frames"]),
+    "splits by town": lambda r: r["splits"].update(by="town"),
+}
+
+
+@pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])
+def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
+    forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
+    assert errors(forged, "rows"), name
+
+
+def test_towns_in_two_splits_are_a_leak_where_splits_are_by_town(honest, tmp_path):
+    splits = {flight["split"] for flight in read_json(honest / "release.json")["flights"]}
+    forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES["splits by town"])
+    assert ("leak" in errors(forged, "rows")) == (len(splits) > 1)
+
+
+# --- hostile files ----------------------------------------------------------------------------------------------------
+
+
+def large_png(width: int, height: int) -> bytes:
+    """A PNG whose header claims more than there is; its checksums hold."""
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(b"\0" * 1000)), (b"IEND", b""))
+    packed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def large_array() -> bytes:
+    """A float32 array of 4 TB, by its header."""
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+def a_broken_link(folder: Path) -> None:
+    shard = next((folder / "data").iterdir())
+    shard.unlink()
+    shard.symlink_to("nowhere.parquet")
+
+
+def a_link_that_leads_out(folder: Path) -> None:
+    shard = next((folder / "data").iterdir())
+    shutil.move(shard, folder.parent / "elsewhere.parquet")
+    shard.symlink_to(folder.parent / "elsewhere.parquet")
+
+
+def a_loop_of_links(folder: Path) -> None:
+    (folder / "data/deeper").symlink_to(folder, target_is_directory=True)
+
+
+def checksums_in_another_encoding(folder: Path) -> None:
+    (folder / "checksums.sha256").write_bytes(b"\xff\xfe\x00" * 40)
+
+
+def a_card_in_another_encoding(folder: Path) -> None:
+    (folder / "README.md").write_bytes(b"\xff\xfe\x00" * 40)
+
+
+def a_shard_cut_short(folder: Path) -> None:
+    shard = next((folder / "data").iterdir())
+    os.truncate(shard, shard.stat().st_size // 2)
+
+
+def a_shard_of_another_schema(folder: Path) -> None:
+    pq.write_table(pa.table({"a": [1, 2, 3]}), next((folder / "data").iterdir()))
+
+
+def a_sparse_shard(folder: Path) -> None:
+    os.truncate(next((folder / "data").iterdir()), 20_000_000_000)
+
+
+def a_sparse_file_beside(folder: Path) -> None:
+    (folder / "data/more.parquet").touch()
+    os.truncate(folder / "data/more.parquet", 20_000_000_000)
+
+
+def a_pipe(folder: Path) -> None:
+    shard = next((folder / "data").iterdir())
+    shard.unlink()
+    os.mkfifo(shard)
+
+
+def a_folder_for_a_file(folder: Path) -> None:
+    (folder / "README.md").unlink()
+    (folder / "README.md").mkdir()
+
+
+def a_number_that_overflows(folder: Path) -> None:
+    text = (folder / "release.json").read_text()
+    (folder / "release.json").write_text(text.replace('"frames": ', '"frames": 1e999, "x": ', 1))
+
+
+def a_path_that_escapes(folder: Path) -> None:
+    record = json.loads((folder / "release.json").read_text())
+    record["shards"][0]["path"] = "../../etc/passwd"
+    (folder / "release.json").write_text(json.dumps(record))
+
+
+def a_checksum_of_a_file_outside(folder: Path) -> None:
+    with (folder / "checksums.sha256").open("a") as file:
+        file.write(f"{'0' * 64}  ../../../etc/passwd\n")
+
+
+HOSTILE = (
+    a_broken_link, a_link_that_leads_out, a_loop_of_links, checksums_in_another_encoding, a_card_in_another_encoding,
+    a_shard_cut_short, a_shard_of_another_schema, a_sparse_shard, a_sparse_file_beside, a_pipe, a_folder_for_a_file,
+    a_number_that_overflows, a_path_that_escapes, a_checksum_of_a_file_outside,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", HOSTILE, ids=lambda damage: damage.__name__)
+def test_hostile_files_are_findings_and_no_traceback(dataset, damage):
+    damage(dataset)
+    for level in ("structure", "pixels"):
+        assert errors(dataset, level)
+
+
+def _claims(column: str, data: bytes):
+    def change(rows):
+        if column == "depth":
+            rows[2]["depth"] = data
+        else:
+            rows[2][column]["bytes"] = data
+
+    return change
+
+
+def _null_pose(rows):
+    rows[2]["pose"] = None
+
+
+def _null_everything(rows):
+    keep = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split", "walk", "pair",
+            "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
+    rows[2].update({name: None for name in rows[2] if name not in keep})
+
+
+def _half_a_caption(rows):
+    row = next(row for row in rows if row["has_caption"])
+    row["caption_window"], row["caption_picture_px"] = [], [0]
+
+
+def _zero_focal(rows):
+    for row in rows:
+        row["intrinsics"] = {"fx": 0.0, "fy": 0.0, "cx": 0.0, "cy": 0.0}
+
+
+def _palette(rows):
+    rows[1]["instance"]["bytes"] = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16), 9)[
+        :-30
+    ]
+
+
+def _flat_depth(rows):
+    set_depth(rows[1], np.full((90, 160), 7.0, np.float32))
+
+
+def _double_depth(rows):
+    from io import BytesIO
+
+    buffer = BytesIO()
+    np.save(buffer, np.full((90, 160), 7.0))
+    rows[1]["depth"] = buffer.getvalue()
+
+
+ODD_ROWS = {
+    "a PNG of 60,000 x 60,000": _claims("image", large_png(60_000, 60_000)),
+    "an instance of 60,000 x 60,000": _claims("instance", large_png(60_000, 60_000)),
+    "a PNG that unpacks to less": _claims("image", large_png(160, 90)),
+    "an array of 4 TB": _claims("depth", large_array()),
+    "no bytes": _claims("image", b""),
+    "no depth": _claims("depth", b""),
+    "text for a picture": _claims("instance", b"hello" * 100),
+    "no pose": _null_pose,
+    "hardly anything": _null_everything,
+    "an empty window": _half_a_caption,
+    "no focal length": _zero_focal,
+    "an instance cut short": _palette,
+    "a flat depth": _flat_depth,
+    "depth in double": _double_depth,
+}
+
+
+@pytest.mark.parametrize("name", ODD_ROWS)
+def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
+    try:
+        forged = forge(honest, tmp_path / "forged", ODD_ROWS[name])
+    except (InputError, TypeError, KeyError):  # no card comes of it: then the old one stands there, which is found too
+        forged = _rows_alone(honest, tmp_path / "forged", ODD_ROWS[name])
+    assert errors(forged)
+
+
+def _rows_alone(honest: Path, out: Path, change) -> Path:
+    """Change rows and nothing else."""
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(honest, out)
+    record, shards = read_all(out)
+    change(shards[0])
+    path = out / record.shards[0].path
+    schema = pq.read_schema(path)
+    pq.write_table(pa.Table.from_pylist(shards[0], schema=schema), path)
+    entry = json.loads((out / "release.json").read_text())
+    entry["shards"][0]["bytes"] = path.stat().st_size
+    (out / "release.json").write_text(json.dumps(entry))
+    return out
+
+
+# --- what it tells ----------------------------------------------------------------------------------------------------
+
+
+def test_one_line_a_kind_with_count_and_first_places():
+    findings = Findings()
+    for number in range(1000):
+        findings.error("kind", f"row {number}", number, "nothing")
+    findings.warn("other", "row 7", "a\nline", "none")
+    report = findings.report()
+    lines = str(report).splitlines()
+    assert len(lines) == 3
+    assert "kind: 1,000 times: row 0: got 0" in lines[0]
+    assert all(f"row {number}" in lines[0] for number in range(EXAMPLES))
+    assert report.num("error") == 1000
+
+
+def test_the_command_tells_people_and_machines(honest, tmp_path):
+    forged = forge(honest, tmp_path / "forged", LIES["visibility_above_one"][0])
+    before = {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()}
+    arguments = ["release", "verify", str(forged), "--level", "rows", "--json", str(tmp_path / "found.json"), "--repair-plan", "--workers", "1"]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1
+    assert "range: once" in result.output
+    assert "repair plan: range" in result.output
+    told = read_json(tmp_path / "found.json")
+    assert told["ok"] is False
+    assert {kind["code"] for kind in told["findings"]} == {"range"}
+    assert {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()} == before
+    assert CliRunner().invoke(app, ["release", "verify", str(honest), "--level", "structure"]).exit_code == 0
+    assert CliRunner().invoke(app, ["release", "verify", str(honest), "--level", "all"]).exit_code == 2
+
+
+def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
+    tree = shutil.copytree(honest_run / "render", tmp_path / "tree")
+    (find_flights(tree)[0] / "frames_playback/frame_00003/rgb.png").unlink()
+    assert {"missing", "picture"} <= set(errors(tree))
