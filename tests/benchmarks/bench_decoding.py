@@ -1,0 +1,131 @@
+"""How fast a student of Qwen3.5's 2 B shape answers, with random weights and made-up samples, beside plain `generate`.
+
+    python tests/benchmarks/bench_decoding.py --shape 2b --batch 16 64 128       on an accelerator
+    python tests/benchmarks/bench_decoding.py                                    on a CPU: a tiny shape, to see that it runs
+    python tests/benchmarks/bench_decoding.py --check                            tokens against `generate`, in float32
+
+Pictures are noise in memory; what it takes to read them, and what frames that several samples share save, tells `cosfly distill infer` on a
+playback tree (`speed` in its manifest). Ways: generate (the library's), decode (ours), features (ours, the pictures looked at before).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scenes
+import torch
+from bench_training import END, PAD, SHAPES, Words, make_rows, make_student, noise_of
+
+from distill.student.decoding import decode
+from distill.student.encoding import Encoded, prompt_batch
+from distill.student.model import Student
+
+
+class Numbers(Words):
+    """Texts of tokens are their numbers."""
+
+    def decode(self, ids: list[int], **_: Any) -> str:
+        return " ".join(map(str, ids))
+
+
+def make_batch(student: Student, shape: dict[str, Any], count: int) -> tuple[list[Encoded], Any]:
+    """Give prompts with their patches, and what the tower makes of these."""
+    rows = []
+    for row, pictures in make_rows(shape, count, seed=1):
+        patches = torch.cat([noise_of(picture, torch.float32).patches for picture in pictures]).numpy()
+        rows.append(replace(row, pixel_values=patches))
+    with torch.inference_mode():
+        seen = []
+        for row in rows:  # one after the other: a batch of towers' activations would be the most memory of all
+            inputs = prompt_batch(student, [row])
+            seen += student.core.model.get_image_features(
+                inputs["pixel_values"], inputs["image_grid_thw"]
+            ).pooler_output
+        return rows, torch.cat(seen)
+
+
+def generate(student: Student, rows: list[Encoded], num_tokens: int) -> list[str]:
+    """Answer by the library's own way."""
+    inputs = prompt_batch(student, rows)
+    with torch.inference_mode():
+        output = student.model.generate(
+            **inputs, max_new_tokens=num_tokens, do_sample=False, eos_token_id=END, pad_token_id=PAD
+        )
+    answers = output[:, inputs["input_ids"].shape[1] :].tolist()
+    return [student.tokenizer.decode(ids[: ids.index(END)] if END in ids else ids) for ids in answers]
+
+
+def seconds(work: Callable[[], Any], device: str, repeats: int) -> float:
+    """Time a call, on a CPU in processor time: the shortest of several, after one that is not counted."""
+    clock = time.perf_counter if device == "cuda" else time.process_time
+    work()
+    times = []
+    for _ in range(repeats):
+        if device == "cuda":
+            torch.cuda.synchronize()
+        begin = clock()
+        work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        times.append(clock() - begin)
+    return min(times)
+
+
+def measure(student: Student, shape: dict[str, Any], count: int, options: argparse.Namespace) -> list[list[Any]]:
+    rows, features = make_batch(student, shape, count)
+    ways: dict[str, Callable[[int], Any]] = {
+        "generate": lambda tokens: generate(student, rows, tokens),
+        "decode": lambda tokens: decode(student, rows, max_tokens=tokens),
+        "features": lambda tokens: decode(student, rows, max_tokens=tokens, features=features),
+    }
+    table = []
+    for name in options.ways:
+        if student.device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        first_s = seconds(lambda way=ways[name]: way(1), student.device, options.repeats)
+        all_s = seconds(lambda way=ways[name]: way(options.tokens), student.device, options.repeats)
+        peak = torch.cuda.max_memory_allocated() / 2**30 if student.device == "cuda" else float("nan")
+        step_ms = 1e3 * (all_s - first_s) / max(1, options.tokens - 1)
+        table.append([name, count, first_s, step_ms, count / all_s, count * options.tokens / all_s, peak])
+    return table
+
+
+def check(student: Student, shape: dict[str, Any], count: int, num_tokens: int) -> None:
+    rows, features = make_batch(student, shape, count)
+    expected = generate(student, rows, num_tokens)
+    for given in (None, features):
+        found = [answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=given)]
+        assert found == expected, f"{np.sum([a != b for a, b in zip(found, expected, strict=True)])} answers differ"
+    print(f"{count} answers of {num_tokens} tokens: those of generate")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shape", choices=list(SHAPES), default="tiny")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, 8])
+    parser.add_argument("--tokens", type=int, default=200)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--ways", nargs="+", default=["generate", "decode", "features"])
+    parser.add_argument("--check", action="store_true", help="compare tokens in float32 instead of measuring")
+    options = parser.parse_args()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    scenes.one_thread_and_machine()
+    dtype = torch.float32 if options.check or device == "cpu" else torch.bfloat16
+    student = make_student(SHAPES[options.shape], device, dtype)
+    student.tokenizer = Numbers()
+    student.model.eval()
+    if options.check:
+        check(student, SHAPES[options.shape], max(options.batch), options.tokens)
+        return
+    table = [row for count in options.batch for row in measure(student, SHAPES[options.shape], count, options)]
+    names = ["way", "batch", "first token, s", "ms a step", "answers/s", "tokens/s", "peak GiB"]
+    scenes.print_table(f"{options.shape}, {options.tokens} tokens, {device}, {dtype}", names, table)
+
+
+if __name__ == "__main__":
+    main()
