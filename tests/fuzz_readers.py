@@ -257,7 +257,7 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
     )
     step = root / "checkpoints/step_000002"
     step.mkdir(parents=True)
-    write_json(step / "state.json", {"schema": "cosfly.checkpoint", "schema_version": "1.0", "step": 2})
+    write_json(step / "state.json", {"schema": "cosfly.checkpoint", "schema_version": "2.0", "step": 2})
     write_checksums(step, {"state.json": provenance.fingerprint(step / "state.json")})
     (root / "log.jsonl").write_text("".join(f'{{"step": {k}, "loss": 0.5}}\n' for k in range(4)))
     model = root / "model"
@@ -416,7 +416,7 @@ def _resumed(root: Path, scratch: Path) -> None:
 def _checkpoint(root: Path, scratch: Path) -> None:
     newest = checkpoint.newest_checkpoint(root / "checkpoints")
     if newest is not None:
-        int(read_json(newest / "state.json")["step"])
+        checkpoint.read_progress(newest)
 
 
 def _log(root: Path, scratch: Path) -> None:

@@ -82,7 +82,7 @@ class Looker:
 class Census:
     """The samples of a split that are learnt from, and how many were left out for what reason.
 
-    indices (n,): their places in the split. prompt_tokens, answer_tokens (n,). examples: reason -> the first sample left out.
+    indices (n,): their places in the split, increasing. prompt_tokens, answer_tokens (n,). examples: reason -> the first sample left out.
     """
 
     indices: np.ndarray
@@ -102,9 +102,9 @@ class Census:
     def tokens(self) -> np.ndarray:
         return self.prompt_tokens + self.answer_tokens
 
-    def pictures_of(self, position: int) -> list[Picture]:
-        """Give the pictures of the sample at `position` of `indices`."""
-        return [self.pictures[place] for place in self._places[position]]
+    def pictures_of(self, index: int) -> list[Picture]:
+        """Give the pictures of the sample at a place of the split."""
+        return [self.pictures[place] for place in self._places[int(np.searchsorted(self.indices, index))]]
 
 
 def take_census(
@@ -125,36 +125,63 @@ def take_census(
     """
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
     mine, looker = chunks[ranks.rank :: ranks.size], Looker(samples, processor, trees, max_tokens)
-    seen: list[Counted] = []
+    seen = _Seen()
     with progress_bar(label, total=sum(map(len, mine))) as advance:
         for counted in in_order(looker, mine, max(0, min(workers, len(mine) - 1))):
-            seen += counted
+            seen.add(counted)
             advance(len(counted))
-    everything = sorted((c for part in ranks.gathered(seen) for c in part), key=lambda counted: counted.index)
-    return _summed(everything)
+    return _census(ranks.gathered(seen))
 
 
-def _summed(everything: Sequence[Counted]) -> Census:
-    kept = [counted for counted in everything if counted.reason is None]
-    left_out = [counted for counted in everything if counted.reason is not None]
-    examples: dict[str, str] = {}
-    for counted in left_out:
-        examples.setdefault(str(counted.reason), f"{counted.key}: {counted.detail}")
-    places: dict[Picture, int] = {}
-    of_samples = [
-        np.array([places.setdefault(picture, len(places)) for picture in counted.pictures], np.int32)
-        for counted in kept
-    ]
+@dataclass
+class _Seen:
+    """What one process saw, each picture once, so that a million samples take little. rows: (index, prompt, answer tokens)."""
+
+    rows: list[tuple[int, int, int]] = field(default_factory=list)
+    of_samples: list[np.ndarray] = field(default_factory=list)  # places of the pictures of each row
+    places: dict[Picture, int] = field(default_factory=dict)
+    decisions: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+    examples: dict[str, tuple[int, str]] = field(default_factory=dict)  # reason -> index and words of the first
+
+    def add(self, everything: Sequence[Counted]) -> None:
+        for counted in everything:
+            if counted.reason is not None:
+                self.skipped[counted.reason] += 1
+                self.examples.setdefault(counted.reason, (counted.index, f"{counted.key}: {counted.detail}"))
+                continue
+            self.rows.append((counted.index, counted.prompt_tokens, counted.answer_tokens))
+            self.of_samples.append(self.places_of(counted.pictures))
+            self.decisions[counted.decision] += 1
+
+    def places_of(self, pictures: Sequence[Picture]) -> np.ndarray:
+        return np.array([self.places.setdefault(picture, len(self.places)) for picture in pictures], np.int32)
+
+
+def _census(parts: Sequence[_Seen]) -> Census:
+    """Put together what the processes saw, in the order of the split."""
+    whole = _Seen()
+    of_samples: list[np.ndarray] = []
+    for part in parts:
+        new_place = whole.places_of(list(part.places))
+        of_samples += [new_place[places] for places in part.of_samples]
+        whole.rows += part.rows
+        whole.decisions += part.decisions
+        whole.skipped += part.skipped
+        for reason, example in part.examples.items():
+            whole.examples[reason] = min(example, whole.examples.get(reason, example))
+    rows = np.array(whole.rows, np.int64).reshape(-1, 3)
+    order = np.argsort(rows[:, 0])
     return Census(
-        indices=np.array([counted.index for counted in kept], np.int64),
-        prompt_tokens=np.array([counted.prompt_tokens for counted in kept], np.int64),
-        answer_tokens=np.array([counted.answer_tokens for counted in kept], np.int64),
-        num_samples=len(everything),
-        decisions=Counter(counted.decision for counted in kept),
-        skipped=Counter(str(counted.reason) for counted in left_out),
-        examples=examples,
-        pictures=list(places),
-        _places=of_samples,
+        indices=rows[order, 0],
+        prompt_tokens=rows[order, 1],
+        answer_tokens=rows[order, 2],
+        num_samples=len(rows) + whole.skipped.total(),
+        decisions=whole.decisions,
+        skipped=whole.skipped,
+        examples={reason: words for reason, (_, words) in whole.examples.items()},
+        pictures=list(whole.places),
+        _places=[of_samples[place] for place in order],
     )
 
 

@@ -48,7 +48,7 @@ LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
 
 @dataclass
 class Lesson:
-    """A student, what it learns from, and what it is asked about. Positions in `census` name samples of `samples`."""
+    """A student, what it learns from, and what it is asked about."""
 
     student: Student
     samples: Sequence[Sample]
@@ -62,7 +62,6 @@ class Lesson:
 
     def __post_init__(self) -> None:
         self.steps = Steps.make(self.cfg, len(self.census), self.seed)
-        self._position_of = {int(index): position for position, index in enumerate(self.census.indices)}
 
     def validate(self) -> Validation | None:
         if not len(self.validation_census):
@@ -78,7 +77,7 @@ class Lesson:
             (step, self.census.indices[share_of(self.steps.samples_of(step), lengths, ranks.rank, ranks.size)].tolist())
             for step in range(first, self.steps.num_steps)
         )
-        return self.supply.steps(self.samples, lambda index: self.census.pictures_of(self._position_of[index]), shares)
+        return self.supply.steps(self.samples, self.census.pictures_of, shares)
 
 
 @contextlib.contextmanager

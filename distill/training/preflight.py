@@ -112,7 +112,9 @@ def _about_chat(processor: Processor, sample: Sample) -> Finding:
 
 
 def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: VisionFeatures) -> list[Finding]:
-    memory = estimate(student, cfg, int(census.tokens.max()), sum(map(features.bytes_of, census.pictures_of(0))))
+    memory = estimate(
+        student, cfg, int(census.tokens.max()), sum(map(features.bytes_of, census.pictures_of(int(census.indices[0]))))
+    )
     level: Any = "warning" if memory.needed > memory.available else "fact"
     return [Finding("memory", f"about {memory} with batch_size {cfg.batch_size}", level)]
 

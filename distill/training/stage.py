@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chance import rng_for
-from cosfly.errors import ConfigError
+from cosfly.errors import ConfigError, InputError
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, write_json
 from cosfly.student_chat import Taught, write_taught
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_model_folder
-from distill.student.encoding import most_pixels
 from distill.student.features import PictureReader, VisionFeatures, folder_bytes
 from distill.student.model import Processor, Student, load_student, require, student_folder, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
@@ -149,8 +148,7 @@ def run(
         if preset is not None:
             ranks.first_does(lambda: str(made_student(cfg, samples, base, seed)))
         with memory_errors(cfg):
-            lesson = _lesson(cfg, samples, dataset, trees, base, out, seed, ranks)
-            taught = taught_by(samples, int(lesson.student.image_processor.size["longest_edge"]))
+            lesson, taught = _lesson(cfg, samples, dataset, trees, base, out, seed, ranks)
             progress = fit(lesson, out)
         ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, opened[0]))
     return product
@@ -159,10 +157,16 @@ def run(
 def _lesson(
     cfg: TrainConfig, samples: Sequence[Sample], dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int,
     ranks: Ranks,
-) -> Lesson:  # fmt: skip
+) -> tuple[Lesson, Taught]:  # fmt: skip
     validation = open_split(dataset, "val")
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
-    max_pixels = cfg.max_pixels or most_pixels([*samples, *(validation[index] for index in chosen)])
+    if not samples:
+        raise InputError(
+            "the training split is empty", where=dataset, fix="prepare it with more captions, or other fractions"
+        )
+    taught = taught_by(samples, max(1, cfg.max_pixels))
+    sizes_px = [*(look.size_px for look in taught.looks), *(validation[index].picture_px for index in chosen)]
+    max_pixels = cfg.max_pixels or max(width_px * height_px for width_px, height_px in sizes_px)
     student = prepared_student(cfg, base, max_pixels, seed, ranks.device)
     processor = Processor(student.tokenizer, student.image_processor)
     workers = num_workers(cfg.data_workers)
@@ -176,7 +180,8 @@ def _lesson(
     lesson = Lesson(student, samples, census, validation, asked, Supply(features, reader, workers), cfg, ranks, seed)
     found = findings(cfg, student, census, asked, features, samples[int(census.indices[0])], lesson.steps)
     ranks.first_does(lambda: tell(found, out / PREFLIGHT))
-    return lesson
+    most = int(student.image_processor.size["longest_edge"])
+    return lesson, taught.model_copy(update={"max_pixels": most})
 
 
 def _features(cfg: TrainConfig, student: Student, out: Path, ranks: Ranks) -> VisionFeatures:

@@ -52,11 +52,10 @@ def validate(
     order = np.argsort(-census.tokens, kind="stable")[ranks.rank :: ranks.size].tolist()
     batches = [order[start : start + cfg.batch_size] for start in range(0, len(order), cfg.batch_size)]
     sums = np.zeros(5)  # nats, their weight, samples, right, parsed
-    position_of = {int(index): position for position, index in enumerate(census.indices)}
     shares = [(number, census.indices[batch].tolist()) for number, batch in enumerate(batches)]
     student.model.eval()
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
-        for ready in supply.steps(samples, lambda index: census.pictures_of(position_of[index]), shares):
+        for ready in supply.steps(samples, census.pictures_of, shares):
             if ready.rows:
                 sums += _validate_batch(student, ready.rows, supply, cfg)
             advance(len(ready.rows))
