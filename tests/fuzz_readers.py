@@ -541,8 +541,8 @@ READERS: dict[str, Reader] = {
     "release, verify": Reader(
         ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md"))),
         lambda root, _: _verified(root), share=0.4, hashes=True),
-    "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4),
-    "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4),
+    "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4, hashes=True),
+    "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4, hashes=True),
     "tree, viewer": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, scratch: _viewed(root, scratch, root / "render"), share=0.2),
     "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
