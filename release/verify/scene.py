@@ -27,10 +27,12 @@ AGREE_LEAST = 0.5  # honest 0.81 and more
 THROUGH_MOST = 0.02  # points in front of what is drawn: honest 0.001
 ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of planes; honest below 1e-5 as float32
 SAME_LEAST = 0.95  # of the instances; honest 0.985
-COLOUR_DROP, COLOUR_LEAST = (
-    0.12,
-    0.3,
-)  # below the flight's median, honest 0.08; the median itself, honest 0.55 at 96 x 54
+COLOUR_DROP = 0.15  # below the median of a flight; honest 0.08
+COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
+    0.82,
+    0.65,
+    160,
+)  # that median itself, honest 0.92; of pictures narrower than so much 0.70
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
 BETTER_BY = 0.07  # how much better the next frame's place must explain a frame's colours to be where they are from
 # Flights of others: depth may be rough, but it is equally rough in all frames.
@@ -123,7 +125,8 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
     usual_colour, drop = _usual(colours)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
-    if usual_colour < COLOUR_LEAST and np.isfinite(colours).sum() >= 4:
+    least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
+    if usual_colour < least_colour and np.isfinite(colours).sum() >= 4 and not flight.is_foreign:
         findings.error("scene_colour", flight.name, f"colours that agree by {usual_colour:.2f} from frame to frame", "pictures of this flight")  # fmt: skip
     for i, gap, pair, elsewhere in zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, strict=True):
         if pair.seen < LEAST_SEEN:

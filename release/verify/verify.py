@@ -30,7 +30,7 @@ from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_w
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
 from release.verify.sources import Entry, FlightSource, Shards, Tree
 
-RECORD = "release.json"
+RECORD, EXPORT = "release.json", "export.json"
 RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
 LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
 
@@ -50,6 +50,8 @@ def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: C
         folder = folder / "dataset"
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
+    elif (folder / EXPORT).is_file():
+        _verify_export(folder, level, workers, findings)
     elif (folder / RECORD).is_file() or ((folder / CHECKSUMS).is_file() and not _is_tree(folder)):
         _verify_release(folder, level, workers, reader, findings)
     else:
@@ -151,6 +153,30 @@ def _check_shard_splits(
             if splits.get(entry.name, split_of[shard]) != split_of[shard]:
                 got = f"rows of {splits[entry.name]} in {shard}"
                 findings.error("leak", entry.name, got, f"{split_of[shard]}, the shard's split")
+
+
+# --- an export --------------------------------------------------------------------------------------------------------
+
+
+def _verify_export(folder: Path, level: Level, workers: int, findings: Findings) -> None:
+    """Check an export: its files against its list of checksums, and one that is a playback tree as such. Rows of other formats are those of
+    its release, which is verified where it stands."""
+    digests = read_digests(folder, findings)
+    inner = [
+        path.relative_to(folder).parent for path in folder.glob(f"*/*/*/{CHECKSUMS}")
+    ]  # a tree's flights list their own
+    own = [
+        (place / name).as_posix() for place in inner for name in (*read_digests(folder / place, findings), CHECKSUMS)
+    ]
+    good = check_names(folder, dict.fromkeys((*digests, *own, "README.md", CHECKSUMS)), findings)
+    if EXPORT not in digests:
+        findings.error("checksum", f"{CHECKSUMS}: {EXPORT}", "no line", "one line per file")
+    if level == "pixels":
+        check_digests(folder, digests, good, findings)
+    if _is_tree(folder):
+        _verify_tree(folder, level, workers, findings)
+    elif level != "structure":
+        findings.note("not_checked", EXPORT, "rows of this format", "verify the release that it was made of: its digest stands there")  # fmt: skip
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
