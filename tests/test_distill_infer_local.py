@@ -145,6 +145,25 @@ def test_the_size_of_batches_changes_no_answer(place, clean, tmp_path):
         )
 
 
+def test_interrupted_and_continued_is_the_same(place, clean, tmp_path, monkeypatch):
+    calls: list[int] = []
+
+    def stopping(student: Any, rows: Any, **more: Any) -> Any:
+        calls.append(len(rows))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return decode(student, rows, **more)
+
+    monkeypatch.setattr("distill.inference.local.decode", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        answer(place, tmp_path / "out")
+    assert not (tmp_path / "out" / "predictions.jsonl").exists()
+    assert len(kept_answers(tmp_path / "out")) == sum(calls[:2])
+    assert answer(place, tmp_path / "out").read_bytes() == clean.read_bytes()
+    assert sum(calls) - calls[2] == len(samples_of(place))  # nothing twice but the batch that was broken off
+
+
+@pytest.mark.slow
 def test_killed_and_continued_is_the_same(place, clean, tmp_path):
     """Killed at a real moment of a real process, three times."""
     out = tmp_path / "out"
@@ -259,6 +278,7 @@ def test_a_memory_too_small_for_the_model_is_one_clear_line(place, tmp_path, mon
 # --- what is answered -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_constrained_answers_all_parse(place, clean, tmp_path):
     pytest.importorskip("llguidance")
     assert all(prediction.coc is None for prediction in read_predictions(clean))  # it knows nothing
