@@ -255,8 +255,17 @@ class History(Strict):
     captions: CaptionHistory
 
 
+class PartOf(Strict):
+    """The release that this one is a part of: its name and content digest, the address it was fetched from, what was asked for."""
+
+    name: str
+    content_digest: str
+    source: str
+    choice: dict[str, Any]
+
+
 class ReleaseRecord(Strict):
-    """The whole file."""
+    """The whole file. part_of: null for what `release build` made, whole as it is."""
 
     name: str
     licence: str
@@ -274,6 +283,7 @@ class ReleaseRecord(Strict):
     flights: list[ReleasedFlight]
     content_digest: str
     shards: list[Shard]
+    part_of: PartOf | None = None
 
 
 DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards

@@ -63,13 +63,14 @@ from cosfly.products.town import read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
+from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees
 from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.stage_events import EventLog, read_events
 from cosfly.stage_folder import StageFolder, read_failures, read_manifest
-from cosfly.store import CHECKSUMS, write_checksums, write_json
+from cosfly.store import CHECKSUMS, read_checksums, write_checksums, write_json
 from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
@@ -82,6 +83,11 @@ from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
 from distill.student.taught import taught_by
+from release.export import stage as export
+from release.export.contract import ExportConfig
+from release.export.manifest import read_export
+from release.get import stage as get
+from release.get.choice import Choice
 from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
@@ -164,6 +170,7 @@ def make_specimens(root: Path) -> Path:
         root / "inspect.json", flights.model_copy(update={"flights": accepted, "funnel": funnel})
     )
     package.run(RELEASE, [Source("one", tree, captions, root / "inspect.json")], root / "release")
+    export.run(build(ExportConfig, {"format": "webdataset"}, "x"), root / "release", root / "export")
     shutil.copy(_first_shard(root), root / "shard.parquet")
     _students(root, captions, tree)
     _records(root)
@@ -387,11 +394,13 @@ def _url(root: Path) -> None:
 
 def _stage(run: Callable[..., object], folder: Path) -> None:
     """Do a stage; a bug in an item, which it records, counts as a traceback."""
-    run()
-    path = folder / "failures.jsonl"
-    bugs = [failure.message for failure in read_failures(path) if failure.code == "bug"] if path.exists() else []
-    if bugs:
-        raise AssertionError(f"recorded as a bug: {bugs[0]}")
+    try:
+        run()
+    finally:
+        path = folder / "failures.jsonl"
+        bugs = [failure.message for failure in read_failures(path) if failure.code == "bug"] if path.exists() else []
+        if bugs:
+            raise AssertionError(f"recorded as a bug: {bugs[0]}")
 
 
 def _inspected(root: Path, scratch: Path) -> None:
@@ -478,6 +487,32 @@ def _viewed(root: Path, scratch: Path, folder: Path) -> None:
     viewer.run(folder, scratch / "page.html", ViewerConfig(frames=2, picture_px=32), captions)
 
 
+def _changed_release(root: Path, scratch: Path) -> Path:
+    """A copy of the release with the changed shard in its place, and its size on record: what only differs in size is refused at the door."""
+    dataset = shutil.copytree(root / "release/dataset", scratch / "dataset")
+    shard, changed = min((dataset / "data").iterdir()), root / "shard.parquet"
+    shard.unlink()
+    if changed.is_file():  # a link to itself, a folder or nothing is a shard that is not there
+        shutil.copy(changed, shard)
+        record = read_json(dataset / "release.json")
+        for entry in record["shards"]:
+            if entry["path"] == f"data/{shard.name}":
+                entry["bytes"] = shard.stat().st_size
+        write_json(dataset / "release.json", record)
+        digests = read_checksums(dataset) | {"release.json": sha256_file(dataset / "release.json")}
+        write_checksums(dataset, digests)
+    return dataset
+
+
+def _exported(root: Path, scratch: Path, format: str) -> None:
+    cfg, dataset = build(ExportConfig, {"format": format}, "x"), _changed_release(root, scratch)
+    _stage(lambda: export.run(cfg, dataset, scratch / "export"), scratch / "export")
+
+
+def _fetched(dataset: Path, scratch: Path, **wanted: Any) -> None:
+    _stage(lambda: get.run(build(Choice, wanted, "x"), str(dataset), scratch / "get"), scratch / "get")
+
+
 def _released(root: Path, scratch: Path) -> None:
     source = Source("one", root / "render", root / "captions.jsonl", root / "inspect.json")
     _stage(lambda: package.run(RELEASE, [source], scratch / "release"), scratch / "release")
@@ -544,6 +579,13 @@ READERS: dict[str, Reader] = {
     "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4, hashes=True),
     "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4, hashes=True),
     "tree, viewer": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, scratch: _viewed(root, scratch, root / "render"), share=0.2),
+    **{
+        f"release, export to {name}": Reader(("shard.parquet",), lambda root, scratch, name=name: _exported(root, scratch, name), share=0.1, hashes=True)
+        for name in ("tree", "webdataset", "lerobot")
+    },
+    "release, get": Reader(("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"), lambda root, scratch: _fetched(root / "release/dataset", scratch), share=0.2, hashes=True),
+    "release, get a part": Reader(("shard.parquet",), lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]), share=0.1, hashes=True),
+    "export record": _one("export/webdataset/export.json", read_export),
     "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
     "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),

@@ -203,3 +203,37 @@ def release_export(
     given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
     product = export.run(build(ExportConfig, given, "--format, --shard-mb"), folder, out, **options.manner(cfg, resume))
     options.tell_product(product, out, cfg)
+
+
+@app.command("get")
+def release_get(
+    source: Annotated[
+        str, typer.Argument(help="Release folder, or an address: https://..., hf://datasets/..., zip://::...")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the release and its records.")],
+    town: Annotated[list[str] | None, typer.Option(help="Only this town; repeat for more.")] = None,
+    split: Annotated[list[str] | None, typer.Option(help="Only this split: train, validation, test; repeat.")] = None,
+    flight: Annotated[
+        list[str] | None, typer.Option(help="Only this run/town/trajectory, with its twin flights; repeat.")
+    ] = None,
+    modality: Annotated[
+        list[str] | None,
+        typer.Option(help="Only these pictures: rgb, depth, instance; repeat. Others do not travel."),
+    ] = None,
+    digest: Annotated[
+        str | None, typer.Option(help="Content digest that the release must have, 12 characters of it or more.")
+    ] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    workers: options.Workers = None,
+    resume: options.Resume = "if-same",
+) -> None:
+    """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and all that can be checked is."""
+    from cosfly.config import build
+    from release.get import stage as get
+    from release.get.choice import Choice
+
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}
+    choice = build(Choice, {name: value for name, value in asked.items() if value}, "the options")
+    options.tell_product(get.run(choice, source, out, **options.manner(cfg, resume)), out, cfg)

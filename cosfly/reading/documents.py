@@ -213,7 +213,7 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
         yield line, content
 
 
-def check_schema(value: Any, schema: str, version: str, path: Path) -> dict:
+def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dict:
     """Check that a JSON value is an object of the wanted schema and major version."""
     if not isinstance(value, dict):
         raise InputError(

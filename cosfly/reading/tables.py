@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import io
 import os
 import threading
 from collections import OrderedDict
@@ -49,6 +50,25 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[pq.ParquetFi
             )
         with table:
             yield table
+
+
+@contextlib.contextmanager
+def open_stream(file: io.RawIOBase, where: str) -> Iterator[pq.ParquetFile]:
+    """Open a parquet file that is read by ranges, as one that lies somewhere else; checksums of pages are held against the pages.
+
+    Raises:
+        InputError: it is no whole parquet file; or what `file` raises.
+    """
+    with arrow_errors(where):
+        table = pq.ParquetFile(
+            file,
+            pre_buffer=True,
+            page_checksum_verification=True,
+            thrift_string_size_limit=MOST_FOOTER_BYTES,
+            thrift_container_size_limit=MOST_FOOTER_BYTES,
+        )
+    with table:
+        yield table
 
 
 def num_rows(path: Path) -> int:

@@ -165,10 +165,12 @@ def _summary(record: ReleaseRecord) -> str:
     numbers = record.numbers
     tracks = ", ".join(f"{count} {name}" for name, count in numbers.flights_by_track.items())
     towns = len(numbers.frames_by.town)
+    part = record.part_of
+    whole = f" A part of the release {part.name}, content {part.content_digest}." if part is not None else ""
     return for_markdown(
         f"{numbers.frames:,} frames of {numbers.flights:,} flights ({tracks}) "
         f"over {numbers.trajectories:,} trajectories in {towns} {'town' if towns == 1 else 'towns'}; "
-        f"{numbers.captions.frames_with:,} frames carry a reason in English and in Chinese."
+        f"{numbers.captions.frames_with:,} frames carry a reason in English and in Chinese.{whole}"
     )
 
 

@@ -134,9 +134,10 @@ def scan(release: Release) -> list[ReleasedRows]:
         path = inside(release.folder, shard)
         with open_table(path, tree=release.folder) as table:
             found = {member.name: member.type for member in table.schema_arrow}
-            if differing := [member.name for member in wanted if found.get(member.name) != member.type]:
+            names = table.schema_arrow.names
+            if differing := [m.name for m in wanted if found.get(m.name) != m.type or names.count(m.name) != 1]:
                 raise InputError(
-                    "not a shard of this version", where=path, got=f"missing or of another type: {', '.join(differing)}",
+                    "not a shard of this version", where=path, got=f"missing, twice there or of another type: {', '.join(differing)}",
                     fix="build the release again with this version of cosfly",
                 )  # fmt: skip
             for k in range(table.num_row_groups):
@@ -154,6 +155,8 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: A
     """Note the flights of one row group, which may hold several."""
     with arrow_errors(shard):
         rows = {name: group.column(name).to_pylist() for name in LIGHT}
+    if not len(group):
+        return
     places: list[Place] = list(zip(*(rows[name] for name in PLACE), strict=True))
     begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
     for start, stop in zip(begins, [*begins[1:], len(places)], strict=True):

@@ -1,0 +1,334 @@
+"""`cosfly release get`: a release, or a part of it, from another place.
+
+Reads release.json and the shards of a release that lies somewhere else; writes `dataset/`, which is a release: all of it byte for byte, or a
+part with a record of its own. Of a part only the wanted rows and columns travel.
+
+What is checked: release.json against checksums.sha256 and against itself, and with `expected` against a digest that the user has from elsewhere;
+the sha256 of shards that are taken whole; of others the sizes, columns, rows and flights that the record tells of, and then, as of every
+release, all that `cosfly release verify` finds in rows. The pictures of a shard of which a part is taken are bound by no digest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from pydantic import BaseModel
+
+from cosfly.config import Config
+from cosfly.errors import InputError, VerifyError
+from cosfly.reading.files import sha256_file
+from cosfly.reading.tables import arrow_errors, open_stream, read_row_group, row_groups
+from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.stage_folder import Resume, StageFolder, result_of
+from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes
+from release.card.numbers import compute_numbers
+from release.columns import PLACE, SPLIT_NAMES, SplitName, schema
+from release.get.choice import RECORD, Choice, chosen_flights, fetch_record
+from release.get.remote import CHUNK, Remote, RemoteFile, open_remote
+from release.package.shards import open_writer
+from release.package.stage import DATASET, PARTS, write_records
+from release.record import (
+    PartOf,
+    ReleasedFlight,
+    ReleaseRecord,
+    Shard,
+    SplitNumbers,
+    content_digest,
+    shard_path,
+)
+from release.verify.verify import verify
+
+NOT_ASKED_FOR = "not asked for"
+ONE_FILE_EACH = ("README.md", "croissant.json", RECORD, CHECKSUMS)  # of a release that is taken whole
+
+
+class _Asked(Config):
+    """What decides the result: the choice, and which release it is of."""
+
+    source: str
+    record_sha256: str
+    choice: Choice
+
+
+class _Got(BaseModel):
+    """A shard that is here: its rows, captions, flights in their order, and whether it is the whole remote one."""
+
+    rows: int
+    captions: int
+    flights: dict[str, int]
+    bytes: int
+    sha256: str
+
+
+class _Plan(BaseModel):
+    """What a worker must know. flights: name -> frames."""
+
+    address: str
+    shown: str
+    columns: list[str]
+    modalities: list[str]
+    flights: dict[str, int]
+
+
+# --- one shard --------------------------------------------------------------------------------------------------------
+
+
+def make_worker(plan: _Plan, parts: Path) -> Work:
+    """Worker factory: give the function that fetches one shard."""
+    remote = open_remote(plan.address)
+
+    def work(item: Item) -> Outcome:
+        got = fetch_shard(remote, item.payload, parts / Path(item.payload.path).name, plan)
+        return Outcome(got.model_dump(), drop_reason=None if got.rows else NOT_ASKED_FOR)
+
+    return work
+
+
+def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
+    """Fetch the wanted part of one shard.
+
+    Raises:
+        InputError: the other side has another size, other columns, or other rows than the record says. VerifyError: another sha256.
+    """
+    where = f"{remote.shown}/{shard.path}"
+    if (size := remote.size(shard.path)) != shard.bytes:
+        raise InputError(
+            "a shard of another size", where=where, got=f"{size} bytes", expected=f"{shard.bytes}, as in release.json"
+        )
+    wanted = schema(plan.modalities)  # type: ignore[arg-type]
+    with open_stream(RemoteFile(remote, shard.path, size), where) as table:
+        found = table.schema_arrow
+        if found.names != plan.columns or any(found.field(member.name).type != member.type for member in wanted):
+            raise InputError("a shard with other columns", where=where, got=", ".join(found.names)[:200])
+        if table.metadata.num_rows != shard.rows:
+            raise InputError(
+                "a shard with other rows", where=where, got=f"{table.metadata.num_rows}", expected=f"{shard.rows}"
+            )
+        groups = [_names_in(table, k, where) for k in range(table.num_row_groups)]
+        flights = Counter(name for group in groups for name in group)
+        is_whole = wanted.names == found.names and flights.keys() <= plan.flights.keys()
+        if not is_whole and flights.keys() & plan.flights.keys():
+            return _write_part(table, groups, path, wanted, plan, where)
+    if not is_whole:
+        return _Got(rows=0, captions=0, flights={}, bytes=0, sha256="")
+    digest = _copy(remote, shard, path)
+    captions = sum(_captions(group) for group in row_groups(path, ["has_caption"]))
+    return _checked(
+        _Got(rows=shard.rows, captions=captions, flights=dict(flights), bytes=shard.bytes, sha256=digest), plan, where
+    )
+
+
+def _names_in(table: pa.parquet.ParquetFile, k: int, where: str) -> list[str]:
+    """Give the flight of each row of a row group; reads these four columns alone."""
+    group = read_row_group(where, table, k, list(PLACE))
+    with arrow_errors(where):
+        return [
+            "/".join(map(str, place)) for place in zip(*(group.column(name).to_pylist() for name in PLACE), strict=True)
+        ]
+
+
+def _write_part(
+    table: pa.parquet.ParquetFile, groups: list[list[str]], path: Path, wanted: pa.Schema, plan: _Plan, where: str
+) -> _Got:
+    """Read the wanted rows and columns, and write them as a release does."""
+    flights: Counter[str] = Counter()
+    captions = 0
+    with atomic_file(path) as file, open_writer(file.name, wanted) as writer:
+        for k, names in enumerate(groups):
+            mask = [name in plan.flights for name in names]
+            if not any(mask):
+                continue
+            rows = read_row_group(where, table, k, wanted.names)
+            with arrow_errors(where):
+                rows = rows.filter(pa.array(mask)).select(wanted.names).replace_schema_metadata(wanted.metadata)
+                writer.write_table(rows, row_group_size=len(rows))
+            flights.update(name for name in names if name in plan.flights)
+            captions += _captions(rows)
+            advance(len(rows))
+    return _checked(
+        _Got(
+            rows=flights.total(),
+            captions=captions,
+            flights=dict(flights),
+            bytes=path.stat().st_size,
+            sha256=sha256_file(path),
+        ),
+        plan,
+        where,
+    )
+
+
+def _captions(rows: pa.Table) -> int:
+    return pc.sum(rows.column("has_caption")).as_py() or 0
+
+
+def _checked(got: _Got, plan: _Plan, where: str) -> _Got:
+    wrong = [
+        f"{name}: {count} rows and not {plan.flights[name]}"
+        for name, count in got.flights.items()
+        if count != plan.flights[name]
+    ]
+    if wrong:
+        raise InputError("flights with other rows than the record says", where=where, got="; ".join(wrong[:10]))
+    return got
+
+
+def _copy(remote: Remote, shard: Shard, path: Path) -> str:
+    """Copy a whole shard; give its sha256, which is the record's."""
+    digest = hashlib.sha256()
+    with atomic_file(path) as file:
+        for start in range(0, shard.bytes, CHUNK):
+            data = remote.read(shard.path, start, min(CHUNK, shard.bytes - start))
+            digest.update(data)
+            file.write(data)
+            advance(0)
+        if digest.hexdigest() != shard.sha256:
+            raise VerifyError(
+                "a shard is not the one of the record",
+                where=f"{remote.shown}/{shard.path}",
+                got=digest.hexdigest(),
+                expected=shard.sha256,
+            )
+    advance(shard.rows)
+    return digest.hexdigest()
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def run(
+    choice: Choice,
+    address: str,
+    out: Path,
+    *,
+    workers: int = 0,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
+) -> Path:
+    """Fetch a release or a part of it from a folder or an address; give the folder that holds it."""
+    remote = open_remote(address)
+    record, data = fetch_record(remote, choice.expected)
+    flights = chosen_flights(record, choice)
+    asked = _Asked(source=remote.shown, record_sha256=sha256_bytes(data), choice=choice)
+    stage = StageFolder.open(out, "get", config=asked, inputs={}, seed=0, resume=resume)
+    dataset, parts = out / DATASET, out / PARTS
+    if stage.is_complete:
+        return dataset
+    modalities = [name for name in record.settings.modalities if choice.modalities is None or name in choice.modalities]
+    plan = _Plan(
+        address=address, shown=remote.shown, columns=schema(record.settings.modalities).names, modalities=modalities,
+        flights={flight.flight: flight.frames for flight in flights},
+    )  # fmt: skip
+    splits = {flight.split for flight in flights}
+    shards = [shard for shard in record.shards if shard.split in splits]
+    items = [Item(shard.path, shard, shard.rows) for shard in shards]
+    in_process = address.startswith("memory:")  # of this process alone
+    finished = run_items(
+        stage, items, make_worker, (plan, parts), workers=0 if in_process else workers, watch=watch, label="get"
+    )
+    if finished.tally.failed:
+        raise InputError(
+            "parts of the release could not be fetched", where=out / "failures.jsonl", got=str(finished.tally),
+            fix="mend what that file names and run the same command again: only those are fetched again",
+        )  # fmt: skip
+    got = {kept.id: result_of(kept, _Got) for kept in finished.kept}
+    taken = [(shard, got[shard.path]) for shard in shards if shard.path in got]
+    _check_all_there(flights, taken)
+    is_whole = len(taken) == len(record.shards) and all(shard.sha256 == one.sha256 for shard, one in taken)
+    with atomic_folder(dataset) as folder:
+        named = list(_named(taken, parts, folder))
+        if is_whole:
+            _copy_records(remote, folder, data)
+        else:
+            part = PartOf(
+                name=record.name, content_digest=record.content_digest, source=remote.shown,
+                choice=choice.model_dump(mode="json", exclude={"expected"}),
+            )  # fmt: skip
+            write_records(folder, part_record(record, part, flights, modalities, named, taken, folder))
+        report = verify(folder, level="rows", workers=0 if in_process else workers)
+        if not report.is_ok:
+            raise VerifyError(
+                "what was fetched does not verify, so it is not kept", where=remote.shown, got=str(report)
+            )
+    stage.finish([dataset / name for name in ("README.md", RECORD, CHECKSUMS)], finished.tally, whole=is_whole)
+    shutil.rmtree(parts, ignore_errors=True)
+    return dataset
+
+
+def _check_all_there(flights: list[ReleasedFlight], taken: Sequence[tuple[Shard, _Got]]) -> None:
+    found = {name for _, one in taken for name in one.flights}
+    if missing := [flight.flight for flight in flights if flight.flight not in found]:
+        raise InputError("flights of the record that no shard holds", got=", ".join(missing[:10]))
+
+
+def _named(taken: Sequence[tuple[Shard, _Got]], parts: Path, folder: Path) -> Iterator[Shard]:
+    """Put the shards under the names that their content gives."""
+    digest = content_digest((shard.split, got.sha256) for shard, got in taken)
+    counts, numbers = Counter(shard.split for shard, _ in taken), Counter[str]()
+    (folder / "data").mkdir()
+    for shard, got in taken:
+        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
+        numbers[shard.split] += 1
+        part = parts / Path(shard.path).name
+        try:
+            os.link(part, folder / path)
+        except OSError:  # the file system has no links, or a kill lost the part, which the copy then names
+            shutil.copyfile(part, folder / path)
+        yield Shard(path=path, split=shard.split, rows=got.rows, bytes=got.bytes, sha256=got.sha256)
+
+
+def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:
+    for name in ONE_FILE_EACH:
+        write_bytes(folder / name, record if name == RECORD else remote.read(name, 0, remote.size(name)))
+
+
+def part_record(
+    record: ReleaseRecord,
+    part: PartOf,
+    flights: list[ReleasedFlight],
+    modalities: list,
+    shards: list[Shard],
+    taken: Sequence[tuple[Shard, _Got]],
+    folder: Path,
+) -> ReleaseRecord:
+    """Give the record of a part: numbers of what is here; where the rest went is on the account as well."""
+    numbers = compute_numbers([folder / shard.path for shard in shards], record.settings.num_frames)
+    history = record.history.model_copy(deep=True)
+    gone = history.flights.released - len(flights)
+    history.flights.released = len(flights)
+    if gone:
+        history.flights.left_out[NOT_ASKED_FOR] = history.flights.left_out.get(NOT_ASKED_FOR, 0) + gone
+    history.captions.flight_left_out += history.captions.released - numbers.captions.frames_with
+    history.captions.released = numbers.captions.frames_with
+    splits: dict[SplitName, SplitNumbers] = {}
+    for split in SPLIT_NAMES:
+        own = [flight for flight in flights if flight.split == split]
+        if own:
+            splits[split] = SplitNumbers(
+                frames=sum(flight.frames for flight in own),
+                captions=sum(got.captions for shard, got in taken if shard.split == split),
+                flights=len(own),
+                trajectories=len({flight.flight.rpartition("/")[0] for flight in own}),
+                walks=sorted({flight.walk for flight in own}),
+                towns=sorted({flight.flight.split("/")[1] for flight in own}),
+            )
+    return record.model_copy(
+        update={
+            "settings": record.settings.model_copy(update={"modalities": modalities}),
+            "depth": record.depth if "depth" in modalities else None,
+            "splits": record.splits.model_copy(update={"splits": splits}),
+            "numbers": numbers,
+            "history": history,
+            "flights": flights,
+            "content_digest": content_digest((shard.split, shard.sha256) for shard in shards),
+            "shards": shards,
+            "part_of": part,
+        }
+    )

@@ -1,0 +1,504 @@
+"""Fetching a release or a part of it: what travels, what is checked, and what a hostile or broken other side gets."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import io
+import json
+import logging
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from test_release_export import TWO_SPLITS, make_release, rows_by_id
+from test_release_package import all_bytes
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.config import build as build_config
+from cosfly.errors import CosflyError, InputError, ResumeError
+from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
+from release.columns import PICTURES
+from release.get import remote as remotes
+from release.get.choice import Choice
+from release.get.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
+from release.get.stage import NOT_ASKED_FOR
+from release.get.stage import run as get
+from release.record import content_digest, read_record
+from release.verify.verify import verify
+
+
+def choice(**wanted) -> Choice:
+    return build_config(Choice, wanted, "test")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    """Six flights, two towns, a split each; small shards, so that there are several."""
+    return make_release(tmp_path_factory.mktemp("get"), **TWO_SPLITS)
+
+
+# --- a server ---------------------------------------------------------------------------------------------------------
+
+
+class Files(http.server.BaseHTTPRequestHandler):
+    """Files of a folder by ranges; counts what it sends, and misbehaves as its server is told to."""
+
+    protocol_version = "HTTP/1.1"
+
+    def log_message(self, *args) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        server = self.server
+        path = self.path.partition("?")[0].lstrip("/")
+        server.asked.append(self.path)
+        file = server.folder / path
+        if not file.is_file():
+            self.send_error(404)
+            return
+        data = server.change(path, file.read_bytes())
+        if server.fault and server.fault(self, path, data):
+            return
+        begin, end = map(int, re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers["range"]).groups())
+        part = data[begin : end + 1]
+        self.send_response(206)
+        self.send_header("content-range", f"bytes {begin}-{begin + len(part) - 1}/{len(data)}")
+        self.send_header("content-length", str(len(part)))
+        self.end_headers()
+        self.wfile.write(part)
+        server.sent += len(part)
+        server.sent_by[path] = server.sent_by.get(path, 0) + len(part)
+
+
+@contextlib.contextmanager
+def served(folder: Path, *, fault=None, change=None):
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Files)
+    server.daemon_threads = True
+    server.folder, server.fault, server.sent, server.sent_by, server.asked = folder, fault, 0, {}, []
+    server.change = change or (lambda path, data: data)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield server, f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture(autouse=True)
+def quick_retries(monkeypatch):
+    monkeypatch.setattr(remotes, "FIRST_WAIT_S", 0.01)
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+def test_a_whole_release_comes_byte_for_byte(dataset, tmp_path):
+    with served(dataset) as (server, address):
+        found = get(choice(), address, tmp_path / "out")
+    assert all_bytes(found) == all_bytes(dataset)
+    assert server.sent < 1.2 * sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("kind", ["folder", "stage folder", "zip", "memory", "http, two processes"])
+def test_from_everywhere_the_same(kind, dataset, tmp_path):
+    wanted = choice(towns=["Town01"], modalities=["rgb"])
+    expected = all_bytes(get(wanted, str(dataset), tmp_path / "expected"))
+
+    def same(found: Path) -> None:
+        assert {n: d for n, d in all_bytes(found).items() if n.startswith("data/")} == {
+            n: d for n, d in expected.items() if n.startswith("data/")
+        }
+
+    if kind == "stage folder":
+        same(get(wanted, str(dataset.parent), tmp_path / "out"))
+    elif kind == "folder":
+        same(get(wanted, str(dataset), tmp_path / "out", workers=2))
+    elif kind == "zip":
+        with zipfile.ZipFile(tmp_path / "release.zip", "w") as archive:
+            for name, data in all_bytes(dataset).items():
+                archive.writestr(f"inner/{name}", data)
+        same(get(wanted, f"zip://inner::{tmp_path / 'release.zip'}", tmp_path / "out"))
+    elif kind == "memory":
+        fsspec = pytest.importorskip("fsspec", reason="extra remote")
+        memory = fsspec.filesystem("memory")
+        for name, data in all_bytes(dataset).items():
+            memory.pipe_file(f"/release/{name}", data)
+        same(get(wanted, "memory://release", tmp_path / "out", workers=2))
+    else:
+        with served(dataset) as (_, address):
+            same(get(wanted, address, tmp_path / "out", workers=2))
+
+
+# --- a part -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wanted", "is_wanted"),
+    [
+        ({"towns": ["Town02"]}, lambda row: row["town"] == "Town02"),
+        ({"splits": ["validation"]}, lambda row: row["split"] == "validation"),
+        ({"flights": ["one/Town01/trajectory_1776047127"]}, lambda row: row["trajectory"] == "trajectory_1776047127"),
+        # a flight brings its twin along
+        (
+            {"flights": ["one/Town01/trajectory_1776047127/ORI"]},
+            lambda row: row["trajectory"] == "trajectory_1776047127",
+        ),
+        ({"towns": ["Town01"], "modalities": ["depth"]}, lambda row: row["town"] == "Town01"),
+    ],
+)
+def test_a_part_is_a_release_of_the_wanted_rows(wanted, is_wanted, dataset, tmp_path):
+    found = get(choice(**wanted), str(dataset), tmp_path / "out")
+    report = verify(found)
+    assert report.is_ok, report
+    pictures = {PICTURES[file].name for file in wanted.get("modalities", PICTURES)}
+    gone = {column.name for column in PICTURES.values()} - pictures
+    expected = {
+        name: {column: value for column, value in row.items() if column not in gone}
+        for name, row in rows_by_id(dataset).items()
+        if is_wanted(row)
+    }
+    assert rows_by_id(found) == expected
+    record, whole = read_record(found / "release.json"), read_record(dataset / "release.json")
+    assert record.part_of.content_digest == whole.content_digest != record.content_digest
+    assert record.numbers.frames == len(expected)
+    left = whole.numbers.flights - record.numbers.flights
+    assert record.history.flights.left_out.get(NOT_ASKED_FOR, 0) == left
+    assert (record.licence, record.credits, record.maps) == (whole.licence, whole.credits, whole.maps)
+    assert whole.content_digest in (found / "README.md").read_text()
+
+
+def test_a_part_opens_with_datasets_by_split(dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    datasets = pytest.importorskip("datasets", reason="extra distill")
+    found = get(choice(splits=["train"], modalities=["rgb"]), str(dataset), tmp_path / "out")
+    loaded = datasets.load_dataset(str(found), cache_dir=str(tmp_path / "cache"))
+    assert set(loaded) == {"train"}
+    assert "depth" not in loaded["train"].column_names
+    assert set(loaded["train"]["sample_id"]) == rows_by_id(found).keys()
+
+
+def test_what_is_left_out_does_not_travel(dataset, tmp_path):
+    """Bytes counted on the wire."""
+    record = read_record(dataset / "release.json")
+    sizes = record.numbers.files.bytes_by_modality
+    with served(dataset) as (server, address):
+        get(choice(modalities=["rgb"]), address, tmp_path / "rgb")
+        without_depth = server.sent
+    with served(dataset) as (server, address):
+        get(choice(splits=["validation"]), address, tmp_path / "split")
+        asked = {path for path in server.sent_by if path.endswith(".parquet")}
+    assert asked == {shard.path for shard in record.shards if shard.split == "validation"}
+    others = sum(path.stat().st_size for path in dataset.iterdir() if path.is_file())
+    assert without_depth < sizes["rgb"] + others + 0.25 * (sizes["depth"] + sizes["instance"])
+    assert without_depth < 0.6 * record.numbers.files.bytes
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"towns": ["Town1"]}, r"no such town \(did you mean 'Town01'\?\)"),
+        ({"flights": ["one/Town01"]}, "no such flight"),
+        ({"towns": ["Town01"], "flights": ["one/Town02/trajectory_1776048127"]}, "no flight is all of that"),
+        ({"splits": ["test"]}, r"no such split.*train, validation"),
+    ],
+)
+def test_what_is_not_there_is_named(wanted, words, dataset, tmp_path):
+    with pytest.raises(InputError, match=words):
+        get(choice(**wanted), str(dataset), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_digest_that_is_expected(dataset, tmp_path):
+    digest = read_record(dataset / "release.json").content_digest
+    get(choice(splits=["train"], expected=digest[:12]), str(dataset), tmp_path / "out")
+    with pytest.raises(InputError, match="not the release that is expected"):
+        get(choice(expected="0" * 64), str(dataset), tmp_path / "other")
+
+
+# --- interrupted ------------------------------------------------------------------------------------------------------
+
+
+def _get_in_process(address: str, out: str) -> None:
+    get(choice(modalities=["rgb", "instance"]), address, Path(out))
+
+
+def test_killed_it_goes_on_and_gives_the_same_bytes(dataset, tmp_path):
+    def slowly(handler, path, data):
+        time.sleep(0.03)
+
+    expected = all_bytes(get(choice(modalities=["rgb", "instance"]), str(dataset), tmp_path / "whole"))
+    context = multiprocessing.get_context("spawn")
+    with served(dataset, fault=slowly) as (server, address):
+        for least in (3, 8, 14):
+            process = context.Process(target=_get_in_process, args=(address, str(tmp_path / "out")))
+            process.start()
+            begun = len(server.asked)
+            while process.is_alive() and len(server.asked) < begun + least:
+                time.sleep(0.01)
+            if process.is_alive():
+                os.kill(process.pid, signal.SIGKILL)
+            process.join()
+        found = get(choice(modalities=["rgb", "instance"]), address, tmp_path / "out")
+    data = {name: content for name, content in all_bytes(found).items() if name.startswith("data/")}
+    assert data == {name: content for name, content in expected.items() if name.startswith("data/")}
+
+
+def test_a_finished_shard_is_not_fetched_again(dataset, tmp_path):
+    last = read_record(dataset / "release.json").shards[-1].path
+
+    def gone(handler, path, data):
+        if path == last:
+            handler.send_error(503)
+            return True
+
+    with served(dataset, fault=gone) as (_, address), pytest.raises(InputError, match="could not be fetched"):
+        get(choice(), address, tmp_path / "out")
+    assert not (tmp_path / "out/dataset").exists()
+    with served(dataset) as (server, other):
+        with pytest.raises(ResumeError, match="source was"):
+            get(choice(), other, tmp_path / "out")
+        found = get(choice(), other, tmp_path / "out", resume="force")
+    assert {path for path in server.sent_by if path.endswith(".parquet")} == {last}
+    assert all_bytes(found) == all_bytes(dataset)
+
+
+def test_a_transfer_that_breaks_is_tried_again(dataset, tmp_path):
+    broken: set[str] = set()
+
+    def breaks(handler, path, data):
+        if handler.headers["range"] not in broken:
+            broken.add(handler.headers["range"])
+            handler.send_response(206)
+            handler.send_header("content-range", f"{handler.headers['range'].replace('=', ' ')}/{len(data)}")
+            handler.send_header("content-length", "100000")
+            handler.end_headers()
+            handler.wfile.write(b"\0" * 10)
+            handler.close_connection = True
+            handler.connection.close()
+            return True
+
+    with served(dataset, fault=breaks) as (_, address):
+        remote = open_remote(address)
+        name = "release.json"
+        assert remote.read(name, 0, 500) == (dataset / name).read_bytes()[:500]
+
+
+# --- an other side that lies ------------------------------------------------------------------------------------------
+
+
+def endless(handler, path, data):
+    """As much as anybody reads."""
+    begin, end = handler.headers["range"].removeprefix("bytes=").split("-")
+    handler.send_response(206)
+    handler.send_header("content-range", f"bytes {begin}-{end}/{len(data)}")
+    handler.send_header("transfer-encoding", "chunked")
+    handler.end_headers()
+    with contextlib.suppress(OSError):
+        for _ in range(4000):
+            handler.wfile.write(b"10000\r\n" + b"x" * 65536 + b"\r\n")
+    handler.close_connection = True
+    return True
+
+
+def no_ranges(handler, path, data):
+    handler.send_response(200)
+    handler.send_header("content-length", str(len(data)))
+    handler.end_headers()
+    with contextlib.suppress(OSError):
+        handler.wfile.write(data)
+    return True
+
+
+def huge_size(handler, path, data):
+    if path != "release.json":
+        return False
+    handler.send_response(206)
+    handler.send_header("content-range", f"bytes 0-0/{10**12}")
+    handler.send_header("content-length", "1")
+    handler.end_headers()
+    handler.wfile.write(b"{")
+    return True
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (endless, "more than was asked for|number of bytes|transfer broke"),
+        (no_ranges, "HTTP 200"),
+        (huge_size, "too large a record"),
+    ],
+)
+def test_a_server_that_lies_is_refused(fault, words, dataset, tmp_path):
+    with served(dataset, fault=fault) as (_, address), pytest.raises(InputError, match=words):
+        get(choice(), address, tmp_path / "out")
+
+
+def retold(change):
+    """Serve a record that was changed, with the checksum made right."""
+
+    def changed(folder: Path):
+        record = json.loads((folder / "release.json").read_text())
+        change(record)
+        data = json.dumps(record).encode()
+        lines = (folder / CHECKSUMS).read_text().splitlines()
+        lines = [f"{sha256_bytes(data)}  release.json" if line.endswith("  release.json") else line for line in lines]
+        texts = {"release.json": data, CHECKSUMS: ("\n".join(lines) + "\n").encode()}
+        return lambda path, data: texts.get(path, data)
+
+    return changed
+
+
+def digest_again(record: dict) -> None:
+    record["content_digest"] = content_digest((s["split"], s["sha256"]) for s in record["shards"])
+    numbers: dict[str, int] = {}
+    for shard in record["shards"]:
+        number = numbers[shard["split"]] = numbers.get(shard["split"], -1) + 1
+        count = sum(other["split"] == shard["split"] for other in record["shards"])
+        shard["path"] = f"data/{shard['split']}-{record['content_digest'][:12]}-{number:05d}-of-{count:05d}.parquet"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r: r["shards"][0].update(path="../../../tmp/escaped.parquet"), "contradicts itself"),
+        (lambda r: r["shards"][0].update(path="/etc/passwd"), "contradicts itself"),
+        (lambda r: r["shards"][0].update(sha256="0" * 64), "contradicts itself"),
+        (lambda r: r["shards"][0].update(bytes=-1), "contradicts itself"),
+        (lambda r: r.update(schema_version="2.0"), "unknown version"),
+        (lambda r: r.update(licence=5), "licence"),
+    ],
+)
+def test_a_record_that_lies_is_refused_before_any_data(change, words, dataset, tmp_path):
+    with served(dataset, change=retold(change)(dataset)) as (server, address):
+        with pytest.raises(InputError, match=words):
+            get(choice(), address, tmp_path / "out")
+        assert not [path for path in server.sent_by if path.endswith(".parquet")]
+
+
+def test_a_size_that_lies(dataset, tmp_path):
+    change = retold(lambda r: r["shards"][0].update(bytes=10**15))
+    with served(dataset, change=change(dataset)) as (_, address), pytest.raises(InputError, match="not be fetched"):
+        get(choice(), address, tmp_path / "out")
+    assert "a shard of another size" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def test_a_record_without_its_checksum(dataset, tmp_path):
+    change = lambda path, data: data + b" " if path == "release.json" else data  # noqa: E731
+    with (
+        served(dataset, change=change) as (_, address),
+        pytest.raises(InputError, match="not the one of the checksums"),
+    ):
+        get(choice(), address, tmp_path / "out")
+
+
+def damaged(path: str, data: bytes) -> bytes:
+    """One byte of a picture is another one."""
+    if not path.endswith(".parquet"):
+        return data
+    at = data.index(b"\x89PNG") + 400
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+def test_a_damaged_shard_is_found_by_its_sha256(dataset, tmp_path):
+    with served(dataset, change=damaged) as (_, address), pytest.raises(InputError, match="could not be fetched"):
+        get(choice(), address, tmp_path / "out")
+    assert "not the one of the record" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def test_rows_of_a_part_that_are_not_those_of_the_record(dataset, tmp_path):
+    change = retold(lambda r: [f.update(frames=f["frames"] + 1) for f in r["flights"]])
+    with (
+        served(dataset, change=change(dataset)) as (_, address),
+        pytest.raises(InputError, match="could not be fetched"),
+    ):
+        get(choice(towns=["Town01"], modalities=["rgb"]), address, tmp_path / "out")
+    assert "other rows than the record says" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def test_a_shard_of_garbage_is_an_error_of_one_line(dataset, tmp_path):
+    change = lambda path, data: bytes(len(data)) if path.endswith(".parquet") else data  # noqa: E731
+    with served(dataset, change=change) as (_, address), pytest.raises(InputError, match="could not be fetched"):
+        get(choice(modalities=["rgb"]), address, tmp_path / "out")
+    failures = (tmp_path / "out/failures.jsonl").read_text()
+    assert "not a whole parquet file" in failures
+    assert '"bug"' not in failures
+
+
+# --- addresses --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("https://me:hush@host:8/a/b?token=hush#x", "https://host:8/a/b"),
+        ("zip://in::https://me:hush@host/a.zip?sig=hush", "zip://in::https://host/a.zip"),
+        ("s3://bucket/key", "s3://bucket/key"),
+        ("https://me:hush@[::1]:8/a?hush", "https://[::1]:8/a"),
+        ("https://[::1/a?hush", "https://...::1/a"),
+        ("plain/folder", "plain/folder"),
+    ],
+)
+def test_addresses_are_shown_without_secrets(address, shown):
+    assert without_secrets(address) == shown
+
+
+def test_secrets_reach_no_log_record_or_error(dataset, tmp_path, caplog):
+    caplog.set_level(logging.DEBUG, logger="cosfly")
+    with served(dataset) as (server, address):
+        secret = address.replace("http://", "http://user:hush@") + "?token=hush"
+        found = get(choice(modalities=["rgb"]), secret, tmp_path / "out")
+        assert all(path.endswith("?token=hush") for path in server.asked)  # it is sent
+        with pytest.raises(CosflyError) as told:
+            open_remote(secret).size("no-such-file")
+    assert "hush" not in str(told.value)
+    assert "hush" not in caplog.text
+    assert b"hush" not in b"".join(all_bytes(tmp_path / "out").values())
+    assert read_record(found / "release.json").part_of.source == address
+
+
+def test_what_cannot_be_opened(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        open_remote(str(tmp_path / "nothing"))
+    pytest.importorskip("fsspec", reason="extra remote")
+    with pytest.raises(InputError, match="no such address"):
+        FsspecRemote("nosuchprotocol://x").size("release.json")
+    with pytest.raises(InputError):
+        HttpRemote("http://127.0.0.1:9").size("release.json")  # nobody listens
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command(dataset, tmp_path):
+    words = [
+        "release",
+        "get",
+        str(dataset),
+        "--town",
+        "Town01",
+        "--modality",
+        "rgb",
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "1",
+    ]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    found = tmp_path / "out/dataset"
+    assert {row["town"] for row in rows_by_id(found).values()} == {"Town01"}
+    assert set(read_checksums(found)) >= {"release.json", "README.md", "croissant.json"}
+    assert CliRunner().invoke(app, words).exit_code == 0  # there is nothing more to do
+    (shard,) = (found / "data").iterdir()
+    assert pq.ParquetFile(io.BytesIO(shard.read_bytes())).metadata.num_rows == len(rows_by_id(found))
+    shutil.rmtree(found)
