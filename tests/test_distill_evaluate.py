@@ -273,6 +273,10 @@ def test_floors_are_predictions_that_a_verifier_can_judge(place):
         found = read_predictions(path)
         assert len(found) == 16
         assert all(parse_answer(prediction.raw, prediction.language).coc == prediction.coc for prediction in found)
+        decisions = {
+            p.key: p.coc.flight_decision for p in found
+        }  # a verifier holds the two languages against each other
+        assert all(decisions[f"{p.sample_id}/en"] == decisions[f"{p.sample_id}/zh"] for p in found)
 
 
 def test_a_prediction_for_an_unknown_sample_is_refused(samples):

@@ -61,20 +61,20 @@ class Floors:
     """The floors of one language, from the training split."""
 
     def __init__(self, train: Iterable[Sample], language: Language, seed: int) -> None:
-        self._language, self._seed = language, seed
+        self._seed = seed
         counts, typical = Counter[str](), dict[str, tuple[bytes, Sample]]()
         for sample in train:
             if sample.language == language:
                 counts[sample.decision] += 1
-                rank = hashlib.sha256(f"{seed}/distill.floor/{sample.key}".encode()).digest()
+                rank = hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
                 if sample.decision not in typical or rank < typical[sample.decision][0]:
                     typical[sample.decision] = rank, sample
         self.decision = majority(counts.elements())
         self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
 
     def groups(self, count: int) -> list[np.ndarray]:
-        """Deal samples into groups, within which references are shuffled."""
-        return shuffled_groups(count, rng_for(self._seed, "distill.floor", self._language))
+        """Deal samples into groups, within which references are shuffled; the same in both languages of the same windows."""
+        return shuffled_groups(count, rng_for(self._seed, "distill.floor", "shuffled"))
 
     def answers(self, references: Sequence[Coc]) -> dict[str, list[Answer]]:
         """Give what each floor answers to samples with these references, of which there is one at least."""
