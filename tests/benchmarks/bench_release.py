@@ -154,7 +154,6 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
 
 
 def measure_memory(num_frames: int, folder: Path) -> None:
-    make_tree(folder, num_frames, SIZES["memory"])
     seconds = build(folder, folder / "out", ("rgb", "depth", "instance"), 1)
     usage = [resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     print(f"{num_frames:9,} frames: main {usage[0]:6.0f} MiB, worker {usage[1]:6.0f} MiB, {seconds:7.1f} s")
@@ -162,20 +161,24 @@ def measure_memory(num_frames: int, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "memory"))
+    parser.add_argument("what", choices=("speed", "memory", "make-tree", "build"))
     parser.add_argument("frames", type=int, nargs="+")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--scratch", type=Path, help="where the tree and both products are written")
     given = parser.parse_args()
-    if given.what == "memory" and len(given.frames) > 1:  # each in a process of its own, which the peak is of
-        for count in given.frames:
-            subprocess.run([sys.executable, __file__, "memory", str(count)], check=True)
+    if given.what == "make-tree":
+        make_tree(given.scratch, given.frames[0], SIZES["memory"])
         return
-    with tempfile.TemporaryDirectory(dir=given.scratch) as folder:
-        if given.what == "speed":
-            measure_speed(given.frames[0], Path(folder), given.rounds)
-        else:
-            measure_memory(given.frames[0], Path(folder))
+    if given.what == "build":
+        measure_memory(given.frames[0], given.scratch)
+        return
+    for count in given.frames:
+        with tempfile.TemporaryDirectory(dir=given.scratch) as folder:
+            if given.what == "speed":
+                measure_speed(count, Path(folder), given.rounds)
+                continue
+            for step in ("make-tree", "build"):  # the build in a process of its own, which the peak is of
+                subprocess.run([sys.executable, __file__, step, str(count), "--scratch", folder], check=True)
 
 
 if __name__ == "__main__":
