@@ -167,7 +167,7 @@ def test_rows_hold_prompts_and_the_state_of_each_sentence(material, tmp_path):
         if not row["has_caption"]:
             assert all(row[name] is None for name in names[2:] + counts)
             continue
-        assert (row["system_en"], row["prompt_zh"]) == ("s", "u")
+        assert (row["system_en"], row["prompt_zh"]) == ("s", "u <pictures>")
         if row["frame_index"] % 2:
             assert row["sentence_states_en"] == ["proved", "unread", "proved", "proved"]
             assert [row[name] for name in counts] == [3, 0, 1, None]
