@@ -19,8 +19,8 @@ import pyarrow.compute as pc
 
 from cosfly.errors import InputError
 from cosfly.products.coverage import AXES, NAMED, Coverage, axis_values
-from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups, rows_of
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, SCALAR_NAMES, schema
+from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups
+from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
@@ -37,12 +37,6 @@ NEVER_NULL = frozenset(
 )
 SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
-
-
-def read_rows(shards: Iterable[Path], columns: list[str] = SCALAR_NAMES) -> Iterator[dict[str, Any]]:
-    """Yield the rows of all shards, a row group at a time; by default without pictures and depth."""
-    for shard in shards:
-        yield from rows_of(shard, columns, tree=shard.parents[1])
 
 
 def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
