@@ -6,6 +6,7 @@ Only `windows.py` makes them, and nothing that builds a prompt takes a `FutureMo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -31,16 +32,37 @@ Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
 # --- windows ----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedFrame:
+    """What was known at one frame, in plain numbers; windows share it, so what is worked out of it is worked out once.
+
+    position_m, target_m (x, y, z), the target's NaN where unknown; rotation_deg: pitch, yaw, roll; target_uv (u, v) px and target_bbox
+    (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its projected 3D box), NaN where unknown;
+    visibility: score, NaN where unknown.
+    """
+
+    time_s: float
+    position_m: Sequence[float]
+    rotation_deg: Sequence[float]
+    target_m: Sequence[float]
+    target_uv: Sequence[float]
+    target_bbox: Sequence[float]
+    in_view: bool
+    visible: bool
+    visibility: float
+
+
+def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
+    """Give the frames of n rows, from an array (n, ...) for each of their fields in order."""
+    return tuple([ObservedFrame(*row) for row in zip(*[column.tolist() for column in columns], strict=True)])
+
+
 @dataclass(frozen=True)
 class ObservedWindow:
     """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
 
-    indices: frame indices (n,). time_s (n,); positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll;
-    targets_m (n, 3) NaN where unknown; target_uv (n, 2) px and target_bbox (n, 4) px of what is
-    seen of the target (where a tree does not say, of its projected 3D box), NaN where unknown; target_depth_m (n,);
-    in_view, visible (n,) bool; visibility (n,) score, NaN where unknown; mission: what the drone knows at the current frame of an order
-    that ends the pursuit, its kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files:
-    the names that each holds.
+    indices: of the n frames in their flight. mission: what the drone knows at the current frame of an order that ends the pursuit, its
+    kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files: the names that each holds.
     """
 
     sample_id: str
@@ -50,16 +72,7 @@ class ObservedWindow:
     indices: tuple[int, ...]
     width_px: int
     height_px: int
-    time_s: np.ndarray
-    positions_m: np.ndarray
-    rotations_deg: np.ndarray
-    targets_m: np.ndarray
-    target_uv: np.ndarray
-    target_bbox: np.ndarray
-    target_depth_m: np.ndarray
-    in_view: np.ndarray
-    visible: np.ndarray
-    visibility: np.ndarray
+    frames: tuple[ObservedFrame, ...]
     frame_folders: tuple[Path, ...]
     frame_files: tuple[frozenset[str], ...]
     mission: str | None = None

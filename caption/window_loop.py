@@ -7,6 +7,7 @@ the flight contradicts is asked for again, by default anchored to the true one; 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 from caption.schema import CaptionConfig, Strategy, Window
@@ -31,6 +32,7 @@ from cosfly.products.captions import (
     Parsed,
     RepairRecord,
     Verdict,
+    Writing,
     parse_answer,
 )
 
@@ -102,7 +104,12 @@ def _terms(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
         return teacher.terms(sample_id)
     if isinstance(teacher, AskingTeacher) and teacher.student is not None:
         return teacher.student.terms
-    return Terms(cfg.writing, tuple(more_fields(way_of(cfg.writing))))
+    return _asked_terms(cfg.writing)
+
+
+@cache
+def _asked_terms(writing: Writing) -> Terms:
+    return Terms(writing, tuple(more_fields(way_of(writing))))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from caption.label_motion import LabelMotion, as_flown, label_motion
-from caption.schema import FutureMotion, LabelConfig, ObservedWindow, Window, WindowConfig
+from caption.schema import (
+    FutureMotion,
+    LabelConfig,
+    ObservedFrame,
+    ObservedWindow,
+    Window,
+    WindowConfig,
+    observed_frames,
+)
 from caption.truth.actions import label_of, measure
 from cosfly.products.captions import KeyframeRecord
 from cosfly.products.playback import Flight, sample_id
@@ -34,7 +42,7 @@ def cut_windows(
         label: thresholds by which keyframes are chosen; the choice takes windows, it shows a teacher nothing.
         twin: the clean flight beside a perturbed one; futures are cut from it.
     """
-    motion = label_motion(flight, twin)
+    motion, frames = label_motion(flight, twin), _frames_of(flight)
     folders = [flight.frame_folder(i) for i in range(len(flight))]
     files = [_files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
@@ -45,7 +53,7 @@ def cut_windows(
         chosen = choose_keyframes([label_of(measure(future), label) for future in futures], cfg.keyframe_stride)
         currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
     for current, keyframe in zip(currents, keyframes, strict=True):
-        observed = _observe(flight, slice(current - cfg.num_frames + 1, current + 1), folders, files)
+        observed = _observe(flight, frames, slice(current - cfg.num_frames + 1, current + 1), folders, files)
         problem = "missing_frame" if missing.intersection(observed.indices) else None
         if problem is None and order_comes_within(flight.mission, current, cfg.future_frames):
             problem = "order_to_come"
@@ -86,8 +94,28 @@ def _files_in(folder: Path) -> frozenset[str]:
         return frozenset()
 
 
-def _observe(flight: Flight, span: slice, folders: list[Path], files: list[frozenset[str]]) -> ObservedWindow:
-    """Copy the observed frames out of a flight: nothing of what follows stays reachable."""
+def _frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
+    return observed_frames(
+        flight.time_s,
+        flight.positions_m,
+        flight.rotations_deg,
+        flight.targets_m,
+        flight.target_uv,
+        flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox,
+        flight.target_in_view,
+        flight.target_visible,
+        flight.visibility,
+    )
+
+
+def _observe(
+    flight: Flight,
+    frames: tuple[ObservedFrame, ...],
+    span: slice,
+    folders: list[Path],
+    files: list[frozenset[str]],
+) -> ObservedWindow:
+    """Take the observed frames out of a flight: nothing of what follows stays reachable."""
     return ObservedWindow(
         sample_id=sample_id(flight.flight_id, span.stop - 1),
         town=flight.town,
@@ -96,16 +124,7 @@ def _observe(flight: Flight, span: slice, folders: list[Path], files: list[froze
         indices=tuple(range(span.start, span.stop)),
         width_px=flight.camera.width_px,
         height_px=flight.camera.height_px,
-        time_s=flight.time_s[span].copy(),
-        positions_m=flight.positions_m[span].copy(),
-        rotations_deg=flight.rotations_deg[span].copy(),
-        targets_m=flight.targets_m[span].copy(),
-        target_uv=flight.target_uv[span].copy(),
-        target_bbox=(flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox)[span].copy(),
-        target_depth_m=flight.target_depth_m[span].copy(),
-        in_view=flight.target_in_view[span].copy(),
-        visible=flight.target_visible[span].copy(),
-        visibility=flight.visibility[span].copy(),
+        frames=frames[span],
         frame_folders=tuple(folders[span]),
         frame_files=tuple(files[span]),
         mission=known_of(flight.mission, span.stop - 1),

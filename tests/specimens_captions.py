@@ -13,7 +13,7 @@ from cosfly.products.captions import Coc, Parsed
 
 def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None = None) -> tuple[Coc, Coc]:
     """Give the rule teacher's English and Chinese answer as plain text."""
-    english, chinese = write_templates(facts, rng.bytes(32), decision)
+    english, chinese = (Coc(**answer) for answer in write_templates(facts, rng.bytes(32), decision))
     first = Slots().read(Parsed(english, therefore=english.flight_decision), facts)
     assert isinstance(first, Draft), first
     second = Slots().read_mirror(Parsed(chinese), first, facts)

@@ -249,7 +249,7 @@ def test_trial_windows_are_consistent_flights(scene):
     assert facts.speed_mps[-1] == pytest.approx(np.hypot(scene.speed_mps, scene.climb_mps), abs=0.01)
     assert facts.visibility[-1] == "visible"
     assert None not in facts.box_height_px
-    for left, top, right, bottom in window.target_bbox:
+    for left, top, right, bottom in (frame.target_bbox for frame in window.frames):
         assert 0 < left < right < 1280
         assert 0 < top < bottom < 720
     pictures = pictures_of(window, CaptionConfig().image)

@@ -15,7 +15,15 @@ from teacher_server import TeacherServer
 
 from caption.label_motion import as_flown
 from caption.run.stage import run
-from caption.schema import CaptionConfig, FutureMotion, ImageConfig, LabelConfig, ObservedWindow, WindowConfig
+from caption.schema import (
+    CaptionConfig,
+    FutureMotion,
+    ImageConfig,
+    LabelConfig,
+    ObservedWindow,
+    WindowConfig,
+    observed_frames,
+)
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages, system_prompt
 from caption.truth.actions import label_of, measure
@@ -60,11 +68,12 @@ def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
     flight = flight_in(tree)
     sample = next(cut_windows(flight, WindowConfig()))
     assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
-    for field in dataclasses.fields(ObservedWindow):
-        value = getattr(sample.observed, field.name)
-        if isinstance(value, np.ndarray):
-            assert len(value) == 5
-            assert value.base is None or len(value.base) == 5, f"{field.name} is a view into the flight"
+    assert [frame.time_s for frame in sample.observed.frames] == flight.time_s[:5].tolist()
+    values = [
+        *vars(sample.observed).values(),
+        *(value for one in sample.observed.frames for value in vars(one).values()),
+    ]
+    assert not any(isinstance(value, np.ndarray) for value in values)  # which could be a view into the flight
 
 
 def spoil_future(root, current: int) -> None:
@@ -146,14 +155,17 @@ def test_facts_of_a_hand_made_window(tree):
         window,
         width_px=640,
         height_px=360,
-        time_s=100.0 + 0.5 * x,
-        positions_m=np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
-        rotations_deg=np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
-        targets_m=np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
-        target_bbox=np.tile([340.0, 160.0, 360.0, 220.0], (5, 1)),
-        in_view=np.array([True, True, True, True, False]),
-        visible=np.array([True, True, True, False, False]),
-        visibility=np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
+        frames=observed_frames(
+            100.0 + 0.5 * x,
+            np.stack([x, 0 * x, 20.0 - 0.5 * x], axis=1),  # 1 m forward, 0.5 m down per 0.5 s
+            np.stack([0 * x - 30.0, np.array([178.0, 179.0, -180.0, -179.0, -178.0]), 0 * x], axis=1),
+            np.stack([x + 15.0, 0 * x, 0 * x + 0.9], axis=1),
+            np.full((5, 2), np.nan),
+            np.tile([340.0, 160.0, 360.0, 220.0], (5, 1)),
+            np.array([True, True, True, True, False]),
+            np.array([True, True, True, False, False]),
+            np.array([np.nan, 1.0, 0.5, 0.1, 0.0]),
+        ),
     )
     facts = measure_facts(window)
     assert facts.speed_mps == (None, 2.24, 2.24, 2.24, 2.24)  # sqrt(1 + 0.25) / 0.5
@@ -172,7 +184,9 @@ def test_facts_of_a_hand_made_window(tree):
     chinese = make_question(window, ImageConfig(), "prose").prompts["zh"].user
     assert "[可见, 可见, 部分遮挡, 被遮挡, 在视野外]" in chinese
     assert "Frames are 0.5 s apart." in prompt
-    doubled = make_question(dataclasses.replace(window, time_s=0.5 * window.time_s), ImageConfig(), "prose").prompts
+    frames = tuple(dataclasses.replace(frame, time_s=0.5 * frame.time_s) for frame in window.frames)
+    halved = dataclasses.replace(window, frames=frames)
+    doubled = make_question(halved, ImageConfig(), "prose").prompts
     assert "Frames are 0.25 s apart." in doubled["en"].user
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
@@ -189,7 +203,7 @@ def test_the_box_is_that_of_what_is_seen(tree):
     assert facts.offset_x_px[:4] == (3, 3, 3, 3)  # 35 of 64 px across
     assert facts.offset_x_px[4] == round(flight.target_uv[4, 0] - 32)
     untold = next(cut_windows(flight, WindowConfig())).observed
-    assert np.array_equal(untold.target_bbox, flight.target_bbox[:5])
+    assert np.array_equal([frame.target_bbox for frame in untold.frames], flight.target_bbox[:5])
 
 
 def test_prompts_name_the_closed_set_and_the_shape():
@@ -314,7 +328,7 @@ def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks,
 def test_what_is_observed_stays_perturbed(two_tracks):
     clean, perturbed = flights_of(two_tracks)
     one, two = (next(cut_windows(flight, NO_IMAGES)) for flight in (clean, perturbed))
-    assert not np.allclose(one.observed.positions_m, two.observed.positions_m)
+    assert not np.allclose(*[[frame.position_m for frame in own.observed.frames] for own in (one, two)])
 
 
 def test_keyframes_are_chosen_by_the_same_labels(two_tracks):

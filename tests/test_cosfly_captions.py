@@ -1,6 +1,7 @@
 """What an answer must look like, and captions.jsonl."""
 
 import json
+import re
 
 import pytest
 from hypothesis import given
@@ -15,6 +16,7 @@ from cosfly.products.captions import (
     Caption,
     Coc,
     answer_schema,
+    is_in_script,
     normalize_action,
     parse_answer,
     read_captions,
@@ -147,3 +149,12 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
 def test_no_caption_holds_what_is_no_number(value):
     with pytest.raises(ValidationError, match="depth_range_m"):
         make_caption("Town01", "trajectory_1", "ORI", 4, depth_range_m=value)
+
+
+@given(st.text(alphabet="高度 ab{}t0，。é1я%", max_size=24))
+def test_a_glance_at_the_script_says_what_counting_says(text):
+    """Chinese has no more Latin words and foreign letters than characters, slots aside; a quick pattern answers for most texts."""
+    bare = re.sub(r"\{[^{}]*\}", "", text)
+    num_han = sum("\u4e00" <= char <= "\u9fff" for char in bare)
+    num_words, num_others = len(re.findall("[a-z]{2,}", bare)), bare.count("я")
+    assert is_in_script(text, "zh") == (num_words + num_others <= num_han)

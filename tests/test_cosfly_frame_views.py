@@ -207,7 +207,7 @@ def test_a_size_read_off_the_picture_is_the_measured_one(large, max_side_px):
     for i, folder in enumerate(observed.frame_folders):
         [picture] = pictures_of(observed, cfg).read(folder)
         rows, columns = np.nonzero((picture == PEDESTRIAN_RGB).all(axis=2))
-        if observed.visibility[i] < 1.0 or not len(rows):
+        if observed.frames[i].visibility < 1.0 or not len(rows):
             continue
         left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         assert right - left == pytest.approx(facts.box_width_px[i], abs=2)

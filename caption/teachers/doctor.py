@@ -18,7 +18,7 @@ import cv2
 import httpx
 import numpy as np
 
-from caption.schema import CaptionConfig, ObservedWindow
+from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.probes import Probe, read_probe
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
@@ -308,16 +308,17 @@ def largest_messages(cfg: CaptionConfig, pictures: list[dict]) -> list[dict]:
         indices=tuple(range(count)),
         width_px=1280,
         height_px=720,
-        time_s=0.5 * np.arange(count),
-        positions_m=far,
-        rotations_deg=np.tile([-123.4, -123.4, -123.4], (count, 1)),
-        targets_m=far + 100.0,
-        target_uv=np.tile([1234.5, 654.3], (count, 1)),
-        target_bbox=np.tile([1200.0, 600.0, 1260.0, 700.0], (count, 1)),
-        target_depth_m=np.full(count, 123.4),
-        in_view=np.ones(count, bool),
-        visible=np.ones(count, bool),
-        visibility=np.full(count, 0.5),
+        frames=observed_frames(
+            0.5 * np.arange(count),
+            far,
+            np.tile([-123.4, -123.4, -123.4], (count, 1)),
+            far + 100.0,
+            np.tile([1234.5, 654.3], (count, 1)),
+            np.tile([1200.0, 600.0, 1260.0, 700.0], (count, 1)),
+            np.ones(count, bool),
+            np.ones(count, bool),
+            np.full(count, 0.5),
+        ),
         frame_folders=tuple(Path(f"frame_{i:05d}") for i in range(count)),
         frame_files=tuple(frozenset(VIEW_FILES.values()) for _ in range(count)),
     )

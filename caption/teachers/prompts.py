@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 
-from caption.schema import ImageConfig, ObservedWindow
+from caption.schema import ImageConfig, ObservedFrame, ObservedWindow
 from caption.teachers.images import FrameSource, pictures_of
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
@@ -136,7 +136,7 @@ def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, 
         "pictures": PICTURES_MARK,
         "target_speed": unknown if speed is None else f"{speed:.2f}{unit}",
         "visibility": ", ".join([words[word][language] for word in facts.visibility]),
-        "target": "; ".join([_target_text(*p) or unknown for p in window.targets_m.tolist()]),
+        "target": "; ".join([_target_text(frame) or unknown for frame in window.frames]),
     }
     told = _filled(f"user_{language}") % (numbers | own)
     return told if window.mission is None else f"{told}\n{_MISSION[language][window.mission]}"
@@ -162,8 +162,8 @@ _WORDS_OF_NUMBERS: dict[Language, tuple[str, str]] = {"en": ("unknown", " m/s"),
 
 def _numbers(window: ObservedWindow, facts: Facts) -> dict[str, str]:
     """Give the numbers of a prompt, which are the same in both languages."""
-    step_s = float(window.time_s[-1] - window.time_s[0]) / (len(window.indices) - 1)
-    poses = zip(window.positions_m.tolist(), window.rotations_deg.tolist(), strict=True)
+    frames = window.frames
+    step_s = (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
     return {
         "num_frames": str(len(window.indices)),
         "step_s": f"{round(step_s, 3):g}",
@@ -171,19 +171,21 @@ def _numbers(window: ObservedWindow, facts: Facts) -> dict[str, str]:
         "speed": ", ".join(["0.0" if v is None else f"{v:.2f}" for v in facts.speed_mps]),
         "altitude": ", ".join([f"{v:.1f}" for v in facts.altitude_m]),
         "yaw": ", ".join([f"{v:.1f}" for v in facts.yaw_deg]),
-        "pose": "; ".join([_pose_text(*p, *r) for p, r in poses]),
+        "pose": "; ".join([_pose_text(frame) for frame in frames]),
     }
 
 
 # Five windows of a flight share a frame, and both languages its text.
 @lru_cache(maxsize=64)
-def _pose_text(x: float, y: float, z: float, pitch: float, yaw: float, roll: float) -> str:
+def _pose_text(frame: ObservedFrame) -> str:
+    (x, y, z), (pitch, yaw, roll) = frame.position_m, frame.rotation_deg
     return f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})"
 
 
 @lru_cache(maxsize=64)
-def _target_text(x: float, y: float, z: float) -> str:
-    """Give a position, "" where it is not known."""
+def _target_text(frame: ObservedFrame) -> str:
+    """Give the target's position, "" where it is not known."""
+    x, y, z = frame.target_m
     return "" if x != x else f"({x:z.2f}, {y:z.2f}, {z:z.2f})"
 
 

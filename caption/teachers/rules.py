@@ -12,7 +12,6 @@ from functools import cache, partial
 
 from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe, word_of
 from caption.truth.facts import Facts
-from cosfly.products.captions import Coc
 
 MODEL = "rules-5"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
@@ -100,7 +99,7 @@ def _goes_one_way(values: Sequence[float | None]) -> bool:
     return len(known) == len(values) and known in (sorted(known), sorted(known, reverse=True))
 
 
-def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> tuple[Coc, Coc]:
+def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> tuple[dict[str, str], dict[str, str]]:
     """Write the English and the Chinese answer, with slots for the facts.
 
     Args:
@@ -114,10 +113,10 @@ def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> 
     ]
     causes = [*_causes(facts, cues, token), conclusion]
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (statements, causes)]
-    english, chinese = (
-        Coc(critical_components=critical, reasoning_trace=reasons, flight_decision=token)
+    english, chinese = [
+        {"critical_components": critical, "reasoning_trace": reasons, "flight_decision": token}
         for critical, reasons in zip(*texts, strict=True)
-    )
+    ]
     return english, chinese
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 
 from caption.truth.facts import Facts
-from caption.truth.references import QUANTITIES, Fact, look_up, parse_reference
+from caption.truth.references import QUANTITIES, Fact, find_fact, parse_reference
 
 Both = tuple[str, str]  # English, Chinese
 
@@ -19,9 +19,11 @@ BEND_DEG = 15.0  # a change of the walker's heading that is worth a word
 
 def word_of(f: Facts, address: str) -> str | None:
     """Give the word that is true at an address, None where none is known."""
-    reference = parse_reference(address)
-    assert reference is not None
-    fact = look_up(reference, f)
+    fact = f.found.get(address)
+    if fact is None:
+        reference = parse_reference(address)
+        assert reference is not None
+        fact = f.found[address] = find_fact(reference, f)
     return str(fact.value) if isinstance(fact, Fact) else None
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from pydantic_core import to_json
 
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.foreign import FileTeacher, StudentTeacher
@@ -35,9 +36,8 @@ from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
-from cosfly.products.captions import Coc, TeacherRecord, TeacherSettings, answer_schema
+from cosfly.products.captions import TeacherRecord, TeacherSettings, answer_schema
 from cosfly.products.playback import flight_of
-from cosfly.store import dump_json
 
 ENCODING_THREADS = 4
 NUM_TRIALS = 2
@@ -62,9 +62,9 @@ class RuleTeacher:
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self.record = TeacherRecord(kind="rules", model=MODEL, settings=TeacherSettings(seed=seed))
-        self._last: tuple[str, tuple[Coc, Coc]] | None = None
+        self._last: tuple[str, tuple[dict[str, str], dict[str, str]]] | None = None
 
-    def _answers(self, question: Question) -> tuple[Coc, Coc]:
+    def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
         key = f"{question.window.sample_id}/{question.purpose}"
         if self._last is None or self._last[0] != key:
             draws = draws_for(self.seed, "caption", key)
@@ -73,14 +73,14 @@ class RuleTeacher:
 
     async def ask(self, question: Question) -> Reply:
         english = self._answers(question)[0]
-        return _native(english.model_dump() | {"therefore": english.flight_decision})
+        return _native(english | {"therefore": english["flight_decision"]})
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
-        return _native(self._answers(question)[1].model_dump())
+        return _native(self._answers(question)[1])
 
 
 def _native(answer: dict[str, str]) -> Reply:
-    return Reply(dump_json(answer), None, "native", "stop")
+    return Reply(to_json(answer).decode(), None, "native", "stop")  # a tenth of the time of the json module
 
 
 class SharedFrames:

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from caption.schema import CaptionConfig, ImageConfig, ObservedWindow
+from caption.schema import CaptionConfig, ImageConfig, ObservedWindow, observed_frames
 from caption.teachers.images import EncodedImage, encode_image
 from caption.teachers.prompts import Correction, Question, make_question, question_messages
 from caption.writing.contract import Refused, more_fields, refuse_decision, way_of
@@ -152,16 +152,17 @@ def trial_window(scene: Scene, count: int) -> ObservedWindow:
         indices=tuple(range(count)),
         width_px=CAMERA_PX[0],
         height_px=CAMERA_PX[1],
-        time_s=time_s,
-        positions_m=drone,
-        rotations_deg=np.stack([pitch, yaw, 0.0 * yaw], axis=1),
-        targets_m=target,
-        target_uv=np.stack([u, v], axis=1),
-        target_bbox=np.stack([u - 0.2 * height, v - 0.5 * height, u + 0.2 * height, v + 0.5 * height], axis=1),
-        target_depth_m=slant,
-        in_view=np.ones(count, bool),
-        visible=~hidden,
-        visibility=np.where(hidden, 0.1, 1.0),
+        frames=observed_frames(
+            time_s,
+            drone,
+            np.stack([pitch, yaw, 0.0 * yaw], axis=1),
+            target,
+            np.stack([u, v], axis=1),
+            np.stack([u - 0.2 * height, v - 0.5 * height, u + 0.2 * height, v + 0.5 * height], axis=1),
+            np.ones(count, bool),
+            ~hidden,
+            np.where(hidden, 0.1, 1.0),
+        ),
         frame_folders=tuple(Path(f"frame_{number:05d}") for number in range(count)),
         frame_files=tuple(frozenset(VIEW_FILES.values()) for _ in range(count)),
     )
@@ -182,8 +183,8 @@ class Drawn:
         ground, person, wall = _COLOURS[view]
         image = np.full((size_px[1], size_px[0], 3), ground, np.uint8)
         scale = size_px[0] / self.window.width_px
-        left, top, right, bottom = (round(float(edge) * scale) for edge in self.window.target_bbox[index])
-        is_hidden = not self.window.visible[index]
+        left, top, right, bottom = (round(edge * scale) for edge in self.window.frames[index].target_bbox)
+        is_hidden = not self.window.frames[index].visible
         grow = (right - left) if is_hidden else 0
         cv2.rectangle(
             image, (left - grow, top - grow), (right + grow, bottom + grow), wall if is_hidden else person, -1

@@ -226,4 +226,4 @@ def verdict_of(decision: str, motion: Motion, cfg: LabelConfig, label: str | Non
 
 def contradicted_by(motion: Motion, cfg: LabelConfig, label: str | None) -> list[str]:
     """Give the decisions that the actual future contradicts: what a guess would have run into."""
-    return [token for token in ACTIONS if verdict_of(token, motion, cfg, label) == "HARD_CONFLICT"]
+    return [token for token in ACTIONS if token != label and is_contradicted(token, motion, cfg)]

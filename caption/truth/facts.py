@@ -13,7 +13,7 @@ from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, Literal
 
-from caption.schema import ObservedWindow
+from caption.schema import ObservedFrame, ObservedWindow
 
 VisibilityWord = Literal["visible", "partly_occluded", "occluded", "out_of_view"]
 STANDING_MPS = 0.2  # slower than this a person stands
@@ -84,27 +84,18 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         picture_px: (width, height) of the pictures that are shown, which pixels refer to; None: the camera's own.
     """
     width_px, height_px = picture_px or (window.width_px, window.height_px)
-    x_scale, y_scale = width_px / window.width_px, height_px / window.height_px
-    # Plain numbers: for five frames they are several times faster than arrays.
-    time_s, positions, targets = window.time_s.tolist(), window.positions_m.tolist(), window.targets_m.tolist()
-    rotations = window.rotations_deg.tolist()
-    boxes = [[a * x_scale, b * y_scale, c * x_scale, d * y_scale] for a, b, c, d in window.target_bbox.tolist()]
-    steps_s = [after - before for before, after in pairwise(time_s)]
-    walked = [(q[0] - p[0], q[1] - p[1]) for p, q in pairwise(targets)]
-    walking_mps = [math.hypot(x, y) / step_s for (x, y), step_s in zip(walked, steps_s, strict=True)]
-    turns_deg = [wrapped(after[1] - before[1]) for before, after in pairwise(rotations)]
-    flown = [math.dist(p, q) for p, q in pairwise(positions)]
-    poses = zip(positions, rotations, targets, strict=True)
-    frames = zip(*[_measure_frame(*p, *r, *q) for p, r, q in poses], strict=True)
-    altitude, pitch, heading, distance, slant, height, bearing, depression = frames
-    # The middle of the box is where the person is seen; uv (the hip) stands in where a tree has no box.
-    seen = [
-        (u * x_scale, v * y_scale) if box[0] != box[0] else ((box[0] + box[2]) / 2.0, (box[1] + box[3]) / 2.0)
-        for box, (u, v) in zip(boxes, window.target_uv.tolist(), strict=True)
-    ]
-    flags = zip(window.in_view.tolist(), window.visible.tolist(), window.visibility.tolist(), strict=True)
+    frames = window.frames
+    camera_px, picture_px = (window.width_px, window.height_px), (width_px, height_px)
+    altitude, pitch, heading, distance, slant, height, bearing, depression, *seen, visibility = zip(
+        *[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True
+    )
+    box_width, box_height, offset_x, offset_y = seen
+    turns_deg, flown, speed, walked, walked_m, walking_mps, walking, course = zip(
+        *[_measure_step(before, after) for before, after in pairwise(frames)], strict=True
+    )
+    start = frames[0].position_m
     return Facts(
-        speed_mps=(None, *_rounded([way / step_s for way, step_s in zip(flown, steps_s, strict=True)], 2)),
+        speed_mps=(None, *speed),
         altitude_m=altitude,
         yaw_deg=tuple([round(a, 1) + 0.0 for a in accumulate(turns_deg, initial=0.0)]),
         pitch_deg=pitch,
@@ -112,20 +103,20 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         slant_m=slant,
         target_speed_mps=_rounded([sum(walking_mps) / len(walking_mps)], 2)[0],
         target_turn_deg=_turn_deg(walked[0], walked[-1], min(walking_mps[0], walking_mps[-1])),
-        box_width_px=_pixels([box[2] - box[0] for box in boxes]),
-        box_height_px=_pixels([box[3] - box[1] for box in boxes]),
-        offset_x_px=_pixels([u - width_px / 2.0 for u, _ in seen]),
-        offset_y_px=_pixels([v - height_px / 2.0 for _, v in seen]),
-        visibility=tuple([_word(in_view, visible, score) for in_view, visible, score in flags]),
+        box_width_px=box_width,
+        box_height_px=box_height,
+        offset_x_px=offset_x,
+        offset_y_px=offset_y,
+        visibility=visibility,
         width_px=width_px,
         height_px=height_px,
-        step_s=round(sum(steps_s) / len(steps_s), 3),
+        step_s=round(sum([after.time_s - before.time_s for before, after in pairwise(frames)]) / len(flown), 3),
         heading_deg=heading,
         travelled_m=tuple([round(way, 1) for way in accumulate(flown, initial=0.0)]),
-        displacement_m=tuple([round(math.dist(positions[0], p), 1) for p in positions]),
-        target_speeds_mps=(None, *_rounded(walking_mps, 2)),
-        target_headings_deg=(None, *_headings_deg(walked, walking_mps)),
-        target_travelled_m=_rounded(accumulate([math.hypot(x, y) for x, y in walked], initial=0.0), 1),
+        displacement_m=tuple([round(math.dist(start, frame.position_m), 1) for frame in frames]),
+        target_speeds_mps=(None, *walking),
+        target_headings_deg=(None, *course),
+        target_travelled_m=_rounded(accumulate(walked_m, initial=0.0), 1),
         height_over_target_m=height,
         bearing_deg=bearing,
         depression_deg=depression,
@@ -134,14 +125,14 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
 
 
 @lru_cache(maxsize=64)  # five windows of a flight share a frame
-def _measure_frame(
-    x: float, y: float, z: float, pitch: float, heading: float, roll: float, u: float, v: float, w: float
-) -> tuple[float | None, ...]:
-    """Measure what one frame tells of a drone at x, y, z and a target at u, v, w.
+def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> tuple[Any, ...]:
+    """Measure what one frame tells.
 
     Returns:
-        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, as the facts have them.
+        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, the box's width and height, its middle's
+        offset to the right and down, the word for visibility: as the facts have them.
     """
+    (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
     # + 0.0: no negative zero, which is equal to zero here and another direction to atan2
     away_x, away_y, away_z = u - x + 0.0, v - y + 0.0, w - z + 0.0
     distance = math.hypot(away_x, away_y)
@@ -149,7 +140,45 @@ def _measure_frame(
     bearing = wrapped(math.degrees(math.atan2(away_y, away_x)) - heading)
     depression = math.degrees(math.atan2(-away_z, distance))
     own = (round(z, 1) + 0.0, round(pitch, 1) + 0.0, round(wrapped(heading), 1) + 0.0)
-    return (*own, *_rounded((distance, slant, -away_z, bearing, depression), 1))
+    return (
+        *own,
+        *_rounded((distance, slant, -away_z, bearing, depression), 1),
+        *_measure_picture(frame, camera_px, picture_px),
+        _word(frame.in_view, frame.visible, frame.visibility),
+    )
+
+
+def _measure_picture(
+    frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]
+) -> tuple[int | None, ...]:
+    """Measure the target in the picture: its box's width and height, its offset from the middle to the right and down."""
+    (width_px, height_px), (u, v) = picture_px, frame.target_uv
+    x_scale, y_scale = width_px / camera_px[0], height_px / camera_px[1]
+    left, top, right, bottom = frame.target_bbox
+    left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
+    # The middle of the box is where the person is seen; uv (the hip) stands in where a tree has no box.
+    u, v = (u * x_scale, v * y_scale) if left != left else ((left + right) / 2.0, (top + bottom) / 2.0)
+    return _pixels([right - left, bottom - top, u - width_px / 2.0, v - height_px / 2.0])
+
+
+@lru_cache(maxsize=64)
+def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...]:
+    """Measure what happened between two frames.
+
+    Returns:
+        turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and as the facts have them speed
+        and heading.
+    """
+    step_s = after.time_s - before.time_s
+    (x0, y0, _), (x1, y1, _) = before.target_m, after.target_m
+    x, y = x1 - x0, y1 - y0
+    way_m, flown_m = math.hypot(x, y), math.dist(before.position_m, after.position_m)
+    walking_mps = way_m / step_s
+    turn_deg = wrapped(after.rotation_deg[1] - before.rotation_deg[1])
+    # NaN is not larger either
+    heading_deg = round(math.degrees(math.atan2(y, x)), 1) + 0.0 if walking_mps > STANDING_MPS else None
+    speed, walking = _rounded((flown_m / step_s, walking_mps), 2)
+    return turn_deg, flown_m, speed, (x, y), way_m, walking_mps, walking, heading_deg
 
 
 def wrapped(angle_deg: float) -> float:
@@ -171,13 +200,6 @@ def _turn_deg(first: tuple[float, float], last: tuple[float, float], slowest_mps
     if not slowest_mps > STANDING_MPS or x0 != x0 or x1 != x1:
         return None
     return round(math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)), 1) + 0.0
-
-
-def _headings_deg(steps: list[tuple[float, float]], speeds_mps: list[float]) -> list[float | None]:
-    return [
-        round(math.degrees(math.atan2(y, x)), 1) + 0.0 if speed > STANDING_MPS else None  # NaN is not larger either
-        for (x, y), speed in zip(steps, speeds_mps, strict=True)
-    ]
 
 
 def _word(in_view: bool, visible: bool, score: float) -> VisibilityWord:

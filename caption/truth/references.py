@@ -162,13 +162,11 @@ def parse_reference(text: str) -> Reference | None:
 
 def look_up(reference: Reference, facts: Facts) -> Fact | Missing:
     """Give the fact at an address, or why there is none."""
-    if not reference.aspect:
-        quantity = QUANTITIES.get(reference.quantity)
-        if quantity is not None:  # as quick to read as to remember
-            return _value_at(reference.first, quantity, facts)
+    if not reference.aspect and reference.quantity in QUANTITIES:  # as quick to read as to remember
+        return find_fact(reference, facts)
     found = facts.found.get(reference)
     if found is None:
-        found = facts.found[reference] = _find(reference, facts)
+        found = facts.found[reference] = find_fact(reference, facts)
     return found
 
 
@@ -179,19 +177,19 @@ def _value_at(frame: int | None, quantity: Quantity, facts: Facts) -> Fact | Mis
     return "unknown_fact" if value is None else Fact(value, quantity.unit, quantity.digits)
 
 
-def _find(reference: Reference, facts: Facts) -> Fact | Missing:
-    count, first, last = len(facts.yaw_deg), reference.first, reference.last
+def find_fact(reference: Reference, facts: Facts) -> Fact | Missing:
+    """Look a fact up without remembering it, for who remembers it under a name."""
+    name, aspect, first, last = reference
+    if not aspect and name in QUANTITIES:
+        return _value_at(first, QUANTITIES[name], facts)
+    count = len(facts.yaw_deg)
     if (first is not None and first >= count) or (last is not None and last >= count):
         return "unobserved_frame"
-    frame = count - 1 if first is None else first
-    match reference.quantity, reference.aspect:
-        case "visibility", _:
-            return Fact(facts.visibility[frame])
-        case ("target_motion" | "drone_motion") as name, _:
-            return _motion(name, facts, reference.first)
-        case _, "comparison":
-            return _comparison(facts, reference.first)
-    return _over_span(reference, facts)
+    if name == "visibility":
+        return Fact(facts.visibility[count - 1 if first is None else first])
+    if name in MOTIONS:
+        return _motion(name, facts, first)
+    return _comparison(facts, first) if aspect == "comparison" else _over_span(reference, facts)
 
 
 def _at(series: Series, frame: int) -> float | None:
@@ -200,12 +198,12 @@ def _at(series: Series, frame: int) -> float | None:
 
 def span_of(reference: Reference, facts: Facts) -> list[float] | None:
     """Give the known values of a reference's span; None where an end that it names is not known."""
-    series = QUANTITIES[reference.quantity].read(facts)
+    name, _, first, last = reference
+    series = QUANTITIES[name].read(facts)
     if not series:
         return None
-    first, last = reference.first, reference.last
-    start, end = (0 if first is None else first), (len(facts) - 1 if last is None else last)
-    if first == 0 and reference.quantity in STEPS:
+    start, end = (0 if first is None else first), (len(series) - 1 if last is None else last)
+    if first == 0 and name in STEPS:
         first = None
     if (first is not None and series[start] is None) or series[end] is None:
         return None

@@ -14,7 +14,7 @@ from typing import Protocol
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.sentences import Judged
-from cosfly.products.captions import ACTIONS, Claim, Coc, Language, Parsed, Template, Writing
+from cosfly.products.captions import ACTIONS, Claim, Coc, Language, Parsed, SentenceState, Template, Writing
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",
@@ -28,13 +28,13 @@ DECISION_REASON = "decision_against_reasoning"
 class Draft:
     """A caption in one language: its plain text, and what that came from. therefore: of the English alone.
 
-    judged: the state of its sentences, where making the text has told it.
+    states: of its sentences, where making the text has told them.
     """
 
     coc: Coc
     therefore: str | None = None
     template: Template | None = None
-    judged: tuple[Judged, ...] = ()
+    states: tuple[SentenceState, ...] = ()
     claims: tuple[Claim, ...] = ()
 
     @property

@@ -8,9 +8,9 @@ from functools import cache
 
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
-from caption.truth.references import QUANTITIES, Fact, Missing, Reference, look_up, span_of
+from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
 from caption.writing.contract import DECISION_REASON, Refused
-from caption.writing.templates import TURNS, Sentence, Slot, read_sentence
+from caption.writing.templates import TURNS, Sentence, Slot, read_sentence, units_behind
 from cosfly.products.captions import Language
 
 _DIRECTIONS = {
@@ -26,7 +26,7 @@ class Filler:
 
     def __init__(self, facts: Facts, decision: str, language: Language) -> None:
         self.facts, self.decision, self.language = facts, decision, language
-        self._found, self._units, self._forms = facts.found, _units(language), _words(language)
+        self._found, self._units, self._forms = facts.found, units_behind(language), _words(language)
         self._printed: dict[str, str] = {}
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
@@ -38,16 +38,24 @@ class Filler:
             refused = self._check_decisions(sentence)
             if refused is not None:
                 return refused
-        words = []
-        for slot in sentence.slots:
-            word = self._printed.get(slot.key) or self._print(slot)
+        words, printed, facts = [], self._printed, self.facts
+        for place in sentence.places:
+            key, slot, read, frame, form = place
+            if read is not None:  # a plain value of a series, which most slots are
+                series = read(facts)
+                value = series[frame] if series and frame < len(series) else None
+                if value is not None:
+                    words.append(form % (abs(value) if slot.is_size else value))
+                    continue
+            word = printed.get(key) or self._print(slot)
             if isinstance(word, Refused):
                 return word
             words.append(word)
-        for number, directions in sentence.sizes:
-            refused = self._check_direction(number, directions)
-            if refused is not None:
-                return refused
+        if sentence.sizes:
+            for number, directions in sentence.sizes:
+                refused = self._check_direction(number, directions)
+                if refused is not None:
+                    return refused
         filled = sentence.pattern % tuple(words)
         return filled[0].upper() + filled[1:] if sentence.begins_with_slot else filled
 
@@ -61,61 +69,36 @@ class Filler:
         return Refused(DECISION_REASON, complaint)
 
     def _print(self, slot: Slot) -> str | Refused:
-        word = self._plain_value(slot)
-        if word is None:
-            fact = self._fitting(slot)
-            if isinstance(fact, Refused):
-                return fact
-            word = self._written(slot, fact)
+        fact = self._look_up(slot)
+        if isinstance(fact, str):
+            return self._missing(slot, fact)
+        value, unit, digits = fact
+        if value in _NEITHER and (slot.is_size or slot.needs_side):
+            value = self._exact_side(slot, fact).value if slot.is_size else value
+            if slot.needs_side and value in _NEITHER:
+                fix = f"it is {value} here, neither side: say it without this slot, or as `is {{{slot.name}}}`"
+                return Refused("slots_no_side", f"{{{slot.name}}}: {fix}")
+        if not isinstance(value, str):
+            word = _DIGITS[digits] % (abs(value) if slot.is_size else value) + self._units[unit]
+        elif unit:  # a box
+            word = (value if self.language == "en" else value.replace("x", "×")) + self._units[unit]
+        else:
+            forms = self._forms[value]
+            word = forms[min(slot.form, len(forms) - 1)]
         if slot.article:
             word = f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}"
         self._printed[slot.key] = word
         return word
 
-    def _plain_value(self, slot: Slot) -> str | None:
-        """Write a value of a series, which most slots are; None where it is something else, or not known."""
-        quantity = slot.quantity
-        if quantity is None:
-            return None
-        assert slot.reference is not None
-        series, frame = quantity.read(self.facts), slot.reference.first
-        if not series or (frame is not None and frame >= len(series)):
-            return None
-        value = series[-1 if frame is None else frame]
-        if value is None:
-            return None
-        return _DIGITS[quantity.digits] % (abs(value) if slot.is_size else value) + self._units[quantity.unit]
-
-    def _fitting(self, slot: Slot) -> Fact | Refused:
-        """Give the fact of a slot, with the side that its sentence needs."""
-        fact = self._look_up(slot)
-        if isinstance(fact, str):
-            return self._missing(slot, fact)
-        if fact.value in _NEITHER:
-            fact = self._exact_side(slot, fact) if slot.is_size else fact
-            if slot.needs_side and fact.value in _NEITHER:
-                fix = f"it is {fact.value} here, neither side: say it without this slot, or as `is {{{slot.name}}}`"
-                return Refused("slots_no_side", f"{{{slot.name}}}: {fix}")
-        return fact
-
-    def _written(self, slot: Slot, fact: Fact) -> str:
-        value, unit, digits = fact
-        if not isinstance(value, str):
-            return _DIGITS[digits] % (abs(value) if slot.is_size else value) + self._units[unit]
-        if unit:  # a box
-            return (value if self.language == "en" else value.replace("x", "×")) + self._units[unit]
-        forms = self._forms[value]
-        return forms[min(slot.form, len(forms) - 1)]
-
     def _look_up(self, slot: Slot) -> Fact | Missing:
-        found = self._found.get(slot.name)  # the other language has asked for it
+        found = self._found.get(slot.fact_key)  # the other language has asked for it
         if found is None:
             if slot.reference is None:
                 return self._of_decision(slot)
-            found = look_up(slot.reference, self.facts)
+            found = find_fact(slot.reference, self.facts)
             if slot.is_shaped and isinstance(found, Fact):
                 found = self._shaped(slot.reference, found)
-            self._found[slot.name] = found
+            self._found[slot.fact_key] = found
         return found
 
     def _of_decision(self, slot: Slot) -> Fact | Missing:
@@ -152,28 +135,20 @@ class Filler:
         return Refused(f"slots_{why}", f"{{{slot.name}}} {words[why]}")
 
     def _check_direction(self, number: Slot, words: Sequence[Slot]) -> Refused | None:
-        """Refuse a size beside directions of its quantity none of which is its own: those of other frames."""
-        value = self._value(number)
+        """Refuse a size beside directions of its quantity none of which is its own: those of other frames. All have been printed."""
+        value = self._look_up(number)[0]
         assert not isinstance(value, str)
         own = (value > 0) - (value < 0)
         own = -own if number.direction == "side:offset_x" else own  # positive to the right
         if not own:
             return None
         for slot in words:
-            if _DIRECTIONS.get(self._word(slot), 0) != -own:
+            word = self._look_up(slot)
+            assert isinstance(word, Fact)
+            if _DIRECTIONS.get(str(self._exact_side(slot, word)[0] if slot.is_size else word[0]), 0) != -own:
                 return None
         fix = "its own direction is the other one; name the same frames in both slots"
         return Refused("slots_sign_differs", f"{{{number.name}}} beside a direction of other frames: {fix}")
-
-    def _word(self, slot: Slot) -> str:
-        found = self._look_up(slot)
-        assert isinstance(found, Fact)  # it has been printed
-        return str(self._exact_side(slot, found).value if slot.is_size else found.value)
-
-    def _value(self, slot: Slot) -> float | str:
-        found = self._look_up(slot)
-        assert isinstance(found, Fact)  # it has been printed
-        return found.value
 
     def _exact_side(self, slot: Slot, side: Fact) -> Fact:
         """Give the side of the very number where "straight" or "centred" would say neither."""
@@ -185,13 +160,6 @@ class Filler:
         if not isinstance(number, Fact) or isinstance(number.value, str) or not number.value:
             return side
         return Fact(QUANTITIES[quantity].sides[0 if number.value > 0 else 1])
-
-
-@cache
-def _units(language: Language) -> dict[str, str]:
-    """Give what stands behind a number: its unit, a space before it where one belongs there."""
-    units = load_glossary().written_units[language]
-    return {unit: f"{'' if unit == 'percent' else ' '}{written}" for unit, written in units.items()}
 
 
 @cache

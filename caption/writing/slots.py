@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import get_args
 
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
@@ -18,10 +19,12 @@ from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler, facts_of
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.products.captions import Coc, Language, Parsed, Template
+from cosfly.products.captions import Coc, Language, Parsed, SentenceState, Template
 from cosfly.products.sentences import cut_sentences
 
 MAX_COMPLAINTS = 6  # named at once
+# Nothing that was filled in is contradicted, so nobody asks which sentence it was.
+_JUDGED = {state: Judged("", "", state) for state in get_args(SentenceState)}
 
 
 class Slots:
@@ -53,7 +56,7 @@ class Slots:
         return Refused("glossary", missing, found) if missing else found
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
-        return list(draft.judged)
+        return [_JUDGED[state] for state in draft.states]
 
 
 @lru_cache(maxsize=64)  # an English text is read again when its mirror is held against it
@@ -65,25 +68,24 @@ def read_text(text: str, language: Language, num_frames: int, step_s: float) -> 
 def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None = None) -> Draft | Refused:
     """Fill the templates of an answer, or tell all that is wrong with their sentences."""
     filler, num_frames = Filler(facts, written.flight_decision, language), len(facts)
-    judged: list[Judged] = []
+    states: list[SentenceState] = []
     problems: list[Refused] = []
     texts: dict[str, str] = {}
-    for letter, name in zip("CR", TEXTS, strict=True):
+    for name in TEXTS:
         filled: list[str] = []
+        is_reasoning = name == "reasoning_trace"
         for number, sentence in enumerate(read_text(getattr(written, name), language, num_frames, facts.step_s), 1):
-            if isinstance(sentence, Sentence):
-                plain = filler.fill(sentence, is_reasoning=letter == "R")
-                if isinstance(plain, str):
-                    judged.append(Judged(f"{letter}{number}", plain, sentence.state))
-                    filled.append(plain)
-                    continue
-                sentence = plain
-            problems.append(Refused(sentence.reason, f"{name}, sentence {number}: {sentence.complaint}."))
+            plain = filler.fill(sentence, is_reasoning=is_reasoning) if isinstance(sentence, Sentence) else sentence
+            if isinstance(plain, Refused):
+                problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
+            elif isinstance(sentence, Sentence):
+                states.append(sentence.state)
+                filled.append(plain)
         texts[name] = "".join(filled)
     if problems:
         return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))
     template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
-    return Draft(Coc(**texts, flight_decision=written.flight_decision), therefore, template, tuple(judged))
+    return Draft(Coc(**texts, flight_decision=written.flight_decision), therefore, template, tuple(states))
 
 
 def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:

@@ -11,10 +11,12 @@ What may stand beside slots: outside.py.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Literal
+from functools import cache, cached_property, lru_cache
+from typing import Literal, NamedTuple
 
+from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.references import (
     ANGLES,
@@ -22,6 +24,7 @@ from caption.truth.references import (
     QUANTITIES,
     Quantity,
     Reference,
+    Series,
     parse_reference,
 )
 from caption.writing.contract import Refused
@@ -58,6 +61,11 @@ class Slot:
     def key(self) -> str:
         """What decides how it is printed."""
         return f"{self.name} {self.form} {self.needs_side:d} {self.is_size:d} {self.article}"
+
+    @cached_property
+    def fact_key(self) -> str:
+        """Name its fact among those that were looked up: one that is written otherwise is another."""
+        return f"shaped {self.name}" if self.is_shaped else self.name
 
     @cached_property
     def quantity(self) -> Quantity | None:
@@ -102,6 +110,17 @@ def has_sides(quantity: str) -> bool:
     return bool(QUANTITIES[quantity].sides) and quantity not in ANGLES
 
 
+class Place(NamedTuple):
+    """A slot where it stands. key: what decides how it is printed. read, frame, form: the series of which it is a plain value, its
+    frame, and how that is written with its unit; None where it is something else."""
+
+    key: str
+    slot: Slot
+    read: Callable[[Facts], Series] | None = None
+    frame: int = -1
+    form: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Sentence:
     """A sentence that may be filled.
@@ -112,7 +131,7 @@ class Sentence:
     """
 
     pattern: str
-    slots: tuple[Slot, ...]
+    places: tuple[Place, ...]
     names: tuple[str, ...]
     sizes: tuple[tuple[Slot, tuple[Slot, ...]], ...]
     begins_with_slot: bool
@@ -158,7 +177,7 @@ def read_sentence(text: str, language: Language, num_frames: int, step_s: float)
         slots = [_with_article(slot, texts, number) for number, slot in enumerate(slots)]
     return Sentence(
         pattern="%s".join(part.replace("%", "%%") for part in texts),
-        slots=tuple(slots),
+        places=tuple(_place(slot, language) for slot in slots),
         names=tuple(sorted(slot.name for slot in slots)),
         sizes=tuple((slot, _words_of(slot, slots)) for slot in slots if slot.is_size and not slot.is_word),
         begins_with_slot=begins_with_slot,
@@ -177,6 +196,23 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
         return slot
     texts[number] = texts[number][: match.start()]
     return replace(slot, article=match[1])
+
+
+def _place(slot: Slot, language: Language) -> Place:
+    quantity = slot.quantity
+    if quantity is None or slot.article:
+        return Place(slot.key, slot)
+    assert slot.reference is not None
+    frame = -1 if slot.reference.first is None else slot.reference.first
+    form = f"%.{quantity.digits}f{units_behind(language)[quantity.unit]}"
+    return Place(slot.key, slot, quantity.read, frame, form)
+
+
+@cache
+def units_behind(language: Language) -> dict[str, str]:
+    """Give what stands behind a number: its unit, a space before it where one belongs there."""
+    units = load_glossary().written_units[language]
+    return {unit: f"{'' if unit == 'percent' else ' '}{written}" for unit, written in units.items()}
 
 
 def _words_of(number: Slot, slots: list[Slot]) -> tuple[Slot, ...]:

@@ -118,6 +118,10 @@ _LEFT_OUT = re.compile(r"\.{3,}|…+|⋯+|。{3,}|·{3,}")
 _SLOT = re.compile(r"\{[^{}]*\}")
 _HAN = re.compile(r"[\u4e00-\u9fff]+")
 _LATIN = re.compile(r"[A-Za-z]{2,}")
+# All of it is Chinese but for numbers, marks, slots and single letters: most texts, and one scan tells.
+_PLAIN_ZH = re.compile(
+    r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+)*+"
+)
 _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 
@@ -141,11 +145,11 @@ def parse_answer(
 
 
 def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
-    if value.keys() != set(names):
+    if len(value) != len(names) or not all(map(value.__contains__, names)):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
     if not all(isinstance(value[name], str) for name in FIELDS):
         return Parsed(None, "field_not_text")
-    if any(_CONTROL.search(value[name]) for name in FIELDS):
+    if not all(value[name].isprintable() or not _CONTROL.search(value[name]) for name in FIELDS):
         value = {name: _CONTROL.sub("", text) if name in FIELDS else text for name, text in value.items()}
         recovered.append("control_characters")
     cleaned = {name: value[name].strip() for name in FIELDS}
@@ -168,7 +172,7 @@ def _problem_of(text: str, language: Language, min_characters: int) -> str | Non
     if len(text) < min_characters:
         return "too_short"
     if (text[0], text[-1]) in (("<", ">"), ("[", "]")) or (
-        any(dots in text for dots in _DOTS) and _is_left_out(text, min_characters)
+        any(map(text.__contains__, _DOTS)) and _is_left_out(text, min_characters)
     ):
         return "placeholder"
     return None if is_in_script(text, language) else "wrong_language"
@@ -185,7 +189,7 @@ def is_in_script(text: str, language: Language) -> bool:
 
     Letters of other scripts are of neither. The names in slots are no words.
     """
-    if language == "en" and text.isascii():
+    if text.isascii() if language == "en" else _PLAIN_ZH.fullmatch(text):
         return True
     text = _SLOT.sub("", text)
     num_han, num_words = sum(map(len, _HAN.findall(text))), len(_LATIN.findall(text))

@@ -12,7 +12,8 @@ from cosfly.products.captions import Coc
 _ABBREVIATIONS = ("approx", "ca", "vs", "deg", "i\\.e", "e\\.g", "resp", "max", "min", "avg", "horiz")
 _POINT = r"(?<=\.)(?=\s|$)" + "".join(rf"(?<!\b(?i:{word})\.)" for word in _ABBREVIATIONS)
 # Begins with one class of characters, for which the engine looks by itself: twice as fast as with alternatives.
-_END = re.compile(rf"[.。！？!?\n](?:(?<=[。！？!?])[。！？!?]*|(?<=\n)|{_POINT})\s*")
+_MARKS = ".。！？!?\n"
+_END = re.compile(rf"[{_MARKS}](?:(?<=[。！？!?])[。！？!?]*|(?<=\n)|{_POINT})\s*")
 
 
 def sentences_of(coc: Coc) -> Iterator[tuple[str, str]]:
@@ -27,7 +28,7 @@ def cut_sentences(text: str) -> tuple[str, ...]:
     """Cut a text at the ends of its sentences; together the pieces are the text."""
     pieces: list[str] = []
     start = 0
-    for end in [*[match.end() for match in _END.finditer(text)], len(text)]:
+    for end in [*_ends_in(text), len(text)]:
         piece = text[start:end]
         if piece and not piece.isspace():
             pieces.append(piece)
@@ -35,3 +36,18 @@ def cut_sentences(text: str) -> tuple[str, ...]:
             pieces[-1] += piece
         start = end
     return tuple(pieces)
+
+
+def _ends_in(text: str) -> list[int]:
+    """Give the places after each end. Where one mark ends all sentences, looking for it is twice as fast as the pattern."""
+    marks = [mark for mark in _MARKS if mark in text]
+    if len(marks) != 1:
+        return [match.end() for match in _END.finditer(text)]
+    ends: list[int] = []
+    at = text.find(marks[0])
+    while at >= 0:
+        match = _END.match(text, at)
+        if match is not None:
+            ends.append(match.end())
+        at = text.find(marks[0], at + 1 if match is None else ends[-1])
+    return ends
