@@ -51,8 +51,8 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
     terms = _terms(teacher, observed.sample_id, cfg)
     question = make_question(observed, cfg.image, terms.writing)
     loop = _Loop(teacher, cfg, terms, motion, label_of(motion, cfg.label), judge)
-    loop.checks.keyframe = window.keyframe
-    loop.checks.contradicted = contradicted_by(motion, cfg.label, loop.label)
+    loop.checks["keyframe"] = window.keyframe
+    loop.checks["contradicted"] = contradicted_by(motion, cfg.label, loop.label)
     reason = window.problem
     if reason is None:
         try:
@@ -62,10 +62,10 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
                 raise
             reason = error.cause
             if not terms.is_given:  # else nobody was asked: the file does not hold it
-                loop.checks.refusal = error.detail
+                loop.checks["refusal"] = error.detail
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unreadable_frame"
-            loop.checks.frame = error.what
+            loop.checks["frame"] = error.what
     return _record(window, question, teacher, loop, reason)
 
 
@@ -93,7 +93,7 @@ def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, r
         verdict=loop.verdict,
         judge=loop.judgement,
         repair=loop.repair,
-        checks=loop.checks,
+        checks=Checks(**loop.checks),
         status="accepted" if reason is None else "dropped",
         drop_reason=reason,
     )
@@ -171,7 +171,7 @@ class _Loop:
         self.verdict: Verdict | None = None
         self.judgement: JudgeRecord | None = None
         self.repair: RepairRecord | None = None
-        self.checks = Checks()
+        self.checks: dict[str, Any] = {}
         self.usage = Usage()
         self.asks = 0
         self.structured: str | None = None
@@ -186,14 +186,14 @@ class _Loop:
         if reason is None and self.terms.has_mirror:
             reason = await self._mirror()
         elif reason is None:
-            self.checks.bilingual = "no_chinese"
+            self.checks["bilingual"] = "no_chinese"
         if reason is None or (self.terms.is_given and self.english is not None):
             found = self._check_evidence(question)  # what was given is judged even where its window is dropped
             reason = reason or found
         if self._recovered:
-            self.checks.recovered = sorted(self._recovered)
+            self.checks["recovered"] = sorted(self._recovered)
         if self._refused:
-            self.checks.refused = self._refused
+            self.checks["refused"] = self._refused
         return reason
 
     def drafts(self) -> dict[str, Any]:
@@ -217,12 +217,12 @@ class _Loop:
             found = await self._answer(asked)
             if isinstance(found, Draft):
                 self._accept(found, asked)
-                self.checks.structure = "ok"
+                self.checks["structure"] = "ok"
                 return None
             answer = found
             if answer.complaint or answer.reason == CONTEXT_FULL:
                 break  # of the right structure, and corrected in vain; or there is no room for one
-        self.checks.structure = "ok" if answer.complaint else answer.reason
+        self.checks["structure"] = "ok" if answer.complaint else answer.reason
         return answer.reason if answer.complaint else f"structure_{answer.reason}"
 
     async def _answer(self, question: Question) -> Draft | Refused:
@@ -352,7 +352,7 @@ class _Loop:
                 self.chinese, problem = answer, None
                 break
             self.chinese, problem, complaint = answer.draft, answer.reason, answer.complaint
-        self.checks.bilingual = problem or "ok"
+        self.checks["bilingual"] = problem or "ok"
         return None if problem is None else f"bilingual_{problem}"
 
     def _translated(self, english: Draft, chinese: Draft) -> Draft | Refused:
@@ -372,7 +372,7 @@ class _Loop:
             language: self.way.judge(draft, question.facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
         }
-        self.checks.sentences = {
+        self.checks["sentences"] = {
             language: [sentence.state for sentence in sentences] for language, sentences in judged.items()
         }
         found = [
@@ -381,7 +381,7 @@ class _Loop:
             for sentence in sentences
             for problem in sentence.problems
         ]
-        self.checks.evidence = found or "ok"
+        self.checks["evidence"] = found or "ok"
         return "evidence" if found and self.cfg.evidence.drop else None
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
@@ -393,7 +393,7 @@ class _Loop:
         parsed = parse_answer(reply.text, language, more, reply.finish_reason)
         if parsed.reason == CONTEXT_FULL:
             usage = reply.usage or Usage()
-            self.checks.refusal = (
+            self.checks["refusal"] = (
                 f"cut: {usage.prompt_tokens} tokens asked and {usage.completion_tokens} answered fill the context"
             )
         self._recovered.update(parsed.recovered)

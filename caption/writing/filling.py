@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from functools import cache
 
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
 from caption.writing.contract import DECISION_REASON, Refused
-from caption.writing.templates import TURNS, Sentence, Slot, read_sentence, units_behind
+from caption.writing.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
 from cosfly.products.captions import Language
 
 _DIRECTIONS = {
     "increasing": 1, "decreasing": -1, "left": 1, "right": -1, "above": -1, "below": 1, "faster": 1, "slower": -1,
 }  # fmt: skip
-_NEITHER = ("straight", "centred")
 _DIGITS = ("%.0f", "%.1f", "%.2f")
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")
 
@@ -26,7 +24,7 @@ class Filler:
 
     def __init__(self, facts: Facts, decision: str, language: Language) -> None:
         self.facts, self.decision, self.language = facts, decision, language
-        self._found, self._units, self._forms = facts.found, units_behind(language), _words(language)
+        self._found, self._units, self._forms = facts.found, units_behind(language), words_of(language)
         self._printed: dict[str, str] = {}
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
@@ -38,25 +36,27 @@ class Filler:
             refused = self._check_decisions(sentence)
             if refused is not None:
                 return refused
-        words, printed, facts = [], self._printed, self.facts
-        for place in sentence.places:
-            key, slot, read, frame, form = place
+        filled_in, printed, found, facts = [], self._printed, self._found, self.facts
+        for key, fact_key, slot, read, frame, form, words in sentence.places:
             if read is not None:  # a plain value of a series, which most slots are
                 series = read(facts)
                 value = series[frame] if series and frame < len(series) else None
                 if value is not None:
-                    words.append(form % (abs(value) if slot.is_size else value))
+                    filled_in.append(form % (abs(value) if slot.is_size else value))
                     continue
-            word = printed.get(key) or self._print(slot)
-            if isinstance(word, Refused):
-                return word
-            words.append(word)
+            elif words and isinstance(fact := found.get(fact_key), Fact) and fact.value in words:
+                filled_in.append(words[fact.value])
+                continue
+            printed_word = printed.get(key) or self._print(slot)
+            if isinstance(printed_word, Refused):
+                return printed_word
+            filled_in.append(printed_word)
         if sentence.sizes:
             for number, directions in sentence.sizes:
                 refused = self._check_direction(number, directions)
                 if refused is not None:
                     return refused
-        filled = sentence.pattern % tuple(words)
+        filled = sentence.pattern % tuple(filled_in)
         return filled[0].upper() + filled[1:] if sentence.begins_with_slot else filled
 
     def _check_decisions(self, sentence: Sentence) -> Refused | None:
@@ -73,9 +73,9 @@ class Filler:
         if isinstance(fact, str):
             return self._missing(slot, fact)
         value, unit, digits = fact
-        if value in _NEITHER and (slot.is_size or slot.needs_side):
+        if value in NEITHER and (slot.is_size or slot.needs_side):
             value = self._exact_side(slot, fact).value if slot.is_size else value
-            if slot.needs_side and value in _NEITHER:
+            if slot.needs_side and value in NEITHER:
                 fix = f"it is {value} here, neither side: say it without this slot, or as `is {{{slot.name}}}`"
                 return Refused("slots_no_side", f"{{{slot.name}}}: {fix}")
         if not isinstance(value, str):
@@ -152,7 +152,7 @@ class Filler:
 
     def _exact_side(self, slot: Slot, side: Fact) -> Fact:
         """Give the side of the very number where "straight" or "centred" would say neither."""
-        if side.value not in _NEITHER:
+        if side.value not in NEITHER:
             return side
         assert slot.reference is not None
         quantity = slot.reference.quantity
@@ -160,14 +160,6 @@ class Filler:
         if not isinstance(number, Fact) or isinstance(number.value, str) or not number.value:
             return side
         return Fact(QUANTITIES[quantity].sides[0 if number.value > 0 else 1])
-
-
-@cache
-def _words(language: Language) -> dict[str, tuple[str, ...]]:
-    """Give the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
-    glossary = load_glossary()
-    names = {name: (pair[language],) for name, pair in (glossary.visibility | glossary.actions).items()}
-    return names | {name: forms[language] for name, forms in glossary.slot_words.items()}
 
 
 def facts_of(facts: Facts, names: Sequence[str]) -> Iterator[tuple[str, str]]:

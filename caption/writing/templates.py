@@ -11,7 +11,7 @@ What may stand beside slots: outside.py.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from typing import Literal, NamedTuple
@@ -36,6 +36,7 @@ _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
 TURNS = {"yaw": "yaw", "heading": "yaw", "target_heading": "target_heading"}
 _WORDS = ("trend", "side", "comparison")
+NEITHER = ("straight", "centred")
 _WITHOUT = ("visibility", *MOTIONS)  # a direction
 
 Form = Literal[0, 1, 2, 3]  # of the glossary's slot_words: verb, after "is", after "has", after "to"
@@ -111,14 +112,20 @@ def has_sides(quantity: str) -> bool:
 
 
 class Place(NamedTuple):
-    """A slot where it stands. key: what decides how it is printed. read, frame, form: the series of which it is a plain value, its
-    frame, and how that is written with its unit; None where it is something else."""
+    """A slot where it stands, and what is needed to fill it at a glance.
+
+    key: what decides how it is printed; fact_key: what it is looked up by. read, frame, form: the series of which it is a plain value,
+    its frame, and how that is written with its unit; None where it is something else. words: how each word that may be true is
+    written, but for those that ask for a closer look.
+    """
 
     key: str
+    fact_key: str
     slot: Slot
     read: Callable[[Facts], Series] | None = None
     frame: int = -1
     form: str = ""
+    words: Mapping[float | str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,12 +207,31 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
 
 def _place(slot: Slot, language: Language) -> Place:
     quantity = slot.quantity
-    if quantity is None or slot.article:
-        return Place(slot.key, slot)
+    if slot.article:
+        return Place(slot.key, slot.fact_key, slot)
+    if quantity is None:
+        words = _words_written(language, slot.form, not (slot.is_size or slot.needs_side)) if slot.is_word else {}
+        return Place(slot.key, slot.fact_key, slot, words=words)
     assert slot.reference is not None
     frame = -1 if slot.reference.first is None else slot.reference.first
     form = f"%.{quantity.digits}f{units_behind(language)[quantity.unit]}"
-    return Place(slot.key, slot, quantity.read, frame, form)
+    return Place(slot.key, slot.fact_key, slot, quantity.read, frame, form)
+
+
+@cache
+def _words_written(language: Language, form: Form, with_neither: bool) -> dict[float | str, str]:
+    """Give how words are written in a form; without those that are neither side where a side may be needed."""
+    left_out = () if with_neither else NEITHER
+    words = {word: forms for word, forms in words_of(language).items() if word not in left_out}
+    return {word: forms[min(form, len(forms) - 1)] for word, forms in words.items()}
+
+
+@cache
+def words_of(language: Language) -> dict[str, tuple[str, ...]]:
+    """Give the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
+    glossary = load_glossary()
+    names = {name: (pair[language],) for name, pair in (glossary.visibility | glossary.actions).items()}
+    return names | {name: forms[language] for name, forms in glossary.slot_words.items()}
 
 
 @cache
