@@ -14,6 +14,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from retold import misread
 from specimens_prose import CASES, FOLLOW, HOLD, SECOND_SET, WINDOWS, Case
 
 from caption.schema import EvidenceConfig
@@ -69,7 +70,7 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
     )
     assert flagged <= 0.03
     assert caught["all"] >= 0.88
-    assert caught["numbers"] >= 0.95
+    assert caught["numbers"] >= 0.98
     assert caught["sides"] >= 0.8
 
 
@@ -80,7 +81,7 @@ def test_the_gold_captions_pass_and_their_errors_are_caught():
         for one in read_gold_prose()
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.82
+    assert caught["all"] >= 0.81  # 0.82 while any other action than the decision's was one against it
     assert caught["numbers"] >= 0.89
     assert caught["sides"] >= 0.86
 
@@ -93,8 +94,15 @@ def test_the_second_set_passes_and_its_errors_are_caught():
     )
     assert flagged <= 0.03
     assert caught["all"] >= 0.78
-    assert caught["numbers"] >= 0.85
-    assert caught["sides"] >= 0.75
+    assert caught["numbers"] >= 0.86
+    assert caught["sides"] >= 0.77
+
+
+def test_true_captions_told_of_other_windows_stay_true():
+    """Where no value is another's by chance, nearly all numbers are still taken for what their writers meant."""
+    found = list(misread([*read_gold_prose(), *read_gold_prose(SECOND_SET)], draws=1))
+    assert len(found) > 1_500
+    assert len({name for name, _, _, is_wrong in found if is_wrong}) <= 4
 
 
 FILLER = {"en": "The scene is calm.", "zh": "场面平静。"}

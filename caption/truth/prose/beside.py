@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, crossing, gap
 from caption.truth.prose.lexicon import Token
@@ -9,6 +11,7 @@ from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.statements import Hedge
 from caption.truth.prose.timing import Timing
 
+_COMES_TO = re.compile(r" to $|回[^,]{0,2}[到至]")
 _ZH_AFTER = 2  # letters between a number and its side: "3 度(左)"
 
 
@@ -37,7 +40,7 @@ class Beside:
         else:
             near.sort(key=lambda t: gap(t, numeral.start, numeral.end) - (8 if t.start >= numeral.end else 0))
         token = near[0]
-        if self.text[token.end : numeral.start] == " to ":
+        if _COMES_TO.search(self.text, token.end, numeral.start):
             return 0, 0  # "has come back right to 0.9 degrees"
         if numeral.unit == "deg" and self._is_of_person(token):
             self.used_sides.add(token)
@@ -79,6 +82,8 @@ class Beside:
                 and not self.text.startswith(("or ", "give"), token.start)
             ):
                 continue
+            if any(token.end <= t.start and t.end <= numeral.start for t in self.clause.of("who")):
+                continue  # "slightly above the target's 1.2 m/s"
             if -1 <= distance <= reach and not crossing(self.sentence, self.clause, token, numeral.start, numeral.end):
                 return token.value  # type: ignore[return-value]
         return ""

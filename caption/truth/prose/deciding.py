@@ -19,6 +19,13 @@ _AGREE = {
 }  # fmt: skip
 
 
+# Decision -> what is asked for where it is not meant, sides aside. Who must search sees nobody to follow.
+_OPPOSITE = {
+    "ascend": ("descend",), "descend": ("ascend",), "speed_up": ("slow", "hover", "search"), "slow_down": ("fast", "search"),
+    "move_forward": ("backward", "hover", "search"), "move_backward": ("forward", "fast", "search"), "hover": ("fast", "forward", "ascend", "descend"),
+    "yaw_left_to_follow": ("straight", "search"), "yaw_right_to_follow": ("straight", "search"), "track_straight": ("search",),
+    "search_to_reacquire_target": ("straight",),
+}  # fmt: skip
 # "a search is not warranted": refused after it is named.
 _REFUSED = {
     "en": re.compile(
@@ -107,17 +114,25 @@ def _side_of(sentence: Sentence, clause: Clause, token: Token) -> int:
 
 
 def argues_against(decision: str, said: list[Said], last: list[Said]) -> bool:
-    """Tell whether a text asks for other actions than its decision and leaves no room for it.
+    """Tell whether a text asks for the opposite of its decision and leaves no room for it.
 
-    said: of the whole reasoning; last: of its last sentence, which is what it asks for where nothing is asked for plainly.
+    Another action than the decision's is no contradiction: a text may ask for several, and may name the decision's own in words that
+    are not known here. said: of the whole reasoning; last: of its last sentence, which is what it asks for where nothing is asked for
+    plainly.
     """
     asked = [one for one in said if one.force == "directive"] or [one for one in said if one.force == "aim"]
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
-    if not asked or decision in _allowed(asked):
+    if decision in _allowed(asked) or not any(_is_opposite(decision, one) for one in asked):
         return False
     sided = {one.action for one in said if one.side}
     rest = [one for one in said if one.force in ("open", "option", "aim") and (one.side or one.action not in sided)]
     return decision not in _allowed(rest)
+
+
+def _is_opposite(decision: str, said: Said) -> bool:
+    if said.action in _SIDED:
+        return said.side != 0 and decision == _SIDED[said.action].format("right" if said.side > 0 else "left")
+    return said.action in _OPPOSITE.get(decision, ())
 
 
 def _allowed(said: list[Said]) -> set[str]:

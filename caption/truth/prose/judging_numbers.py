@@ -31,6 +31,8 @@ class NumberJudge:
         found = self._compare(s)
         if s.kind == "number" and not self._is_possible(s, is_meant=found is True):
             return False
+        if s.kind == "course" and self._goes_otherwise(s):
+            return False
         if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self._is_of_the_window(s):
             return None
         return found
@@ -116,9 +118,8 @@ class NumberJudge:
         if s.kind == "list" and len(s.numbers) >= _WHOLE:
             return self._list(replace(s, names=(), trend=0)) is not False
         for numeral, value, step in map(self._read, s.numbers):
-            unit = numeral.unit or "times"
-            slack = max(step, {"percent": 1.0, "times": 0.05 * value}.get(unit, 0.0)) + _ROUGHLY * value * bool(s.hedge)
-            if not self.pool.holds(value, unit, (slack, slack)):
+            slack = step + _ROUGHLY * value * bool(s.hedge)
+            if not self.pool.holds(value, numeral.unit, (slack, slack)):
                 return False
         return True
 
@@ -192,8 +193,6 @@ class NumberJudge:
         base = name.removeprefix("rate:")
         if base in _SIGNED and s.side:
             sign = s.side * _SIGNED[base]
-        if name == "pitch" and sign > 0:
-            sign = 0
         if s.mode != "change" or name == "target_turn":
             for true in self.values(s, name):
                 if s.side and sign and true * sign < -2.0 * step:
@@ -296,6 +295,21 @@ class NumberJudge:
                 is_unknown = is_unknown or not self.measured.facts.target_speeds_mps
         return None if is_unknown else False
 
+    def _goes_otherwise(self, s: Statement) -> bool:
+        """Tell whether a course that is told of certain frames is that of none of its series there."""
+        if not s.sure_names or s.sure_frames is None:
+            return False
+        series = [self.measured.series(name.removeprefix("rate:")) for name in s.sure_names]
+        ends = [[values[frame] for frame in s.sure_frames] for values in series if values]
+        known = [pair for pair in ends if None not in pair]
+        told = [
+            (value, self.slack(n.unit, value, step, s.hedge, n.factor)) for n, value, step in map(self._read, s.numbers)
+        ]
+        return bool(known) and not any(
+            all(abs(value - abs(true or 0.0)) <= slack for (value, slack), true in zip(told, pair, strict=True))
+            for pair in known
+        )
+
     def _list(self, s: Statement) -> bool | None:
         read = [self._read(i) for i in s.numbers]
         unit, count = read[0][0].unit, len(read)
@@ -386,9 +400,4 @@ class NumberJudge:
         if bearing and bearing[-1] is not None:
             error = abs((bearing[-1] - angle + 180.0) % 360.0 - 180.0)
             return True if error <= 17.0 else False if error > 25.0 else None
-        dx = self.measured.facts.offset_x_px[-1]
-        if dx is None:
-            return None
-        if abs(angle) < 1.0:
-            return abs(dx) <= 0.1 * self.measured.facts.width_px
-        return angle * dx < 0 or None if dx else (False if abs(angle) >= 45.0 else None)
+        return None

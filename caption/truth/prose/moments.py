@@ -143,7 +143,7 @@ _MOMENT_BEFORE = {
     "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
 }  # fmt: skip
 _MOMENT_AFTER = {
-    "en": re.compile(r"\s*(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|to\b|and\b|~|→|,? ?t\d))|(?P<now>now|at present|currently)\b(?! than))"),
+    "en": re.compile(r"\s*(?:(?:to the |to )?(?:left|right|high|low|up|down)\s+(?=at t|in t))?(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|~|→|,? ?t\d|(?:to|and)\b\s*(?:at )?t\d))|(?P<now>now|at present|currently)\b(?! than))"),
     "zh": re.compile(r"\s*\(\s*t(?P<frame>\d)\s*时?\s*\)"),
 }  # fmt: skip
 _REACH = 30  # letters before a number in which its frame stands

@@ -6,9 +6,8 @@ import re
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import Context, cues_of, names_of, owner_of, times_of
+from caption.truth.prose.cues import Context, cues_of, names_of, owner_of
 from caption.truth.prose.numerals import Numeral
-from caption.truth.prose.statements import Mode
 
 _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
@@ -86,12 +85,3 @@ class Naming:
         """ "快于目标 3 米/秒"."""
         before = self.text[: numeral.start]
         return re.search(r"(?:快|慢|高|低)(?:于|出|过)?[^#]{0,12}$", before) is not None or "相差" in before[-6:]
-
-    def is_difference(self, numeral: Numeral, mode: Mode) -> bool:
-        """ "2 m/s faster than the walker": between two speeds, not of one in time."""
-        if numeral.unit != "mps" or mode == "value" or times_of(self.clause):
-            return False
-        after = MORE_THAN.match(self.text, numeral.end)
-        return bool(
-            after and after["than"] and any(t.start >= after.end() for t in self.clause.of("who", "drone", "target"))
-        )

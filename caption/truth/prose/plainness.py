@@ -43,10 +43,16 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
         return False  # what to do
     match found.kind:
         case "state":
-            return not clause.has("who", "scene") and _has_subject(token, clause, language, found)
+            return (
+                found.word in ("walking", "standing")  # others are rarely met, or idioms: "running out"
+                and not clause.has("who", "scene")
+                and _has_subject(token, clause, language, found)
+            )
         case "visibility":
-            return _is_of_frame(clause) and not any(
-                sentence.numerals[i].unit in ("m", "percent", "px") for i in clause.numerals
+            return (
+                _is_of_frame(clause)
+                and found.word != "visible"  # "to keep him in the picture", "last seen": never of what is hidden now
+                and not any(sentence.numerals[i].unit in ("m", "percent", "px") for i in clause.numerals)
             )
         case "trend":
             allowed = (

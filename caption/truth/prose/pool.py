@@ -29,7 +29,7 @@ _SERIES: dict[str, tuple[str, ...]] = {
     "px": _PIXELS,
 }
 _RATES: dict[str, tuple[str, ...]] = {"mps": _LENGTHS, "dps": _ANGLES}
-# Pairs of series whose difference or ratio people tell.
+# Pairs of series whose difference people tell.
 _BESIDE = {
     "m": (("travelled", "target_travelled"), ("travelled", "displacement"), ("slant", "distance"), ("altitude", "distance")),
     "mps": (("speed", "target_speed"), ("speed", "target_mean")),
@@ -72,8 +72,6 @@ class Pool:
         return place < len(values) and values[place] <= abs(value) + slack[1] + _NOISE
 
     def _of(self, unit: str, names: tuple[str, ...], frames: Frames, mode: Mode) -> Iterable[float]:
-        if unit in ("percent", "times"):
-            return [100.0 * share if unit == "percent" else share for share in self._ratios(unit)]
         series = names or _SERIES.get(unit, ())
         found = [v for name in series if not name.startswith("rate:") for v in self._series(name, frames, mode)]
         rates = [name[5:] for name in names if name.startswith("rate:")] or ([] if names else _RATES.get(unit, ()))
@@ -85,7 +83,7 @@ class Pool:
         frames = None if name == "picture" else frames
         if mode != "change":
             yield from (v for i, v in known if frames is None or i in frames)
-            if known:
+            if known and frames is None:
                 yield sum(v for _, v in known) / len(known)
         if mode != "value":
             for (i, a), (j, b) in combinations(known, 2):
@@ -107,20 +105,3 @@ class Pool:
                     if a is None or b is None:
                         continue
                     yield change("heading", b, a) if unit == "deg" else a - b
-
-    def _ratios(self, unit: str) -> Iterable[float]:
-        for name in (*_LENGTHS, *_SPEEDS, *_PIXELS, "box_area", "yaw"):
-            for a, b in combinations([abs(v) for v in self.measured.known(name) if v], 2):
-                yield from _as_told(a, b, unit)
-        for pairs in _BESIDE.values():
-            for one, other in pairs:
-                for a in self.measured.known(one):
-                    for b in self.measured.known(other):
-                        if a and b:
-                            yield from _as_told(abs(a), abs(b), unit)
-
-
-def _as_told(a: float, b: float, unit: str) -> Iterable[float]:
-    """ "Twice", "half as fast", "20 % faster": the ratio either way, and what is added or lost."""
-    ratios = (a / b, b / a)
-    return (*ratios, *(ratio - 1.0 for ratio in ratios)) if unit == "percent" else ratios

@@ -30,7 +30,6 @@ _IMPLIED = {
 }  # fmt: skip
 
 
-_AND_SO = re.compile(r"^[^,;]*(?:\band|,|、|和)\s*(?:by |about )?$")
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
 _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最")
 # A turn that is told from the window's start: its sum.
@@ -233,6 +232,8 @@ class NumberReader:
             sure_frames=sure_frames,
             sure_mode=self.sureness.mode(numeral),
         )
+        if found.sure_names and not set(found.names) & set(found.sure_names):
+            found = replace(found, names=found.sure_names)
         found = self._angle(found) if numeral.unit == "deg" else found
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
@@ -242,17 +243,10 @@ class NumberReader:
     def _change(self, numeral: Numeral, names: tuple[str, ...]) -> tuple[tuple[str, ...], Mode, int]:
         """Say of what a number is, whether it is a change, and which way."""
         mode, trend = self.changing.change(numeral)
-        before = self.statements[-1] if self.statements else None
-        if mode == "value" and before is not None and before.mode == "change" and before.clause[0] == self.clause.start:
-            last = self.sentence.numerals[before.numbers[-1]]
-            if last.unit == numeral.unit and _AND_SO.search(self.text[last.end : numeral.start]):
-                mode, trend = "change", before.trend  # "by 3 px in width and 8 px in height"
         if names and set(names) <= _WAYS and mode != "value" and not self.changing.is_partial():
             mode, trend = "value", 0
         if numeral.unit == "mps" and self.naming.differs_by(numeral):
             names, mode, trend = (*names, "speed_difference", "difference_mean"), "either", 0
-        if self.naming.is_difference(numeral, mode):
-            names, mode, trend = ("speed_difference", "difference_mean"), "value", 0
         return names, mode, trend
 
     def _angle(self, s: Statement) -> Statement:
@@ -276,6 +270,8 @@ class NumberReader:
         is_length = (
             numeral.unit == "m" and is_bare and self.clause.has("quantity") and not self.sureness.is_in_group(numeral)
         )
+        if set(s.names) <= _WAYS and not self.sureness.owner(numeral):
+            is_length = False  # of somebody who is not known to have been named
         if not s.sure_names and (s.sure_mode == "change" or is_length):
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
@@ -323,9 +319,14 @@ class NumberReader:
             later = any(t.value == "now" and t.start > numeral.end for c in self.sentence.clauses for t in c.of("time"))
             frames = None if later or loose or (is_past and not self.clause.has("time", "now")) else (NOW,)
         side, vertical = self.beside.side(numeral)
+        first = self.sentence.numerals[early]
+        told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
+        if is_cued and not told and (numeral.unit != "mps" or self.sureness.owner(first)):
+            told = {names}
         self.statements.append(
             Statement(
-                kind="course", clause=(self.clause.start, self.clause.end), names=names, numbers=(early, late), frames=frames,
+                kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral),
+                clause=(self.clause.start, self.clause.end), names=names, numbers=(early, late), frames=frames,
                 hedge=self.beside.hedge(numeral) or self.beside.hedge(self.sentence.numerals[early]), side=side or vertical,
                 trend=signs.pop() if len(signs) == 1 else 0,
                 span=(start[0], NOW) if start is not None and len(start) == 1 else None,

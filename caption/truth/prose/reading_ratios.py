@@ -17,7 +17,7 @@ _MORE_BY = re.compile(
 
 # What a speed or a size is compared with is its own at another moment.
 _EARLIER = re.compile(
-    r"\b(?:initial|original|first|what it (?:was|did|had)|before|earlier|previous|ago|at the start|relative to its)\b|原来|原先|最初|起初|当初|开始|之前|此前|前一|上一"
+    r"\b(?:initial|original|first|what it (?:was|did|had)|before|earlier|previous|ago|at the start|relative to its)\b|原来|原先|最初|起初|当初|开始|之前|此前|前一|上一|[降减增涨升]幅"
 )
 _AGAINST = re.compile(r"\b(?:against|versus|vs)\b|对(?!方)|比")
 _OBJECT = re.compile(r"[比是为于及达到]")

@@ -14,7 +14,7 @@ from caption.truth.prose.cues import GOES_TO, OBJECTS, Context, names_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.moments import Moments
 from caption.truth.prose.numerals import Numeral
-from caption.truth.prose.statements import Mode
+from caption.truth.prose.statements import NOW, Mode
 from caption.truth.prose.versus import pairs_of_speeds
 
 _LINK = {
@@ -62,6 +62,7 @@ _NAMED: dict[str, dict[str, tuple[str, ...]]] = {
         "box": ("box_width", "box_height"), "centre": ("offset_x", "offset_y"),
     },
     "deg": {"pitch": ("pitch", "depression"), "depression": ("pitch", "depression"), "bearing": ("bearing",), "yaw": (), "turn": (), "heading": (), "target_heading": ()},
+    "dps": {"yaw_rate": ("rate:yaw", "rate:heading")},
 }  # fmt: skip
 _TOLD = {"alt_up": "altitude", "alt_down": "altitude", "dist_up": "distance", "dist_down": "distance"}
 
@@ -248,6 +249,14 @@ class Sureness:
             return None
         mode = self.mode(numeral)
         return self.moments.span() if mode == "change" else self.moments.frames(numeral, is_value=mode == "value")
+
+    def ends_of_course(self, first: Numeral, last: Numeral) -> tuple[int, ...] | None:
+        """Give the frames of "from A at t1 to B now" or "from A to B in the last step", where both are told."""
+        found = [self.moments.beside(n) for n in (first, last)]
+        if found[0] is not None:
+            return None if found[0] == found[1] else (found[0], NOW if found[1] is None else found[1])
+        spans = {t.value for t in self.clause.of("time")} - {"since", "last_s:0.5"}  # "from", "half a second"
+        return (-2, NOW) if spans == {"last_step"} and found[1] in (None, NOW) else None
 
     # --- value or change ---------------------------------------------------------------------------------------------
 
