@@ -28,8 +28,8 @@ from caption.truth.prose.pool import Pool
 from caption.truth.prose.reading import read_form
 from caption.truth.prose.statements import Form
 from caption.truth.references import Fact, look_up, parse_reference
-from caption.truth.sentences import sentences_of
 from cosfly.products.captions import Claim
+from cosfly.products.sentences import sentences_of
 
 KINDS = ("number", "list", "range", "course", "pair", "percent", "ratio", "speeds")
 _FROM_ZERO = ("travelled_m", "displacement_m", "target_travelled_m", "yaw_deg", "offset_x_px", "offset_y_px")
