@@ -42,7 +42,7 @@ def cut_windows(
         label: thresholds by which keyframes are chosen; the choice takes windows, it shows a teacher nothing.
         twin: the clean flight beside a perturbed one; futures are cut from it.
     """
-    motion, frames = label_motion(flight, twin), _frames_of(flight)
+    motion, frames = label_motion(flight, twin), frames_of(flight)
     folders = [flight.frame_folder(i) for i in range(len(flight))]
     files = [_files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
@@ -94,7 +94,8 @@ def _files_in(folder: Path) -> frozenset[str]:
         return frozenset()
 
 
-def _frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
+def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
+    """Give what was known at each frame of a flight."""
     return observed_frames(
         flight.time_s,
         flight.positions_m,

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from caption.label_motion import LabelMotion, label_motion
-from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedWindow
+from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompts import mission_lines, user_prompts
 from caption.truth.actions import label_of, measure, verdict_of
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.judging import check_evidence
-from caption.windows import cut_future
+from caption.windows import cut_future, frames_of
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
 
 ORDERS = ("break_off", "return_to_home")
@@ -30,14 +30,14 @@ MOST_SHOWN = 160  # characters of a text in a finding
 def read_released(shown: ShownFlight) -> list[Lie]:
     """Say what of a flight's captions cannot be."""
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
-    motion = label_motion(shown.flight, shown.twin)
+    motion, frames = label_motion(shown.flight, shown.twin), frames_of(shown.flight)
     lies: list[Lie] = []
     for caption in shown.captions:
         picked = [rows.get(index) for index in caption.window]
         if None in picked or len(picked) < 3:
             continue  # found by release verify itself
         mission = _mission_of(caption)
-        window = _window(shown, caption, [row for row in picked if row is not None], mission)
+        window = _window(shown, frames, caption, [row for row in picked if row is not None], mission)
         lies += _prompt_lies(window, caption)
         lies += _text_lies(window, caption)
         lies += _label_lies(shown, motion, caption, rows, mission)
@@ -53,16 +53,18 @@ def _mission_of(caption: ShownCaption) -> str | None:
     return None
 
 
-def _window(shown: ShownFlight, caption: ShownCaption, rows: list[int], mission: str | None) -> ObservedWindow:
+def _window(
+    shown: ShownFlight,
+    frames: tuple[ObservedFrame, ...],
+    caption: ShownCaption,
+    rows: list[int],
+    mission: str | None,
+) -> ObservedWindow:
     flight = shown.flight
-    boxes = flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox
     return ObservedWindow(
         sample_id=caption.sample_id, town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
         indices=caption.window, width_px=flight.camera.width_px, height_px=flight.camera.height_px,
-        time_s=flight.time_s[rows], positions_m=flight.positions_m[rows], rotations_deg=flight.rotations_deg[rows],
-        targets_m=flight.targets_m[rows], target_uv=flight.target_uv[rows], target_bbox=boxes[rows],
-        target_depth_m=flight.target_depth_m[rows], in_view=flight.target_in_view[rows],
-        visible=flight.target_visible[rows], visibility=flight.visibility[rows],
+        frames=tuple(frames[row] for row in rows),
         frame_folders=(), frame_files=(), mission=mission,
     )  # fmt: skip
 
