@@ -60,6 +60,12 @@ def test_every_example_parses(words):
     command.make_context("cosfly", list(words))
 
 
+def test_no_page_holds_what_a_merge_left():
+    for page in [*PAGES, ROOT / "CHANGELOG.md"]:
+        left = re.findall(r"^(?:<{7}|={7}|>{7})(?: .*)?$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        assert not left, f"{page.name}: {left}"
+
+
 def test_links_and_pictures_exist():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
