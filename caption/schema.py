@@ -233,7 +233,7 @@ class RepairConfig(Config):
 
 
 class StudentConfig(Config):
-    """A student behind a server (or in vLLM) as a teacher, asked as it was taught; see caption/teachers/students.py."""
+    """A student as a teacher: behind a server or in vLLM, asked as it was taught (caption/teachers/students.py), or by its predictions."""
 
     folder: Path | None = Field(
         None,
@@ -241,6 +241,10 @@ class StudentConfig(Config):
     )
     max_new_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
     constrained: bool = Field(False, description="hold its answers to their JSON schema")
+    run: str | None = Field(
+        None,
+        description="of student:PATH, predictions for several trees: the one whose windows are captioned, as the training set names it",
+    )
 
     def recorded(self) -> dict[str, Any]:
         """Where the folder stands does not decide what is asked: what it says stands in the other settings."""

@@ -39,9 +39,10 @@ class Sample(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    sample_id: str
+    sample_id: str  # unique in the set
     language: Language
     run: str  # the tree that its flight stands in
+    window_id: str  # of its window in that tree, as its captions name it
     town: str
     trajectory: str
     variant: str
@@ -156,7 +157,7 @@ def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
 
 # --- splits -----------------------------------------------------------------------------------------------------------
 
-_STRINGS = ("sample_id", "language", "run", "town", "trajectory", "variant", "walk")
+_STRINGS = ("sample_id", "language", "run", "window_id", "town", "trajectory", "variant", "walk")
 COLUMNS = pa.schema([
     *(pa.field(name, pa.string(), nullable=False) for name in _STRINGS),
     pa.field("window", pa.list_(pa.field("element", pa.int32())), nullable=False),

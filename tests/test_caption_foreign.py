@@ -269,7 +269,22 @@ def test_predictions_of_before_and_of_nothing(tmp_path, rules):
     line = json.loads(predicted(rules[0], "en").model_dump_json())
     del line["model"]
     path.write_text(json.dumps(line))
-    assert read_student(path)[0].model is None
+    (prediction,) = read_student(path).values()
+    assert prediction.model is None
+
+
+def test_predictions_for_several_trees_are_taken_for_the_one_that_is_named(tmp_path, rules):
+    path = tmp_path / "predictions.jsonl"
+    made = [
+        predicted(rules[0], "en").model_copy(update={"sample_id": f"{run}_x", "run": run, "window_id": "x"})
+        for run in ("north", "south")
+    ]
+    path.write_text("".join(prediction.model_dump_json() + "\n" for prediction in made))
+    with pytest.raises(InputError, match=r"several trees.*north, south"):
+        read_student(path)
+    assert read_student(path, "south")["x/en"].sample_id == "south_x"
+    with pytest.raises(InputError, match=r"no prediction.*west.*north, south"):
+        read_student(path, "west")
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

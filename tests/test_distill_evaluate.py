@@ -25,7 +25,7 @@ from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.figures import differences_of, draw_walks, figures_of, macro_f1
 from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
-from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_report, text_of
+from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_judged, read_report, text_of
 from distill.evaluation.scores import VERDICTS, Answer, Scores, read_scores, score_answers, write_scores
 from distill.evaluation.speed import speed_of
 from distill.evaluation.stage import EvaluateConfig, run
@@ -360,12 +360,29 @@ def test_what_a_verifier_found_in_the_answers_is_read(place, samples):
     caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved", "unread"]}})
     student = caption.model_copy(update={"teacher": caption.teacher.model_copy(update={"kind": "student"})})
     write_captions(place / "judged.jsonl", [student])
-    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged={"student": place / "judged.jsonl"})
+    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged={"student": [place / "judged.jsonl"]})
     figures = read_report(place / "out").all.who[STUDENT].figures
     assert (figures["proved"].value, figures["proved"].count) == (0.5, 2)
     write_captions(place / "rules.jsonl", [caption])
     with pytest.raises(InputError, match="no captions of a student"):
-        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged={"student": place / "rules.jsonl"})
+        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged={"student": [place / "rules.jsonl"]})
+
+
+def test_what_was_judged_tree_by_tree_finds_its_samples(place, samples):
+    one = samples[0]
+    both = [one.model_copy(update={"run": run, "sample_id": f"{run}_{one.sample_id}"}) for run in ("north", "south")]
+    caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved"]}})
+    assert one.window_id == caption.sample_id
+
+    def judged(run):
+        teacher = caption.teacher.model_copy(update={"kind": "student", "run": run})
+        write_captions(place / f"{run}.jsonl", [caption.model_copy(update={"teacher": teacher})])
+        return read_judged([place / f"{run}.jsonl"], both)
+
+    assert judged("south") == {both[1].key: ["proved"]}
+    assert judged("west") == {}
+    with pytest.raises(InputError, match=r"several trees.*north, south"):
+        judged(None)
 
 
 def test_speed_comes_from_what_stands_beside_the_predictions(place):

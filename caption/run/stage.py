@@ -70,7 +70,7 @@ def run(
             "this teacher never fails to answer", where="--retry-failed", got=cfg.teacher_kind, fix="leave it out"
         )
     cfg = as_taught(cfg)
-    foreign = None if cfg.caption_file is None else given_samples(cfg.caption_file, cfg.teacher_kind)
+    foreign = None if cfg.caption_file is None else given_samples(cfg, cfg.caption_file)
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)
     if was_whole and not (retry_failed and _has_refused(stage, cfg)):

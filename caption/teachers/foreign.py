@@ -11,11 +11,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from caption.schema import CaptionConfig
 from caption.teachers.prompts import Question
 from caption.writing.contract import Draft
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError
-from cosfly.products.captions import Claim, Coc, Language, TeacherKind, TeacherRecord, TeacherSettings, Writing
+from cosfly.products.captions import Claim, Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.products.predictions import FAILED, Prediction, read_predictions
 from cosfly.reading.documents import model_lines
 from cosfly.store import dump_json
@@ -106,10 +107,11 @@ class FileTeacher:
 class StudentTeacher:
     """Answers with a student's predictions, as it wrote them: what does not parse is refused as a teacher's answer is."""
 
-    def __init__(self, path: Path, seed: int) -> None:
-        self._answers = {prediction.key: prediction for prediction in read_student(path)}
+    def __init__(self, path: Path, run: str | None, seed: int) -> None:
+        self._answers = read_student(path, run)
         names = sorted({prediction.model or "a student" for prediction in self._answers.values()})
-        self.record = TeacherRecord(kind="student", model=", ".join(names), settings=TeacherSettings(seed=seed))
+        settings = TeacherSettings(seed=seed)
+        self.record = TeacherRecord(kind="student", model=", ".join(names), settings=settings, run=run)
 
     def terms(self, sample_id: str) -> Terms:
         return Terms("prose", (), is_given=True, has_mirror=f"{sample_id}/zh" in self._answers)
@@ -130,22 +132,36 @@ class StudentTeacher:
         return Reply(prediction.raw, None, "plain", "stop" if prediction.is_finished else "length")
 
 
-def read_student(path: Path) -> list[Prediction]:
-    """Read the predictions of a student.
+def read_student(path: Path, run: str | None = None) -> dict[str, Prediction]:
+    """Read the predictions of a student for the windows of one tree: window and language -> prediction.
 
+    Args:
+        run: the tree, as the training set names it; None where the predictions leave no doubt.
     Raises:
-        InputError: as `read_predictions`; or there is none.
+        InputError: as `read_predictions`; or there is none, or several trees have a window of one name.
     """
     predictions = read_predictions(path)
-    if not predictions:
-        raise InputError("the file holds no prediction", where=path, fix="give what cosfly distill infer wrote")
-    return predictions
+    runs = sorted({prediction.run for prediction in predictions})
+    found: dict[str, Prediction] = {}
+    for prediction in predictions:
+        if run in (None, prediction.run):
+            key = f"{prediction.window_id or prediction.sample_id}/{prediction.language}"
+            if found.setdefault(key, prediction) is not prediction:
+                raise InputError(
+                    "the predictions are for several trees that share names", where=path, got=", ".join(runs),
+                    fix="say which one is given: --set caption.student.run=NAME",
+                )  # fmt: skip
+    if not found:
+        expected = f"one of {', '.join(runs)}" if runs else None
+        fix = "give what cosfly distill infer wrote"
+        raise InputError("the file holds no prediction", where=path, got=run, expected=expected, fix=fix)
+    return found
 
 
-def given_samples(path: Path, kind: TeacherKind) -> set[str]:
+def given_samples(cfg: CaptionConfig, path: Path) -> set[str]:
     """Give the windows that a file of captions or predictions speaks of; raises as its reader."""
-    if kind == "student":
-        return {prediction.sample_id for prediction in read_student(path)}
+    if cfg.teacher_kind == "student":
+        return {key.rpartition("/")[0] for key in read_student(path, cfg.student.run)}
     return set(read_foreign(path))
 
 

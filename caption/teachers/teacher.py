@@ -270,7 +270,7 @@ def embedded_teacher(cfg: CaptionConfig, seed: int) -> Teacher:
     path = cfg.caption_file
     if path is None:
         return RuleTeacher(seed)
-    return StudentTeacher(path, seed) if cfg.teacher_kind == "student" else FileTeacher(path, seed)
+    return StudentTeacher(path, cfg.student.run, seed) if cfg.teacher_kind == "student" else FileTeacher(path, seed)
 
 
 def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -166,7 +167,7 @@ def distill_evaluate(
         list[str] | None,
         typer.Option(
             metavar="[NAME=]CAPTIONS",
-            help="captions.jsonl that `caption --teacher student:` made of these predictions; of a floor's as shuffled=... or constant=...",
+            help="captions.jsonl that `caption --teacher student:` made of these predictions, one a tree; of a floor's as shuffled=... or constant=...",
         ),
     ] = None,
     config: options.ConfigFile = None,
@@ -183,9 +184,16 @@ def distill_evaluate(
     models = {"en": bertscore_en, "zh": bertscore_zh}
     given: Any = {
         "bertscore_models": {language: folder for language, folder in models.items() if folder is not None},
-        "judged": dict(map(_judged, judged or [])), "seed": cfg.seed, "resume": resume,
+        "judged": _by_name(map(_judged, judged or [])), "seed": cfg.seed, "resume": resume,
     }  # fmt: skip
     typer.echo(evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))
+
+
+def _by_name(given: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    for name, path in given:
+        found.setdefault(name, []).append(path)
+    return found
 
 
 def _judged(text: str) -> tuple[str, Path]:

@@ -246,7 +246,8 @@ class TeacherSettings(BaseModel):
 
 
 class TeacherRecord(BaseModel):
-    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked."""
+    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked. run: of a student's
+    predictions for several trees, the one that these captions are of."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -254,6 +255,7 @@ class TeacherRecord(BaseModel):
     model: str
     settings: TeacherSettings
     structured: _Given[str] = None
+    run: _Given[str] = None
 
 
 class JudgeRecord(BaseModel):

@@ -24,6 +24,8 @@ class Prediction(BaseModel):
     schema_version: Literal["1.0"] = "1.0"
     sample_id: str
     language: Language
+    run: str = ""  # the tree of its window; empty in files of before it stood here
+    window_id: str = ""  # of the window in that tree; empty: sample_id
     split: Split
     model: str | None = None  # who answered; None in files of before it stood here
     raw: str

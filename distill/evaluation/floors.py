@@ -116,6 +116,7 @@ def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path
 def _prediction(sample: Sample, split: Split, name: str, answer: Answer) -> Prediction:
     assert answer.coc is not None
     return Prediction(
-        sample_id=sample.sample_id, language=sample.language, split=split, model=f"floor: {name}",
+        sample_id=sample.sample_id, language=sample.language, run=sample.run, window_id=sample.window_id, split=split,
+        model=f"floor: {name}",
         raw=dump_json(answer.coc.model_dump()), num_tokens=0, is_finished=True, coc=answer.coc, reason=None, recovered=[],
     )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -116,21 +116,33 @@ def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> lis
     return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
 
 
-def read_judged(path: Path) -> dict[str, Sequence[SentenceState]]:
+def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> dict[str, Sequence[SentenceState]]:
     """Read what `cosfly caption --teacher student:` found out about a student's sentences: sample's key -> states.
 
+    Args:
+        paths: one file a tree.
     Raises:
-        InputError: as `read_captions`; or somebody else than a student wrote them.
+        InputError: as `read_captions`; or somebody else than a student wrote them, or several trees share the name of a window.
     """
+    keys: dict[str, dict[str, str]] = {}  # window and language -> run -> sample's key
+    for sample in samples:
+        keys.setdefault(f"{sample.window_id}/{sample.language}", {})[sample.run] = sample.key
     found: dict[str, Sequence[SentenceState]] = {}
-    for caption in read_captions(path):
+    for path, caption in ((file, caption) for file in paths for caption in read_captions(file)):
         if caption.teacher.kind != "student":
             raise InputError(
                 "these are no captions of a student", where=f"{path}: {caption.sample_id}", got=caption.teacher.kind,
                 fix="give what cosfly caption --teacher student:PREDICTIONS wrote",
             )  # fmt: skip
         for language, states in (caption.checks.sentences or {}).items():
-            found[f"{caption.sample_id}/{language}"] = states
+            by_run = keys.get(f"{caption.sample_id}/{language}", {})
+            if caption.teacher.run is None and len(by_run) > 1:
+                raise InputError(
+                    "several trees have a window of this name", where=f"{path}: {caption.sample_id}",
+                    got=", ".join(sorted(by_run)), fix="caption each tree with --set caption.student.run=NAME",
+                )  # fmt: skip
+            of_run = by_run.values() if caption.teacher.run is None else filter(None, [by_run.get(caption.teacher.run)])
+            found |= dict.fromkeys(of_run, states)
     return found
 
 

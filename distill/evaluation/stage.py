@@ -61,7 +61,7 @@ def run(
     out: Path,
     *,
     bertscore_models: Mapping[Language, Path] | None = None,
-    judged: Mapping[str, Path] | None = None,
+    judged: Mapping[str, Sequence[Path]] | None = None,
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
@@ -69,7 +69,7 @@ def run(
 
     Args:
         bertscore_models: local folders of the encoders; a language without one is not scored, and the report says so.
-        judged: who (`student`, `shuffled`, `constant`) -> the captions that `cosfly caption --teacher student:` made of their answers.
+        judged: who (`student`, `shuffled`, `constant`) -> the captions that `cosfly caption --teacher student:` made of their answers, a file a tree.
     Returns:
         The path of `report.json`.
     Raises:
@@ -77,7 +77,7 @@ def run(
     """
     models, captions = dict(bertscore_models or {}), dict(judged or {})
     inputs = {"predictions": predictions, "dataset": dataset}
-    inputs |= {f"judged/{name}": path for name, path in captions.items()}
+    inputs |= {f"judged/{name}/{n}": path for name, paths in captions.items() for n, path in enumerate(paths, 1)}
     for language, folder in models.items():
         require("torch", "transformers", "bert_score")
         check_encoder(getattr(cfg.bertscore, language), folder, language)
@@ -92,7 +92,7 @@ def run(
         raise InputError("predictions of one split are needed", where=predictions, got=", ".join(splits) or "none")
     samples = list(open_split(dataset, splits[0]))
     pairs = pair_up(samples, found)
-    sentences = {name: read_judged(captions[name]) for name in captions}
+    sentences = {name: read_judged(paths, samples) for name, paths in captions.items()}
     report, scores = _evaluate(cfg, pairs, dataset, models, sentences, seed)
     num_left = len(samples) - len(pairs)
     report = report.model_copy(update={"not_asked": num_left, "speed": speed_of(predictions, found)})

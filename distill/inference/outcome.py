@@ -37,6 +37,8 @@ def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is
     return Prediction(
         sample_id=sample.sample_id,
         language=sample.language,
+        run=sample.run,
+        window_id=sample.window_id,
         split=split,
         raw=text,
         num_tokens=num_tokens,

@@ -141,6 +141,7 @@ def make_sample(
         sample_id=sample_id or caption.sample_id,
         language=language,
         run=run,
+        window_id=caption.sample_id,
         town=caption.town,
         trajectory=caption.trajectory,
         variant=caption.variant,
