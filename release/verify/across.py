@@ -124,12 +124,16 @@ def same_walks(flights: list[Summary]) -> Iterable[tuple[Summary, Summary, float
 
 
 def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings) -> None:
+    """Check that twins name each other; where both tracks are wanted, that each flight has one. A run of one track alone has no twins."""
+    tracks: dict[str, set[str | None]] = defaultdict(set)
+    for flight in flights.values():
+        tracks[flight.name.partition("/")[0]].add(flight.track)
     for flight in flights.values():
         if flight.pair is None:
             same = [n for n in flights if n != flight.name and n.rpartition("/")[0] == flight.name.rpartition("/")[0]]
             if same and flight.split is not None:
                 findings.error("pair", flight.name, "null", f"{same[0]}, of the same trajectory")
-            elif both and flight.split is not None:
+            elif both and flight.split is not None and len(tracks[flight.name.partition("/")[0]]) > 1:
                 findings.error("pair", flight.name, "without its twin", "both tracks, as settings.pairs says")
             continue
         twin = flights.get(flight.pair)
