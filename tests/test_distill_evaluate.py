@@ -20,6 +20,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.journal import Journal
 from cosfly.products.captions import parse_answer, write_captions
 from cosfly.products.predictions import Prediction, read_predictions
+from cosfly.stage_folder import StageFolder, Tally
 from cosfly.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
@@ -396,6 +397,13 @@ def test_speed_comes_from_what_stands_beside_the_predictions(place):
     found = speed_of(place / "predictions.jsonl", read_predictions(place / "predictions.jsonl"))
     assert found.latency_s == {"mean": 2.0, "median": 2.0, "p95": pytest.approx(2.9)}
     assert found.mean_tokens == 9.0
+    assert found.samples_per_s is None
+    folder = StageFolder.open(place / "infer", "distill.infer", config=CFG, inputs={}, seed=0)
+    (place / "infer" / "predictions.jsonl").write_bytes((place / "predictions.jsonl").read_bytes())
+    # A start that went on, loaded for long and made three answers of all.
+    folder.finish([], Tally(input=9, kept=9), speed={"loading_s": 90.0, "seconds": 6.0, "answers": 3})
+    found = speed_of(place / "infer" / "predictions.jsonl", read_predictions(place / "predictions.jsonl"))
+    assert (found.seconds, found.samples_per_s) == (6.0, 0.5)
 
 
 # --- several students -------------------------------------------------------------------------------------------------

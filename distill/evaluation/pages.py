@@ -52,7 +52,7 @@ def _notes(report: Report) -> list[str]:
     if "student" not in report.judged:
         said.append("sentences were not judged: give --judged what cosfly caption --teacher student: wrote")
     if speed.samples_per_s is not None:
-        said.append(f"answering took {speed.seconds:.1f} s in its last start, {speed.samples_per_s:.2f} samples/s")
+        said.append(f"its last start answered for {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
     if speed.latency_s is not None:
         said.append("latency, s: " + ", ".join(f"{name} {value:.2f}" for name, value in speed.latency_s.items()))
     if report.not_asked:

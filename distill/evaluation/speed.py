@@ -12,13 +12,13 @@ from cosfly.chat.answers import Answer, read_line
 from cosfly.journal import Journal
 from cosfly.products.predictions import Prediction
 from cosfly.provenance import MANIFEST_SCHEMA
-from cosfly.reading.documents import read_json
+from cosfly.reading.documents import read_object, validation_errors
 from cosfly.stage_folder import read_manifest
 
 
 class Speed(BaseModel):
-    """seconds: of the last start of `distill infer`, which a resumed one shares with earlier ones; samples_per_s from it, None where it was
-    resumed or nothing says. latency_s: of an answer, as the engine's client saw it: mean, median, 95th percentile."""
+    """seconds: of the last start of `distill infer`, without loading; samples_per_s: answers made in it, a second, None where it made none or
+    nothing says. latency_s: of an answer, as who asked saw it: mean, median, 95th percentile."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -28,6 +28,13 @@ class Speed(BaseModel):
     latency_s: dict[str, float] | None = None
 
 
+class _LastStart(BaseModel):
+    """Of the manifest of `distill infer`: what it says of its last start."""
+
+    seconds: float | None = None
+    answers: int = 0
+
+
 def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed:
     """Measure what can be measured beside `predictions.jsonl`.
 
@@ -35,12 +42,12 @@ def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed
         InputError: a record that stands there cannot be read.
     """
     folder = predictions_path.parent
-    seconds = _seconds(folder)
+    seconds, num_new = _last_start(folder)
     tokens = [prediction.num_tokens for prediction in predictions if prediction.num_tokens]
     latencies = np.array([answer.latency_s for answer in _answers(folder / "answers")])
     return Speed(
         seconds=seconds,
-        samples_per_s=len(predictions) / seconds if seconds else None,
+        samples_per_s=num_new / seconds if seconds and num_new else None,
         mean_tokens=float(np.mean(tokens)) if tokens else None,
         latency_s=None if not len(latencies) else {
             "mean": float(latencies.mean()), "median": float(np.median(latencies)),
@@ -49,11 +56,14 @@ def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed
     )  # fmt: skip
 
 
-def _seconds(folder: Path) -> float | None:
+def _last_start(folder: Path) -> tuple[float | None, int]:
+    """Give the seconds of the last start of `distill infer`, and how many answers it made."""
     path = folder / "manifest.json"
-    if not path.is_file() or read_json(path, what="manifest").get("schema") != MANIFEST_SCHEMA:
-        return None
-    return read_manifest(folder).seconds
+    if not path.is_file() or read_object(path, what="manifest").get("schema") != MANIFEST_SCHEMA:
+        return None, 0
+    with validation_errors(path):
+        found = _LastStart.model_validate(read_manifest(folder).facts.get("speed", {}))
+    return found.seconds, found.answers
 
 
 def _answers(folder: Path) -> list[Answer]:
