@@ -79,10 +79,13 @@ def distill_train(
 ) -> None:
     """Train a student, LoRA or in full, in one process or many (torchrun); continues from its last checkpoint."""
     from distill.training import stage as train
+    from distill.training.ranks import is_first_process
 
     cfg, trees = options.resolve(config, overrides, {"seed": seed}), options.data_folders(data)
     options.verify_first(verify, dataset, *trees, out)
-    typer.echo(train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=resume))
+    product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=resume)
+    if is_first_process():
+        typer.echo(product)
 
 
 @app.command("infer")

@@ -69,11 +69,6 @@ class Metric(BaseModel):
     versions: dict[str, str]
 
 
-def means_of(scores: np.ndarray) -> dict[str, float]:
-    """Give the means of (n, 3) scores by name."""
-    return {name: float(scores[:, i].mean()) for i, name in enumerate(("precision", "recall", "f1"))}
-
-
 def deciding_files(folder: Path) -> list[Path]:
     """Give the files of a model's folder that decide its scores: configuration, tokenizer, weights."""
     kinds = ("*.json", "*.txt", "*.safetensors", "*.bin", "*.model")

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, Coc, Language, SentenceState, Verdict, verdict_on
+from cosfly.products.captions import ACTIONS, Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import row_groups
 from cosfly.store import atomic_file
@@ -124,10 +124,6 @@ def score_answers(
         num_tokens=np.array([a.num_tokens for a in answers], dtype=np.int64),
         **sentences,
     )
-
-
-def languages_of(scores: Scores) -> list[Language]:
-    return sorted(set(scores.language))
 
 
 # --- on disk ----------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,7 +43,8 @@ def require(*packages: str) -> None:
 
 
 def quiet_transformers() -> None:
-    """Keep the library's own bars and hints off the terminal, where ours stand."""
+    """Keep the library's own bars, hints and talk of its next version off the terminal, where ours stand."""
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"transformers\.")
     from transformers.utils import logging as transformers_logging
 
     transformers_logging.disable_progress_bar()
@@ -123,8 +125,8 @@ def student_folder(name: str) -> Path:
     ) as error:  # of the hub's client: no network, no such repository, no permission
         raise InputError(
             "no such folder, and the repository of that name cannot be loaded",
-            where="--student",
-            got=f"{name}: {type(error).__name__}: {error}"[:300],
+            where=name,
+            got=f"{type(error).__name__}: {error}"[:300],
             fix="check name and network, or download it elsewhere and give its folder",
         ) from error
 

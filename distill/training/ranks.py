@@ -88,9 +88,6 @@ class Ranks:
             raise box[1]
         return box[0]
 
-    def wait_for_all(self) -> None:
-        self.gathered(None)
-
 
 BUCKET_NUMBERS = 50_000_000  # of gradients that are added up in one call
 
@@ -122,6 +119,11 @@ def _collective(call: Callable[..., Any], *arguments: Any) -> None:
             got=str(error).splitlines()[0][:160],
             fix="its own message says why; run the same command again: it goes on from the last checkpoint",
         ) from error
+
+
+def is_first_process() -> bool:
+    """Tell whether this process is the one of those that were started together that speaks for all."""
+    return _number("RANK", 0) == 0
 
 
 def _number(name: str, default: int) -> int:
