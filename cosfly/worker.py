@@ -80,7 +80,7 @@ def signals_held_back() -> Iterator[None]:
 
 def work_through(connection: Connection, manner: Manner) -> None:
     """Take a Start, then do items until None comes. Everything that is to be said goes back through the pipe."""
-    _end_with_parent(manner.parent_pid)
+    end_with_parent(manner.parent_pid)
     for number in LEFT_TO_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
@@ -113,7 +113,7 @@ def _received(connection: Connection) -> Any:
         return None
 
 
-def _end_with_parent(parent_pid: int) -> None:
+def end_with_parent(parent_pid: int) -> None:
     """Have the system kill this process with its parent; elsewhere than on Linux the pipe tells, at the next sign of life."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -256,6 +257,31 @@ def test_a_second_process_is_refused(place, tmp_path):
         with pytest.raises(ResumeError, match=f"another process.*process {holder.pid} "):
             run(place, out)
         holder.kill()
+
+
+WORKERS = """
+import os, time
+from distill.training.loading import in_order
+for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(100), 2):
+    print(pid, flush=True)
+    time.sleep(0.5)
+"""
+
+
+def test_workers_end_with_a_training_that_was_killed(tmp_path):
+    """Those that had something to hand over stayed for ever, and held the lock of the folder."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-c", WORKERS], stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        workers = {int(process.stdout.readline()) for _ in range(2)}
+        assert len(workers) == 2
+        process.kill()
+    deadline_s = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
 
 
 def test_what_changes_the_result_is_refused_on_resume(place, tmp_path):

@@ -7,10 +7,12 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.reading.limits import Limits, limits, use_limits
+from cosfly.worker import end_with_parent
 from distill.schema import Sample
 from distill.student.encoding import Encoded, encode_text
 from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, pictures_of
@@ -48,10 +50,13 @@ class _Work(Generic[Asked, Given]):
             return error
 
 
-def _begin_worker(_: int) -> None:
+def _begin_worker(parent_pid: int, _: int) -> None:
     import cv2
     import torch
 
+    end_with_parent(
+        parent_pid
+    )  # else one that has something to hand over waits for ever, and with it the lock of the folder
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
 
@@ -77,7 +82,7 @@ def in_order(function: Callable[[Asked], Given], orders: Iterable[Asked], worker
         sampler=orders,
         num_workers=workers,
         prefetch_factor=ORDERS_AHEAD if workers else None,
-        worker_init_fn=_begin_worker,
+        worker_init_fn=partial(_begin_worker, os.getpid()),
         multiprocessing_context="fork" if workers else None,
         collate_fn=_as_it_is,
     )
