@@ -135,6 +135,23 @@ def read_taught(folder: Path) -> Taught:
     Raises:
         InputError: there is none, or it is malformed.
     """
+    place = _place_of(folder)
+    return read_model(place / TAUGHT, Taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION, what="student", tree=place)
+
+
+def student_files(folder: Path) -> dict[str, Path]:
+    """Give what decides who a student is, what it was taught and its weights, for the inputs of a stage: name -> path.
+
+    A server tells a name only, and under one name may serve another student tomorrow.
+
+    Raises:
+        InputError: nothing there says what it was taught.
+    """
+    place = _place_of(folder)
+    return {f"student/{path.name}": path for path in (place / TAUGHT, *sorted(place.glob("*.safetensors")))}
+
+
+def _place_of(folder: Path) -> Path:
     places = [folder, folder / "adapter", folder / "model"]
     place = next((place for place in places if (place / TAUGHT).is_file()), None)
     if place is None:
@@ -144,4 +161,4 @@ def read_taught(folder: Path) -> Taught:
             expected=f"{TAUGHT} in it, in adapter/ or in model/",
             fix="give what cosfly distill train or merge wrote",
         )
-    return read_model(place / TAUGHT, Taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION, what="student", tree=place)
+    return place

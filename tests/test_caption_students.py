@@ -17,7 +17,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.cli import app
-from cosfly.errors import ConfigError, InputError, NothingKept, TeacherError
+from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import Caption, read_captions
 from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.inference import stage as infer
@@ -239,3 +239,19 @@ def test_a_folder_that_says_nothing_is_refused(place, tmp_path):
         as_taught(settings("http://127.0.0.1:1/v1", tmp_path))
     with pytest.raises(ValueError, match=r"student.folder needs a teacher that is asked"):
         CaptionConfig.model_validate({"student": {"folder": place / "trained"}})
+
+
+def test_a_folder_holds_the_captions_of_one_student(place, tmp_path):
+    """Another student that is served under the same name, and was taught the same way."""
+    one, other = (Path(shutil.copytree(place / "trained", tmp_path / name)) for name in ("one", "other"))
+    weights = "adapter/adapter_model.safetensors"
+    for folder in (one, other):
+        (folder / weights).write_bytes(b"weights")
+    with TeacherServer(decision=label_of(place)) as server:
+        run(settings(server.url, one), place / "tree", tmp_path / "out")
+        num_asked = len(server.bodies)
+        run(settings(server.url, other), place / "tree", tmp_path / "out")  # where it stands does not matter
+        (other / weights).write_bytes(b"others!")
+        with pytest.raises(ResumeError, match=r"adapter_model\.safetensors"):
+            run(settings(server.url, other), place / "tree", tmp_path / "out")
+        assert len(server.bodies) == num_asked

@@ -32,6 +32,7 @@ from cosfly.reading.files import read_lines
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest
 from cosfly.store import write_json
+from cosfly.student_chat import student_files
 
 log = logging.getLogger(__name__)
 
@@ -117,6 +118,8 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     if not (out / "manifest.json").exists():
         refuse_one_file(out / ANSWERS)
     inputs = {"data": data} if cfg.caption_file is None else {"data": data, "captions": cfg.caption_file}
+    if cfg.student.folder is not None:
+        inputs |= student_files(cfg.student.folder)
     return StageFolder.open(
         out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=PACKAGE_FILES
     )
