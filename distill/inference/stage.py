@@ -23,7 +23,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.products.predictions import PREDICTIONS, Split
 from cosfly.stage_folder import Resume, StageFolder, read_manifest
 from cosfly.store import sha256_bytes
-from cosfly.student_chat import StudentEndpointConfig
+from cosfly.student_chat import TAUGHT, StudentEndpointConfig, read_taught
 from distill.inference.asking import Asking
 from distill.inference.constraint import AnswerSchemas
 from distill.inference.local import LocalAnswers
@@ -57,7 +57,9 @@ class InferConfig(Config):
         description="samples that transformers answers together, halved where the memory is full; part of the result where rounding matters",
     )
     max_pixels: int = Field(
-        0, ge=0, description="most pixels kept of a picture; 0: as in training, and with an engine all"
+        0,
+        ge=0,
+        description="most pixels kept of a picture; 0: as in training where the student's folder says, and at a server all",
     )
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
     feature_memory_gb: MayDiffer[float] = Field(
@@ -88,6 +90,14 @@ class Inputs:
     adapter: Path | None
 
     @property
+    def taught_pixels(self) -> int:
+        """Most pixels of a picture that the student was taught with; 0: nothing here says, as of a server or a base as it is."""
+        if self.adapter is not None:
+            return read_adapter_facts(self.adapter, Path(self.model)).max_pixels
+        folder = Path(self.model)
+        return read_taught(folder).max_pixels if (folder / TAUGHT).is_file() else 0
+
+    @property
     def name(self) -> str:
         """The model's name where it runs in this process."""
         name = Path(self.model).absolute().name
@@ -106,14 +116,14 @@ async def _answering(
     engine = _make_engine(cfg, inputs)
     in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
     async with started(engine):
-        asking = Asking(engine, book, inputs.trees, cfg.sampling, max_pixels=cfg.max_pixels, in_flight=in_flight)
+        max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
+        asking = Asking(engine, book, inputs.trees, cfg.sampling, max_pixels=max_pixels, in_flight=in_flight)
         yield asking.answers(inputs.samples)
 
 
 def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
     model = Path(inputs.model)
-    trained = read_adapter_facts(inputs.adapter, model).max_pixels if inputs.adapter else 0
-    max_pixels = cfg.max_pixels or trained or most_pixels(inputs.samples)
+    max_pixels = cfg.max_pixels or inputs.taught_pixels or most_pixels(inputs.samples)
     student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=inputs.adapter)
     return LocalAnswers(
         student,

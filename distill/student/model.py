@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.reading.documents import read_json
+from cosfly.student_chat import TAUGHT
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"
@@ -105,13 +106,18 @@ class Student(Processor):
         return torch.autocast(self.device, self.dtype)
 
 
+def is_hub_name(name: str) -> bool:
+    """Tell whether a student is named as a repository of a hub, and not as a folder."""
+    return HUB_NAME.fullmatch(name) is not None and not name.startswith(".") and not Path(name).is_dir()
+
+
 def student_folder(name: str) -> Path:
     """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the hub's cache.
 
     Raises:
         InputError: there is no such folder, or the repository cannot be had.
     """
-    if Path(name).is_dir() or not HUB_NAME.fullmatch(name) or name.startswith("."):
+    if not is_hub_name(name):
         return Path(name)
     require("torch", "transformers", "peft")
     from huggingface_hub import snapshot_download
@@ -149,7 +155,7 @@ def weight_files(folder: Path) -> dict[str, Path]:
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
         raise InputError("no weights", where=folder, expected="*.safetensors", fix="download the whole model folder")
-    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json")
+    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", TAUGHT)
     files = [path for name in (*settings, "chat_template.jinja") if (path := folder / name).is_file()]
     return {f"model/{path.name}": path for path in (*files, *weights)}
 
