@@ -258,6 +258,12 @@ def test_the_product_holds_no_pickle(trained):
     assert suffixes <= {".json", ".jsonl", ".safetensors", ".sha256", ".md", ".lock", ""}, suffixes
 
 
+def test_the_product_holds_no_local_path(place, trained):
+    texts = {path.name: path.read_text() for path in (trained / "adapter").iterdir() if path.suffix != ".safetensors"}
+    assert json.loads(texts["adapter_config.json"])["base_model_name_or_path"] == "student"
+    assert not [name for name, text in texts.items() if str(place) in text]
+
+
 def test_adapter_reloads_equal(place, trained):
     own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
     assert load_checkpoint(trained / "checkpoints" / "step_00000012", own).step == 12

@@ -18,7 +18,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from safetensors.torch import load_file  # noqa: E402
 from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, make_place, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import ConfigError, ResumeError  # noqa: E402
+from cosfly.errors import ConfigError, InputError, ResumeError  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.encoding import encode, prompt_batch  # noqa: E402
@@ -193,6 +193,11 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
     (out / "manifest.json").unlink()
     run(place, out, **settings)  # it has ended: nothing is done again
     assert json.loads((out / "manifest.json").read_text())["steps"] == steps
+    (out / "manifest.json").unlink()
+    weights = out / "checkpoints" / f"step_{best:08d}" / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-7])
+    with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
+        run(place, out, **settings)
 
 
 # --- before the first step --------------------------------------------------------------------------------------------

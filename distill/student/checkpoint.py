@@ -16,9 +16,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_json, read_json, read_model, validation_errors
+from cosfly.reading.documents import parse_json, read_json, read_model, read_object, validation_errors
 from cosfly.reading.files import read_lines, sha256_file
-from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_model
+from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
 from distill.student.model import Student, weight_files
 
 log = logging.getLogger(__name__)
@@ -83,14 +83,34 @@ def _save_tensors(path: Path, tensors: dict[str, Any]) -> None:
 def newest_checkpoint(folder: Path) -> Path | None:
     """Give the newest undamaged checkpoint; a damaged one is reported and passed over."""
     for path in sorted(folder.glob("step_*"), reverse=True):
-        try:
-            damaged = [name for name, digest in read_checksums(path).items() if sha256_file(path / name) != digest]
-        except InputError as error:
-            damaged = [str(error)]
-        if not damaged:
+        damaged = _damage_of(path)
+        if damaged is None:
             return path
-        log.warning("%s: a damaged checkpoint is passed over (%s)", path, damaged[0])
+        log.warning("%s: a damaged checkpoint is passed over (%s)", path, damaged)
     return None
+
+
+def check_whole(checkpoint: Path) -> None:
+    """Check that a checkpoint that is needed stands and is whole.
+
+    Raises:
+        InputError: it is gone or damaged.
+    """
+    damaged = _damage_of(checkpoint)
+    if damaged is not None:
+        raise InputError(
+            "the checkpoint of the best validation is damaged", where=checkpoint, got=damaged,
+            fix="train anew in another --out (keep=last takes the last weights instead)",
+        )  # fmt: skip
+
+
+def _damage_of(checkpoint: Path) -> str | None:
+    """Say what is damaged of a checkpoint; None: it is whole."""
+    try:
+        digests = read_checksums(checkpoint).items()
+        return next((name for name, digest in digests if sha256_file(checkpoint / name) != digest), None)
+    except InputError as error:
+        return str(error)
 
 
 def read_progress(folder: Path) -> Progress:
@@ -191,6 +211,19 @@ def adapter_facts(student: Student, max_pixels: int, model: Path) -> dict[str, A
         "device": student.device,
         "versions": {"torch": torch.__version__, "transformers": transformers.__version__, "peft": peft.__version__},
     }
+
+
+def write_adapter_folder(student: Student, folder: Path, base_name: str) -> None:
+    """Write an adapter that peft loads.
+
+    Args:
+        base_name: what its base is called. peft writes where it stands on this machine, which is nobody else's business, also into a
+            card that says nothing but that.
+    """
+    student.model.save_pretrained(folder)
+    (folder / "README.md").unlink(missing_ok=True)
+    path = folder / "adapter_config.json"
+    write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
 
 
 def write_model_folder(student: Student, folder: Path, base: Path) -> None:

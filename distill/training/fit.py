@@ -23,6 +23,7 @@ from cosfly.store import dump_json, storage_errors
 from distill.schema import Sample
 from distill.student.checkpoint import (
     Progress,
+    check_whole,
     checkpoint_path,
     cut_log,
     drop_old_checkpoints,
@@ -166,6 +167,7 @@ def fit(lesson: Lesson, out: Path) -> Progress:
             progress = _run_steps(lesson, optimizer, progress, out, note)
     best = checkpoint_path(folder, progress.best_step)
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
+        ranks.first_does(partial(check_whole, best))
         load_checkpoint(best, lesson.student)
         log.info("%s: the weights after step %d are kept, whose validation was the best", STAGE, progress.best_step)
     return progress

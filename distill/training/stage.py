@@ -19,9 +19,9 @@ from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, write_json
 from cosfly.student_chat import Taught, write_taught
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
-from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_model_folder
+from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures, folder_bytes
-from distill.student.model import Processor, Student, load_student, require, student_folder, weight_files
+from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
 from distill.student.taught import taught_by
 from distill.training.census import Census, choose_over_all, take_census
@@ -128,6 +128,7 @@ def run(
         ConfigError: the memory is full, or the loss is not finite.
     """
     require("torch", "transformers", "peft")
+    base_name = str(student) if is_hub_name(str(student)) else Path(student).absolute().name
     product = out / (ADAPTER if cfg.method == "lora" else MODEL)
     with joined(cfg.device) as ranks:
         trees = resolve_trees(dataset, data)
@@ -150,7 +151,7 @@ def run(
         with memory_errors(cfg):
             lesson, taught = _lesson(cfg, samples, dataset, trees, base, out, seed, ranks)
             progress = fit(lesson, out)
-        ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, opened[0]))
+        ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, base_name, opened[0]))
     return product
 
 
@@ -205,13 +206,13 @@ def _nothing_to_learn(out: Path, census: Census) -> Exception:
 
 
 def _write_product(
-    lesson: Lesson, progress: Progress, taught: Taught, product: Path, base: Path, stage: StageFolder
+    lesson: Lesson, progress: Progress, taught: Taught, product: Path, base: Path, base_name: str, stage: StageFolder
 ) -> None:
     student, cfg, census = lesson.student, lesson.cfg, lesson.census
     facts = adapter_facts(student, int(student.image_processor.size["longest_edge"]), base)
     with atomic_folder(product) as partial:
         if cfg.method == "lora":
-            student.model.save_pretrained(partial)
+            write_adapter_folder(student, partial, base_name)
             write_json(partial / ADAPTER_FACTS, facts)
         else:
             write_model_folder(student, partial, base)
