@@ -123,6 +123,7 @@ ORBIT = dataclasses.replace(
 SECOND_SET = Path(__file__).with_name(
     "prose_second.jsonl"
 )  # captions in the form of the gold set, by two further hands
+THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand that had seen no rule of the reader's
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 

@@ -95,6 +95,8 @@ def parse(text: str, language: Language) -> Sentence:
     tokens += _spans(text, found, language)
     if language == "en":
         tokens += _particles(text, tokens)
+        if _GROUND.search(text):
+            tokens = [_may_be_slant(t, text) for t in tokens]
     ratios = [t for t in tokens if t.kind == "ratio"]
     kept = [
         n
@@ -111,6 +113,15 @@ def parse(text: str, language: Language) -> Sentence:
     clauses = _cut(text, tokens, kept, language)
     _block(clauses, text)
     return Sentence(text, language, kept, clauses)
+
+
+_GROUND = re.compile(r"\bground (?:distance|range)\b|\bhorizontal")
+
+
+def _may_be_slant(token: Token, text: str) -> Token:
+    """A bare "range" beside a distance over the ground may be that along the line of sight."""
+    is_bare = token.kind == "quantity" and token.value == "distance" and text[token.start : token.end] == "range"
+    return Token("quantity", "range", token.start, token.end) if is_bare else token
 
 
 _PARTICLE = re.compile(

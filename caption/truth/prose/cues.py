@@ -12,7 +12,7 @@ from caption.truth.prose.statements import NOW
 
 # unit -> cue -> series; {0: unknown owner's, ...} where the owner decides.
 _LENGTHS = {
-    "distance": ("distance",), "slant": ("slant",), "altitude": ("altitude",), "height": ("altitude", "height_over_target"),
+    "distance": ("distance",), "range": ("distance", "slant"), "slant": ("slant",), "altitude": ("altitude",), "height": ("altitude", "height_over_target"),
     "over": ("height_over_target",),
 }  # fmt: skip
 _PIXELS = {
@@ -67,7 +67,7 @@ ANY = {
     "px": ("box_width", "box_height", "offset_x", "offset_y", "picture"),
 }
 TREND_SERIES = {
-    "distance": ("distance",), "slant": ("slant",), "altitude": ("altitude",), "over": ("height_over_target", "altitude"),
+    "distance": ("distance",), "range": ("distance", "slant"), "slant": ("slant",), "altitude": ("altitude",), "over": ("height_over_target", "altitude"),
     "box": ("box_area",), "width": ("box_width",), "tall": ("box_height",), "climb_rate": ("climb_rate",), "difference": ("speed_difference", "difference_mean"),
 }  # fmt: skip
 

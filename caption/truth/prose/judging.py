@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 from caption.schema import EvidenceConfig
@@ -13,7 +14,7 @@ from caption.truth.prose.measured import Measured
 from caption.truth.prose.numerals import masked
 from caption.truth.prose.pool import Pool
 from caption.truth.prose.reading import read_form
-from caption.truth.prose.statements import Form
+from caption.truth.prose.statements import Form, Statement
 from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
@@ -58,11 +59,19 @@ def judge_sentences(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langu
             letter, subject = name[0], ""
         hidden, runs = masked(text, language)
         form = read_form(hidden, language, subject, letter == "R")
+        if forms and forms[-1].asks_of_past:
+            form = replace(form, statements=_after_answer(form.statements), left_out=True)
         subject = form.subject
         forms.append(form)
         numbers = NumberJudge(measured, pool, cfg, form, runs)
         judged.append(_judge(name, text, form, numbers, words))
     return _against_decision(judged, forms, coc.flight_decision)
+
+
+def _after_answer(statements: tuple[Statement, ...]) -> tuple[Statement, ...]:
+    """Leave out what answers a question: it is told of the moment that was asked for."""
+    first = min((s.clause for s in statements), default=None)
+    return tuple([s for s in statements if s.clause != first])
 
 
 def _judge(name: str, text: str, form: Form, numbers: NumberJudge, words: WordJudge) -> Judged:

@@ -22,6 +22,9 @@ _DASHES = str.maketrans({"−": "-", "–": "-", "—": ";", "’": "'", "‘": 
 _HYPHEN = re.compile(r"(?<=[a-z])-(?=[a-z])")
 _ARROW = re.compile(r"\s*(?:-+>|=+>|→)\s*")
 _OF_TIME = re.compile(r"(?<![a-z])([a-z]{1,5})\((t\d)\)")  # v(t4)
+_GLOSSED = re.compile(r"第[一二三四五1-5][帧步]\s*\(\s*(t\d)\s*\)")  # 第二帧(t1)
+_TELEGRAM = re.compile(r" STOP[\s.]*$")  # "SUBJECT VISIBLE STOP RANGE 20 M STOP"
+_LAST_FEW = re.compile(r"\b(the (?:last|latest|newest|first) (?:two|three|four))(?=\s*(?:[.,;)]|$))")
 _EQUALS = re.compile(r"\s*=\s*")
 
 
@@ -58,12 +61,15 @@ class Numeral:
 
 def masked(sentence: str, language: Language) -> tuple[str, tuple[str, ...]]:
     """Give a sentence in lower case with its runs of digits as `#`, and those runs."""
+    if language == "en" and _TELEGRAM.search(sentence):
+        sentence = sentence.replace(" STOP", ";")
     text = sentence.translate(_DASHES).lower()
     if "(t" in text:
-        text = _OF_TIME.sub(r"\1 \2 ", text)
+        text = _OF_TIME.sub(r"\1 \2 ", _GLOSSED.sub(r"\1", text))
     if "-" in text or "→" in text or "=" in text:
         text = _EQUALS.sub(" = ", _ARROW.sub(" → ", _HYPHEN.sub(" ", text)))
     if language == "en":
+        text = _LAST_FEW.sub(r"\1 frames", text)
         text = _SIDE_LETTER.sub(lambda match: " left" if match[1] in ("l", "left") else " right", text)
     runs: list[str] = []
 
@@ -125,8 +131,27 @@ def numerals(text: str, language: Language) -> list[Numeral]:
             numeral = _said_apart(numeral, text)
             side = _side_of(match, text, language)
             numeral = replace(numeral, side=side) if side else numeral
+        if found and _is_rest_of(numeral, found[-1], text):
+            found[-1] = _added_up(found[-1], numeral)
+            continue
         found.append(_joined(numeral, found, text))
     return _with_units(found, text, lexicon)
+
+
+_AND = re.compile(r"\s*(?:and|,)?\s*")
+
+
+def _is_rest_of(numeral: Numeral, last: Numeral, text: str) -> bool:
+    """Tell whether a number goes on from the one before in a smaller unit: "eleven metres and thirty centimetres"."""
+    is_smaller = numeral.unit == last.unit == "m" and numeral.factor == 0.01 and last.factor == 1.0
+    return is_smaller and _AND.fullmatch(text, last.end, numeral.start) is not None
+
+
+def _added_up(last: Numeral, rest: Numeral) -> Numeral:
+    """Add up two numbers in words; of digits nothing is said."""
+    if last.whole is None and rest.whole is None:
+        return replace(last, end=rest.end, value=last.value + rest.value * rest.factor)
+    return replace(last, end=rest.end, unit="", whole=None, value=0.0)
 
 
 _SIDE = {

@@ -7,12 +7,12 @@ from dataclasses import replace
 from functools import lru_cache
 
 from caption.truth.prose.clauses import Clause, parse
-from caption.truth.prose.cues import Context
+from caption.truth.prose.cues import Context, times_of
 from caption.truth.prose.deciding import actions_of
 from caption.truth.prose.reading_numbers import NumberReader
 from caption.truth.prose.reading_states import StateReader
 from caption.truth.prose.reading_words import WordReader
-from caption.truth.prose.statements import Form, Said, Statement
+from caption.truth.prose.statements import NOW, Form, Said, Statement
 from cosfly.products.captions import Language
 
 
@@ -21,7 +21,8 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
     """Read a sentence in which runs of digits are written as `#`. subject: whom the sentence before it spoke of."""
     sentence = parse(masked, language)
     if masked.endswith(("?", "？")):  # a question states nothing
-        return Form(masked, tuple(sentence.numerals), (), True, subject)
+        of_past = any(frames != (NOW,) for clause in sentence.clauses for _, frames in times_of(clause))
+        return Form(masked, tuple(sentence.numerals), (), True, subject, asks_of_past=of_past)
     context = Context(subject=subject)
     statements: list[Statement] = []
     actions: list[Said] = []

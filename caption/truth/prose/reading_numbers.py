@@ -22,9 +22,10 @@ from caption.truth.prose.reading_ratios import ratio_statement
 from caption.truth.prose.statements import NOW, Mode, Statement
 from caption.truth.prose.sureness import Sureness
 from caption.truth.prose.timing import MEASURED, Timing
+from caption.truth.prose.versus import owners_behind
 
 _IMPLIED = {
-    "speed": "mps", "distance": "m", "slant": "m", "altitude": "m", "over": "m", "yaw": "deg", "heading": "deg", "pitch": "deg",
+    "speed": "mps", "distance": "m", "range": "m", "slant": "m", "altitude": "m", "over": "m", "yaw": "deg", "heading": "deg", "pitch": "deg",
     "depression": "deg", "bearing": "deg", "box": "px", "width": "px", "tall": "px", "centre": "px", "climb_rate": "mps",
     "yaw_rate": "dps", "travelled": "m", "displacement": "m", "target_heading": "deg",
 }  # fmt: skip
@@ -34,7 +35,7 @@ _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|acc
 _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最")
 # A turn that is told from the window's start: its sum.
 _FROM_START = re.compile(
-    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date)\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
+    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it \w+ at t0)\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
 _AT_PACE = re.compile(r"(?:\b(?:at|doing|does|do|did|making|makes|our|their|his|her)|\w's|只有|为|是|有) ?$")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
@@ -77,7 +78,7 @@ class NumberReader:
                 continue
             owners = [self.sureness.right_beside(n) for n in (a, b)]
             if re.match(r"\s*的?[^(]*\(", self.text[b.end :]) or self.text[: self.clause.start].endswith(":"):
-                owners = self._owners_behind()  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
+                owners = owners_behind(self.sentence, self.clause)  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
             first = {"drone": 1, "target": -1, "": 0}[owners[0]] or -{"drone": 1, "target": -1, "": 0}[owners[1]]
             today = not any(t.value not in ("now", "last_step") for t in self.clause.of("time"))
             frames = (NOW,) if today else None
@@ -92,18 +93,6 @@ class NumberReader:
                     hedge=self.beside.hedge(a),
                 )
             )
-
-    def _owners_behind(self) -> list[str]:
-        """Give the two owners that stand alone in brackets behind a clause."""
-        if not self.text.startswith("(", self.clause.end):
-            return ["", ""]
-        end = self.text.find(")", self.clause.end)
-        inside = [t for c in self.sentence.clauses if self.clause.end < c.end <= end for t in c.of("who")]
-        return (
-            [t.value for t in inside]
-            if {t.value for t in inside} == {"drone", "target"} and len(inside) == 2
-            else ["", ""]
-        )
 
     def _with_unit(self, numeral: Numeral) -> Numeral:
         """A number without a unit has that of the quantity right before it."""
@@ -145,7 +134,10 @@ class NumberReader:
         earlier = any(
             "每秒" in self.text[max(0, n.start - 4) : n.start] for n in self.sentence.numerals if n.unit == "mps"
         )
-        return earlier and not self.clause.has("quantity")
+        is_way = self.clause.has("time", "window") or not all(
+            t.value == "travelled" for t in self.clause.of("quantity")
+        )
+        return earlier and not is_way  # "他只走 1.59 米" goes on about paces
 
     def _num_told(self) -> int:
         return sum(self.sentence.numerals[i].unit not in ("s", "frames") for i in self.clause.numerals)
@@ -272,6 +264,8 @@ class NumberReader:
         )
         if set(s.names) <= _WAYS and not self.sureness.owner(numeral):
             is_length = False  # of somebody who is not known to have been named
+        if is_length and s.names and set(s.names) <= _WAYS and (end := self.timing.end_of_all()):
+            return replace(s, sure_names=s.sure_names or s.names, sure_frames=end, sure_mode="value")
         if not s.sure_names and (s.sure_mode == "change" or is_length):
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:

@@ -246,7 +246,7 @@ def _direction(sentence: Sentence, before: list, after: list, context: Context) 
 def _hedge(sentence: Sentence, clause: Clause, start: int, end: int) -> Hedge:
     text = sentence.text
     if sentence.language == "zh":
-        if text.startswith(("多", "以上", "有余"), end) or text[start:end].endswith("多"):
+        if text.startswith(("多", "还多", "以上", "有余"), end) or text[start:end].endswith("多"):
             return "more"
         if re.search(r"不到|不足|少于", text[clause.start : start]):
             return "less"

@@ -95,7 +95,10 @@ class StateReader(ClauseWords):
             word, negated = "hidden" if word == "visible" else word, word != "visible"
         if negated and text.startswith(("no ", "not ", "without", "无", "没", "未", "毫", "nothing", "不")):
             negated = False
-        counted = any(self.sentence.numerals[i].unit == "frames" for i in self.clause.numerals)
+        numerals = [self.sentence.numerals[i] for i in self.clause.numerals]
+        named = [t for t, _ in times_of(self.clause)]  # "第二帧" is no count
+        counted = any(n.unit == "frames" and not any(t.start <= n.start < t.end for t in named) for n in numerals)
+        counted = counted or "连续第" in self.text[self.clause.start : self.clause.end]
         spans = [t for t in self.clause.of("time") if t.value.startswith(("last:", "first:"))]
         part = self.text[self.clause.start : self.clause.end]
         spans += [t for t in self.clause.of("time", "since") if times_of(self.clause)]

@@ -66,6 +66,7 @@ class Form:
     """A sentence as it was read, its digits aside.
 
     left_out: a number or an opposite of which nothing is known; subject: who it spoke of last. actions: those that it names.
+    asks_of_past: a question about another moment than now, which its answer need not name again.
     """
 
     text: str
@@ -74,3 +75,4 @@ class Form:
     left_out: bool
     subject: str
     actions: tuple[Said, ...] = ()
+    asks_of_past: bool = False

@@ -53,7 +53,7 @@ _OTHER = {
 # unit -> cue -> what it surely names; an owner's where it is by drone and target.
 _NAMED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
-        "distance": ("distance",), "slant": ("slant",), "altitude": ("altitude", "height_over_target"), "height": ("altitude", "height_over_target"),
+        "distance": ("distance",), "range": ("distance", "slant"), "slant": ("slant",), "altitude": ("altitude", "height_over_target"), "height": ("altitude", "height_over_target"),
         "over": ("height_over_target",), "displacement": (), "travelled": (),
     },
     "mps": {"climb_rate": ("climb_rate", "rate:altitude")},

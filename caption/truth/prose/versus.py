@@ -35,3 +35,12 @@ def pairs_of_speeds(sentence: Sentence, clause: Clause) -> list[tuple[Numeral, N
         and groups.count(a.group) <= 2
         and _VERSUS[sentence.language].fullmatch(sentence.text, a.end, b.start)
     ]
+
+
+def owners_behind(sentence: Sentence, clause: Clause) -> list[str]:
+    """Give the two owners that stand alone in brackets behind a clause."""
+    if not sentence.text.startswith("(", clause.end):
+        return ["", ""]
+    end = sentence.text.find(")", clause.end)
+    inside = [t.value for c in sentence.clauses if clause.end < c.end <= end for t in c.of("who")]
+    return inside if set(inside) == {"drone", "target"} and len(inside) == 2 else ["", ""]
