@@ -42,6 +42,9 @@ from release.export.lerobot.summary import merged, summarize
 from release.export.manifest import read_export
 from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
 from release.export.stage import run as export
+from release.package import stage as package
+from release.package.sources import Source
+from release.verify.verify import verify
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
@@ -593,3 +596,38 @@ def test_digests_of_bytes_do_not_depend_on_the_folder(dataset, tmp_path):
     b = export(config("webdataset"), moved, tmp_path / "b")
     digest = [hashlib.sha256((p / "train-00000.tar").read_bytes()).hexdigest() for p in (a, b)]
     assert digest[0] == digest[1]
+
+
+# --- verified ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("format", ["tree", "webdataset"])
+def test_an_export_verifies_where_it_stands_and_by_its_stages_folder(format, dataset, tmp_path):
+    product = export(config(format), dataset, tmp_path / "out")
+    for folder in (product, tmp_path / "out"):
+        report = verify(folder, level="structure")
+        assert report.is_ok, report
+    (product / "more").write_text("x")
+    assert "unexpected" in str(verify(tmp_path / "out", level="structure"))
+
+
+def test_the_record_of_an_export_is_read(dataset, tmp_path):
+    product = export(config("webdataset"), dataset, tmp_path / "out")
+    record = (product / "export.json").read_text()
+    (product / "export.json").write_text(record.replace('"frames": ', '"frames": 1e999, "f": ', 1))
+    assert "1e999" in str(verify(product, level="structure"))
+
+
+def test_the_tree_of_two_runs_verifies(whole, tmp_path):
+    sources = []
+    for run in ("one", "two"):
+        for name in ("tree", "captions.jsonl", "inspect.json"):
+            place = tmp_path / run / name
+            place.parent.mkdir(exist_ok=True)
+            place.symlink_to(whole / name)
+        sources.append(Source.of_files(*(tmp_path / run / n for n in ("tree", "captions.jsonl", "inspect.json"))))
+    package.run(CFG.model_copy(update={"unbound": "accept"}), sources, tmp_path / "release")
+    product = export(config("tree"), tmp_path / "release/dataset", tmp_path / "out")
+    assert {path.name for path in product.iterdir() if path.is_dir()} == {"one", "two"}
+    report = verify(product, level="structure")
+    assert report.is_ok, report

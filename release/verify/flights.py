@@ -41,8 +41,11 @@ class Told:
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
         run = flight.name.split("/")[0]
-        found = (values for (own, name), values in self.settings.items() if name == stage and run.startswith(own))
-        return next(found, {})
+        found = {own: values for (own, name), values in self.settings.items() if name == stage}
+        of_run = [
+            own for own in found if run == own or run.startswith(f"{own}_")
+        ]  # folders above a town count as part of its run
+        return found[max(of_run, key=len)] if of_run else {}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where the rows and pictures of flights come from: the shards of a release, or a playback tree. Exports: exports.py.
+"""Where the rows and pictures of flights come from: the shards of a release, or a playback tree.
 
 A source is small and pickles: worker processes open the files themselves.
 """

@@ -22,6 +22,8 @@ from cosfly.runner import run_items
 from cosfly.stage_folder import Failed, Kept, StageFolder
 from cosfly.store import CHECKSUMS
 from release.card.croissant import CROISSANT
+from release.export.contract import FORMATS
+from release.export.manifest import read_export
 from release.record import ReleaseRecord, read_record
 from release.verify import records
 from release.verify.across import Summary, check_across
@@ -36,7 +38,7 @@ LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
 
 
 def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: CaptionReader | None = None) -> Verified:
-    """Check a folder (or the `dataset` folder inside a release stage's).
+    """Check a folder (or the `dataset` folder inside a release stage's, or the format's inside an export's).
 
     Args:
         level: how far to go; each level does what the ones before it do.
@@ -46,8 +48,9 @@ def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: C
         the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
     """
     findings = Findings()
-    if not (folder / RECORD).is_file() and (folder / "dataset" / RECORD).is_file():
-        folder = folder / "dataset"
+    if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
+        inner = (folder / "dataset" / RECORD, *(folder / name / EXPORT for name in FORMATS))  # in the stage's folder
+        folder = next((path.parent for path in inner if path.is_file()), folder)
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
     elif (folder / EXPORT).is_file():
@@ -62,7 +65,7 @@ def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: C
 
 
 def _is_tree(folder: Path) -> bool:
-    return next(folder.glob("*/*/*/trajectory.json"), None) is not None
+    return next(folder.rglob("trajectory.json"), None) is not None
 
 
 # --- a release --------------------------------------------------------------------------------------------------------
@@ -159,12 +162,17 @@ def _check_shard_splits(
 
 
 def _verify_export(folder: Path, level: Level, workers: int, findings: Findings) -> None:
-    """Check an export: its files against its list of checksums, and one that is a playback tree as such. Rows of other formats are those of
-    its release, which is verified where it stands."""
+    """Check an export: its record, its files against its list of checksums, and one that is a playback tree as such. Rows of other formats
+    are those of its release, which is verified where it stands."""
+    try:
+        record = read_export(folder / EXPORT)
+    except InputError as error:
+        findings.error("record", EXPORT, error.got or error.what, error.expected or "a record of an export")
+        return
+    is_tree = record.format == "tree"
     digests = read_digests(folder, findings)
-    inner = [
-        path.relative_to(folder).parent for path in folder.glob(f"*/*/*/{CHECKSUMS}")
-    ]  # a tree's flights list their own
+    flights = folder.rglob("trajectory.json") if is_tree else ()  # each lists its own files
+    inner = [path.relative_to(folder).parent for path in flights]
     own = [
         (place / name).as_posix() for place in inner for name in (*read_digests(folder / place, findings), CHECKSUMS)
     ]
@@ -173,7 +181,7 @@ def _verify_export(folder: Path, level: Level, workers: int, findings: Findings)
         findings.error("checksum", f"{CHECKSUMS}: {EXPORT}", "no line", "one line per file")
     if level == "pixels":
         check_digests(folder, digests, good, findings)
-    if _is_tree(folder):
+    if is_tree:
         _verify_tree(folder, level, workers, findings)
     elif level != "structure":
         findings.note("not_checked", EXPORT, "rows of this format", "verify the release that it was made of: its digest stands there")  # fmt: skip
