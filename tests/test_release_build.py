@@ -400,9 +400,9 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_
     kept: dict[str, int] = {}
     real = package.name_shards
 
-    def look(planned, written, parts, folder):
-        kept.update({path.name: path.stat().st_mtime_ns for path in parts.iterdir()})
-        return real(planned, written, parts, folder)
+    def look(finished, folder):
+        kept.update({shard.path.name: shard.path.stat().st_mtime_ns for shard in finished})
+        return real(finished, folder)
 
     monkeypatch.setattr(package, "name_shards", look)
     assert all_bytes(run(split_cfg(), [source_of(copy)], tmp_path / "r")) == all_bytes(whole)

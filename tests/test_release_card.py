@@ -27,7 +27,7 @@ from release.card.numbers import COLUMNS, Counted, Sum, count_shard, spread_of
 from release.card.render import render_card
 from release.card.snippets import first_split
 from release.columns import POINT, schema
-from release.package.stage import write_records
+from release.package.folder import write_records
 from release.record import MadeBy, read_record
 from release.verify.verify import verify
 

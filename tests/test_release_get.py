@@ -466,6 +466,40 @@ def test_secrets_reach_no_log_record_or_error(dataset, tmp_path, caplog):
     assert read_record(found / "release.json").part_of.source == address
 
 
+@pytest.mark.parametrize(
+    ("shown", "published"),
+    [
+        ("/data/people/me/release", "release"),
+        ("../release/dataset", "dataset"),
+        ("https://host/a/b", "https://host/a/b"),
+        ("file:///data/people/me/a.zip", "a.zip"),
+        ("zip://in::/data/people/me/a.zip", "zip://in::a.zip"),
+    ],
+)
+def test_the_record_of_a_part_names_no_place_on_this_machine(shown, published):
+    assert remotes.published_address(shown) == published
+
+
+def test_a_part_of_a_folder_says_nothing_of_where_that_stood(dataset, tmp_path):
+    found = get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
+    assert str(dataset.parent).encode() not in b"".join(all_bytes(found).values())
+
+
+def test_finished_shards_that_are_gone_are_told_of(dataset, tmp_path):
+    get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
+    shutil.rmtree(tmp_path / "out/dataset")
+    (tmp_path / "out/manifest.json").unlink()  # as after a kill, and somebody tidied up
+    with pytest.raises(CosflyError, match="finished before is missing"):
+        get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
+
+
+def test_a_kill_before_the_parts_were_gone_leaves_none(dataset, tmp_path):
+    get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
+    (tmp_path / "out/parts").mkdir()
+    get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
+    assert not (tmp_path / "out/parts").exists()
+
+
 def test_what_cannot_be_opened(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         open_remote(str(tmp_path / "nothing"))

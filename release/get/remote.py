@@ -22,6 +22,7 @@ from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.reading.files import open_file
 from cosfly.runner import advance
 from cosfly.store import inside
+from release.package.publishable import published_name
 
 Answer = TypeVar("Answer")
 MB = 1024 * 1024
@@ -29,6 +30,7 @@ CHUNK = 4 * MB
 TRIES, FIRST_WAIT_S = 4, 0.5  # a request that broke is made anew, after 0.5, 1, 2 s
 TIMEOUT_S = 60.0
 MOST_REDIRECTS = 5
+LOCAL = ("file", "local")  # schemes of files of this machine
 CHAIN = re.compile(r"::(?![^\[]*\])")  # between the links of a chain, not within [::1]
 
 
@@ -76,6 +78,15 @@ def _plain(link: str) -> str:
     except ValueError:
         return f"{link.partition('://')[0]}://..."
     return urlunsplit((parts.scheme, host, parts.path, "", ""))
+
+
+def published_address(shown: str) -> str:
+    """Give an address as a record that is published may name it: of what lies on this machine the last name alone."""
+    links = (link.partition("://") for link in CHAIN.split(shown))
+    return "::".join(
+        published_name(path if mark else scheme) if not mark or scheme in LOCAL else f"{scheme}://{path}"
+        for scheme, mark, path in links
+    )
 
 
 def check_length(data: bytes, length: int, where: str) -> bytes:

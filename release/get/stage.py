@@ -11,10 +11,9 @@ release, all that `cosfly release verify` finds in rows. The pictures of a shard
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -31,9 +30,9 @@ from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, wr
 from release.card.numbers import compute_numbers
 from release.columns import PLACE, SPLIT_NAMES, SplitName, schema
 from release.get.choice import RECORD, Choice, chosen_flights, fetch_record
-from release.get.remote import CHUNK, Remote, RemoteFile, open_remote
+from release.get.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
+from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
 from release.package.shards import open_writer
-from release.package.stage import DATASET, PARTS, write_records
 from release.record import (
     PartOf,
     ReleasedFlight,
@@ -41,7 +40,6 @@ from release.record import (
     Shard,
     SplitNumbers,
     content_digest,
-    shard_path,
 )
 from release.verify.verify import verify
 
@@ -220,6 +218,7 @@ def run(
     stage = StageFolder.open(out, "get", config=asked, inputs={}, seed=0, resume=resume)
     dataset, parts = out / DATASET, out / PARTS
     if stage.is_complete:
+        shutil.rmtree(parts, ignore_errors=True)  # a kill came before they were gone
         return dataset
     modalities = [name for name in record.settings.modalities if choice.modalities is None or name in choice.modalities]
     plan = _Plan(
@@ -241,14 +240,16 @@ def run(
     got = {kept.id: result_of(kept, _Got) for kept in finished.kept}
     taken = [(shard, got[shard.path]) for shard in shards if shard.path in got]
     _check_all_there(flights, taken)
+    done = _finished(taken, parts)
+    check_parts(done, out)
     is_whole = len(taken) == len(record.shards) and all(shard.sha256 == one.sha256 for shard, one in taken)
     with atomic_folder(dataset) as folder:
-        named = list(_named(taken, parts, folder))
+        named = name_shards(done, folder)
         if is_whole:
             _copy_records(remote, folder, data)
         else:
             part = PartOf(
-                name=record.name, content_digest=record.content_digest, source=remote.shown,
+                name=record.name, content_digest=record.content_digest, source=published_address(remote.shown),
                 choice=choice.model_dump(mode="json", exclude={"expected"}),
             )  # fmt: skip
             write_records(folder, part_record(record, part, flights, modalities, named, taken, folder))
@@ -268,20 +269,10 @@ def _check_all_there(flights: list[ReleasedFlight], taken: Sequence[tuple[Shard,
         raise InputError("flights of the record that no shard holds", got=", ".join(missing[:10]))
 
 
-def _named(taken: Sequence[tuple[Shard, _Got]], parts: Path, folder: Path) -> Iterator[Shard]:
-    """Put the shards under the names that their content gives."""
-    digest = content_digest((shard.split, got.sha256) for shard, got in taken)
-    counts, numbers = Counter(shard.split for shard, _ in taken), Counter[str]()
-    (folder / "data").mkdir()
-    for shard, got in taken:
-        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
-        numbers[shard.split] += 1
-        part = parts / Path(shard.path).name
-        try:
-            os.link(part, folder / path)
-        except OSError:  # the file system has no links, or a kill lost the part, which the copy then names
-            shutil.copyfile(part, folder / path)
-        yield Shard(path=path, split=shard.split, rows=got.rows, bytes=got.bytes, sha256=got.sha256)
+def _finished(taken: Sequence[tuple[Shard, _Got]], parts: Path) -> list[Finished]:
+    return [
+        Finished(shard.split, parts / Path(shard.path).name, got.rows, got.bytes, got.sha256) for shard, got in taken
+    ]
 
 
 def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:

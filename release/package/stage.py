@@ -6,7 +6,6 @@ croissant.json, checksums.sha256), which is what gets published: all of it, or n
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -19,17 +18,15 @@ from cosfly.errors import CosflyError, InputError, VerifyError
 from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.provenance import read_stage_record
-from cosfly.reading.files import sha256_file
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of, write_failures
-from cosfly.store import CHECKSUMS, atomic_folder, write_bytes, write_checksums
+from cosfly.store import CHECKSUMS, atomic_folder
 from release import columns
-from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
-from release.card.render import render_card
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.depth import depth_record
+from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
 from release.package.origin import provenance_of
 from release.package.plan import PlannedShard, selected_bytes, shards_of
 from release.package.shards import ShardPlan, Written, write_shard
@@ -50,14 +47,11 @@ from release.record import (
     SplitNumbers,
     Splits,
     content_digest,
-    shard_path,
-    write_record,
 )
 from release.subsample import RULE
 from release.verify.verify import verify
 
 MB = 1024 * 1024
-DATASET, PARTS = "dataset", "parts"
 NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
 SPLIT_RULE = (
     "whole walks (a walk: flights of one town, in any of its builds, whose person is at the same places at the same seconds), or whole towns; ranked "
@@ -105,7 +99,7 @@ class ReleaseConfig(Config):
         500, ge=1, description="size that a parquet file should not pass by more than one flight, MB before compression"
     )
     row_group_mb: int = Field(
-        64, ge=1, description="size of a row group before compression, MB; viewers load one at a time"
+        64, ge=1, le=1024, description="size of a row group before compression, MB; viewers load one at a time"
     )
 
     @field_validator("tracks", "modalities")
@@ -293,7 +287,7 @@ def run(
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     history = account_for(plan, written)
     with atomic_folder(dataset) as folder:
-        shards = name_shards(plan.shards, written, parts, folder)
+        shards = name_shards(_finished(plan, written, parts), folder)
         record = make_record(cfg, sources, plan, written, shards, history, licence, maps, folder, out)
         write_records(folder, record)
         _check_release(folder)
@@ -326,31 +320,15 @@ def _write_parts(
     findings.failures += [record for record in finished.records if isinstance(record, Failed)]
     findings.check()
     written = [result_of(record, Written) for record in finished.kept]
-    for shard, result in zip(plan.shards, written, strict=True):
-        path = part_path(parts, shard.name)
-        if not path.is_file() or path.stat().st_size != result.bytes:
-            expected, fix = f"{result.bytes} bytes", f"remove {stage.path} and run again"
-            what = "a shard that was finished before is missing or has another size"
-            raise VerifyError(what, where=path, expected=expected, fix=fix)
+    check_parts(_finished(plan, written, parts), stage.path)
     return written
 
 
-def name_shards(planned: list[PlannedShard], written: list[Written], parts: Path, folder: Path) -> list[Shard]:
-    """Put the parts under their names in the release: linked, so that no byte moves and a kill costs nothing."""
-    digest = content_digest((shard.split, result.sha256) for shard, result in zip(planned, written, strict=True))
-    counts, numbers = Counter(shard.split for shard in planned), Counter[str]()
-    (folder / "data").mkdir()
-    shards = []
-    for shard, result in zip(planned, written, strict=True):
-        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
-        numbers[shard.split] += 1
-        part = part_path(parts, shard.name)
-        try:
-            os.link(part, folder / path)
-        except OSError:  # the file system has no links
-            shutil.copyfile(part, folder / path)
-        shards.append(Shard(path=path, split=shard.split, rows=result.rows, bytes=result.bytes, sha256=result.sha256))
-    return shards
+def _finished(plan: _Plan, written: list[Written], parts: Path) -> list[Finished]:
+    return [
+        Finished(shard.split, part_path(parts, shard.name), result.rows, result.bytes, result.sha256)
+        for shard, result in zip(plan.shards, written, strict=True)
+    ]
 
 
 def _check_release(folder: Path) -> None:
@@ -460,14 +438,3 @@ def make_record(
         content_digest=content_digest((shard.split, shard.sha256) for shard in shards),
         shards=shards,
     )
-
-
-def write_records(folder: Path, record: ReleaseRecord) -> None:
-    """Write release.json, the card, croissant.json and the checksums beside the shards."""
-    write_record(folder / "release.json", record)
-    write_bytes(folder / "README.md", render_card(record).encode())
-    write_bytes(folder / CROISSANT, render_croissant(record).encode())
-    digests = {shard.path: shard.sha256 for shard in record.shards}
-    for name in ("release.json", "README.md", CROISSANT):
-        digests[name] = sha256_file(folder / name)
-    write_checksums(folder, digests)
