@@ -109,8 +109,15 @@ def fingerprints(path: Path) -> set[str]:
 def folder_digests(folder: Path) -> dict[str, str]:
     """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, of what that leaves out its own."""
     listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
-    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return listed | {name: sha256_file(folder / name) for name in found if name not in (*listed, CHECKSUMS)}
+    known, root = listed.keys() | {CHECKSUMS}, f"{folder}{os.sep}"
+    found = (  # of thousands of files: as text, paths take three times as long
+        f"{above}{os.sep}{name}".removeprefix(root).replace(os.sep, "/")
+        for above, _, names in os.walk(folder)
+        for name in names
+    )
+    return listed | {
+        name: sha256_file(folder / name) for name in found if name not in known and (folder / name).is_file()
+    }
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:

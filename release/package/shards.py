@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -38,6 +38,7 @@ MB = 1024 * 1024
 VALUES_A_BATCH = (
     4  # values between two looks at the size of a page: with more a page takes a whole row group, twice in memory
 )
+MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
 MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
 META = "meta.json"
 ANEW = "put the file back, or inspect and caption the tree as it is now"
@@ -92,7 +93,8 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Wri
     problems = _Problems()
     flights: list[ReleasedPart] = []
     with atomic_file(path) as file:
-        with open_writer(file.name, columns.schema(plan.files)) as writer:
+        hashed = _HashedFile(file)
+        with open_writer(pa.PythonFile(hashed, mode="w"), columns.schema(plan.files)) as writer:
             rows = _Rows(writer, plan)
             for part in parts:
                 with problems.collected():
@@ -102,7 +104,7 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Wri
     return Written(
         rows=sum(flight.frames for flight in flights),
         bytes=path.stat().st_size,
-        sha256=sha256_file(path),
+        sha256=hashed.sha256.hexdigest(),
         flights=flights,
         depth=rows.depth,
     )
@@ -226,11 +228,35 @@ def _read_picture(flight: Flight, i: int, file: FrameFile, digests: Mapping[str,
 # --- what is written --------------------------------------------------------------------------------------------------
 
 
+class _HashedFile:
+    """A file under construction with the digest of what was written, so that a shard needs not be read again for its own."""
+
+    closed = False  # whoever opened the file closes it
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self.sha256 = file, hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        self.sha256.update(data)
+        return self._file.write(data)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        """Leave the file open: its end is flushed to disk before it has its name."""
+
+
 class _Column:
     """The files of one picture column of a row group, one after the other in memory that every row group uses again."""
 
     def __init__(self, num_bytes: int) -> None:
-        self._memory = np.empty(num_bytes, np.uint8)
+        self._memory = np.empty(
+            2 * num_bytes, np.uint8
+        )  # the last file goes beyond; pages that nobody writes to take no memory
         self.ends = [0]  # of the files that are kept, from byte 0 on
         self._last = 0  # end of the one that was read last
 
@@ -263,7 +289,7 @@ class _Column:
     def _room(self, size: int) -> memoryview:
         begin = self.ends[-1]
         if begin + size > len(self._memory):
-            grown = np.empty(2 * (begin + size), np.uint8)  # pages that nobody writes to take no memory
+            grown = np.empty(2 * (begin + size), np.uint8)
             grown[:begin] = self._memory[:begin]
             self._memory = grown
         return self._memory.data[begin : begin + size]
@@ -296,7 +322,7 @@ class _Rows:
         self._scalars.append(scalars)
         self._paths.append(sample_id(flight.flight_id, i))
         self._num_bytes += sum(column.keep() for column in self.pictures.values())
-        if self._num_bytes >= self._plan.row_group_bytes:
+        if self._num_bytes >= self._plan.row_group_bytes or len(self._scalars) >= MOST_ROWS:
             self.flush()
 
     def flush(self) -> None:
@@ -322,7 +348,7 @@ class _Rows:
         return pa.StructArray.from_arrays([column.array(), paths], fields=list(kind))
 
 
-def open_writer(path: str, schema: pa.Schema) -> pq.ParquetWriter:
+def open_writer(sink: str | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
     """Open a parquet file whose bytes depend on the rows alone.
 
     PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
@@ -337,7 +363,7 @@ def open_writer(path: str, schema: pa.Schema) -> pq.ParquetWriter:
     small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
     repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
     return pq.ParquetWriter(
-        path,
+        sink,
         schema,
         compression=compression,
         use_dictionary=repeated,
