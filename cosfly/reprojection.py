@@ -93,44 +93,49 @@ def _colours_at(matches: np.ndarray, one: np.ndarray, other: np.ndarray, height:
     return one[m[:, 1], m[:, 0], :3].astype(np.float64), other[nearest, m[:, 2], :3].astype(np.float64)
 
 
-@njit(cache=True, nogil=True)
-def survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-def]
+def survey(
+    depth: np.ndarray, instance: np.ndarray, sky_kind: int, person_id: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Look at every pixel of a frame once.
 
     Args:
         depth: (h, w) float32, or (0, 0) where there is none; instance: (h, w, 3) uint8, or (0, 0, 3).
     Returns:
-        range (2,) least and greatest depth, NaN where one is; counts (5,): pixels of sky by depth, by kind, by one alone; of the person;
-        of the person's id with another kind than Pedestrians. box (4,) of the person's pixels, edges at pixel borders; kinds (256,) pixels.
+        range (2,) least and greatest depth, NaN where one is not finite; counts (4,): pixels of sky by one of depth and kind alone; of the
+        person; of the person's id with another kind than Pedestrians. box (4,) of the person's pixels, edges at pixel borders; kinds (256,)
+        pixels.
     """
-    counts, kinds = np.zeros(5, np.int64), np.zeros(256, np.int64)
+    limits = np.array([depth.min(), depth.max()]) if depth.size else np.zeros(2)
+    return limits if np.isfinite(limits).all() else np.full(2, np.nan), *_survey(depth, instance, sky_kind, person_id)
+
+
+@njit(cache=True, nogil=True)
+def _survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-def]
+    """Count run by run: of a mask's row most neighbours are the same."""
+    counts, kinds = np.zeros(3, np.int64), np.zeros(256, np.int64)
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
-    least, greatest, is_finite = np.inf, -np.inf, True
-    has_depth, has_ids = depth.shape[0] > 0, instance.shape[0] > 0
-    height, width = depth.shape if has_depth else instance.shape[:2]
+    height, width = instance.shape[:2]
+    has_depth = depth.shape[0] > 0
     for y in range(height):
-        for x in range(width):
-            is_far = False
+        begin = np.int64(0)
+        while begin < width:
+            kind, low, high = instance[y, begin, 0], instance[y, begin, 1], instance[y, begin, 2]
+            end = begin + 1
+            while end < width and instance[y, end, 0] == kind and instance[y, end, 1] == low and instance[y, end, 2] == high:  # fmt: skip
+                end += 1
+            kinds[kind] += end - begin
             if has_depth:
-                d = depth[y, x]
-                if not np.isfinite(d):
-                    is_finite = False
-                least, greatest = min(least, d), max(greatest, d)
-                is_far = d == 1000.0
-                counts[0] += is_far
-            if has_ids:
-                kind = instance[y, x, 0]
-                kinds[kind] += 1
-                counts[1] += kind == sky_kind
-                counts[2] += has_depth and ((kind == sky_kind) != is_far)
-                if instance[y, x, 1] == (person_id & 255) and instance[y, x, 2] == (person_id >> 8):
-                    counts[3] += 1
-                    counts[4] += kind != 12
-                    box[0], box[1] = min(box[0], x), min(box[1], y)
-                    box[2], box[3] = max(box[2], x + 1), max(box[3], y + 1)
-    if not is_finite:
-        least, greatest = np.nan, np.nan
-    return np.array([least, greatest]), counts, box, kinds
+                num_far = np.int64(0)
+                for x in range(begin, end):
+                    num_far += depth[y, x] == 1000.0
+                counts[0] += end - begin - num_far if kind == sky_kind else num_far
+            if low == (person_id & 255) and high == (person_id >> 8):
+                counts[1] += end - begin
+                counts[2] += end - begin if kind != 12 else 0
+                box[0], box[1] = min(box[0], begin), min(box[1], y)
+                box[2], box[3] = max(box[2], end), max(box[3], y + 1)
+            begin = end
+    return counts, box, kinds
 
 
 @njit(cache=True, nogil=True)

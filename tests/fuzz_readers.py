@@ -63,7 +63,8 @@ from cosfly.products.town import read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
-from cosfly.reading.files import sha256_file
+from cosfly.reading.files import read_bytes, sha256_file
+from cosfly.reading.png import parse_png
 from cosfly.render import older_trees
 from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify
@@ -543,6 +544,7 @@ READERS: dict[str, Reader] = {
     "rgb": _one(PICTURES[0], lambda path: read_rgb(path.parent)),
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
+    "PNG, by rows": Reader(PICTURES[::2], lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]]),
     "town": _one("render/Town01/map.json", lambda path: read_town_map(path.parent)),
     "flight's checksums": Reader((f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True),
     "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),

@@ -1,8 +1,7 @@
 """PNG without a library, as fast as data sets of a hundred thousand pictures need it: whole pictures, or the few rows that are looked at.
 
-The chunks' checksums, the stream's own and the number of bytes are always compared, so a picture that passes is whole. A library
-undoes the filter of every row; here a row is undone when it is wanted, which for rows that lean on no other (filters none and sub, as
-cosfly writes them) is a hundredth of the work. Only what data sets hold: 8 bits, grey to RGBA, not interlaced.
+The chunks' checksums, the stream's own and the number of bytes are always compared, so a picture that passes is whole. Filters
+are undone when rows are wanted; where no row leans on another (filters none and sub), in those rows alone. Only what data sets hold: 8 bits, grey to RGBA, not interlaced.
 Formats: RFC 1950, 1951, 2083.
 """
 
@@ -19,7 +18,7 @@ from cosfly.errors import InputError
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
-TABLE_BITS = 11
+CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
 _BASE_LENGTH = np.array([3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 15, 17, 19, 23, 27, 31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227, 258], np.int64)  # fmt: skip
 _MORE_LENGTH = np.array([0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 0], np.int64)  # fmt: skip
 _BASE_WAY = np.array([1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129, 193, 257, 385, 513, 769, 1025, 1537, 2049, 3073, 4097, 6145, 8193, 12289, 16385, 24577], np.int64)  # fmt: skip
@@ -57,7 +56,7 @@ class Png:
         return self.lines
 
 
-def parse_png(data: bytes, where: object) -> Png:
+def parse_png(data: bytes | memoryview, where: object) -> Png:
     """Unpack a PNG, and see that every checksum holds.
 
     Raises:
@@ -70,7 +69,9 @@ def parse_png(data: bytes, where: object) -> Png:
     source = np.frombuffer(packed, np.uint8)
     if len(source) < 8 or (source[0] & 15) != 8 or (int(source[0]) * 256 + int(source[1])) % 31 or source[1] & 32:
         raise _broken(where, "a stream that is none of zlib's")
-    used = _inflate(source, 2, out)
+    # Eight bytes from each place on: most bits are fetched so many at once.
+    words = np.ndarray(len(source) - 7, "<u8", packed, strides=(1,))
+    used = _inflate(source, words, 2, out)
     if used < 0:
         raise _broken(where, "a compressed stream that does not unpack to the picture")
     if used + 4 > len(source) or zlib.adler32(out.data) != int.from_bytes(packed[used : used + 4], "big"):
@@ -85,9 +86,9 @@ def _broken(where: object, got: str) -> InputError:
     return InputError("the image does not decode", where=str(where), got=got, expected="a whole PNG")
 
 
-def _chunks(data: bytes, where: object) -> tuple[int, int, int, bytes]:
+def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:
     """Walk through the chunks: width, height, colour type, the packed pixels."""
-    if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR" or len(data) < 33:
+    if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
     check_pixels(width * height, str(where), f"{width} x {height} px")
@@ -95,11 +96,11 @@ def _chunks(data: bytes, where: object) -> tuple[int, int, int, bytes]:
         raise _broken(where, f"{depth} bits, colour type {kind}, interlace {interlace}, {width} x {height} px")
     position, parts, view = len(PNG_SIGNATURE), list[memoryview](), memoryview(data)
     while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        name, end = data[position + 4 : position + 8], position + 8 + length
+        length, name = CHUNK.unpack_from(data, position)
+        end = position + 8 + length
         if end + 4 > len(data):
             break
-        if zlib.crc32(view[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+        if zlib.crc32(view[position + 4 : end]) != NUMBER.unpack_from(data, end)[0]:
             raise _broken(where, f"a damaged {name.decode('latin-1')} chunk at byte {position}")
         if name == b"IDAT":
             parts.append(view[position + 8 : end])
@@ -113,37 +114,67 @@ def _chunks(data: bytes, where: object) -> tuple[int, int, int, bytes]:
 
 
 @njit(cache=True, nogil=True)
+def _nearest(left, up, corner):  # type: ignore[no-untyped-def]
+    """Give Paeth's guess of a byte."""
+    a, b, c = abs(up - corner), abs(left - corner), abs(left + up - 2 * corner)
+    return left if a <= b and a <= c else up if b <= c else corner
+
+
+@njit(cache=True, nogil=True)
 def _undo(lines, channels):  # type: ignore[no-untyped-def]
-    """Undo the filters of rows, in place; a row leans on the one before it."""
+    """Undo the filters of rows, in place; a row leans on the one before it. A row of zeros stands before the first."""
     height, stride = lines.shape
+    nothing = np.zeros(stride, np.uint8)
     for y in range(height):
-        form = lines[y, 0]
-        if form == 1:
-            for x in range(1 + channels, stride):
-                lines[y, x] = (lines[y, x] + lines[y, x - channels]) & 255
-        elif form == 2 and y > 0:
+        row, above = lines[y], lines[y - 1] if y > 0 else nothing
+        if row[0] == 2:
             for x in range(1, stride):
-                lines[y, x] = (lines[y, x] + lines[y - 1, x]) & 255
-        elif form >= 3:
-            for x in range(1, stride):
-                left = np.int64(lines[y, x - channels]) if x > channels else np.int64(0)
-                above = np.int64(lines[y - 1, x]) if y > 0 else np.int64(0)
-                if form == 3:
-                    lines[y, x] = (lines[y, x] + ((left + above) >> 1)) & 255
-                    continue
-                corner = np.int64(lines[y - 1, x - channels]) if y > 0 and x > channels else np.int64(0)
-                guess = left + above - corner
-                a, b, c = abs(guess - left), abs(guess - above), abs(guess - corner)
-                near = left if a <= b and a <= c else above if b <= c else corner
-                lines[y, x] = (lines[y, x] + near) & 255
-        lines[y, 0] = 0 if form <= 4 else form
+                row[x] = (row[x] + above[x]) & 255
+        elif row[0] != 0 and channels == 3:
+            _undo_colours(row, above)
+        elif row[0] != 0:
+            for first in range(1, 1 + channels):
+                left, corner = np.int64(0), np.int64(0)
+                for x in range(first, stride, channels):
+                    up = np.int64(above[x])
+                    guess = left if row[0] == 1 else (left + up) >> 1 if row[0] == 3 else _nearest(left, up, corner)
+                    left, corner = (np.int64(row[x]) + guess) & 255, up
+                    row[x] = left
+        row[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _undo_colours(row, above):  # type: ignore[no-untyped-def]
+    """Undo a row of three channels that leans on its left: they are computed beside each other, as each has to wait for its own left."""
+    red, green, blue = np.int64(0), np.int64(0), np.int64(0)
+    if row[0] == 1:
+        for x in range(1, len(row), 3):
+            red = (row[x] + red) & 255
+            green = (row[x + 1] + green) & 255
+            blue = (row[x + 2] + blue) & 255
+            row[x], row[x + 1], row[x + 2] = red, green, blue
+    elif row[0] == 3:
+        for x in range(1, len(row), 3):
+            red = (row[x] + ((red + above[x]) >> 1)) & 255
+            green = (row[x + 1] + ((green + above[x + 1]) >> 1)) & 255
+            blue = (row[x + 2] + ((blue + above[x + 2]) >> 1)) & 255
+            row[x], row[x + 1], row[x + 2] = red, green, blue
+    else:
+        corners = np.int64(0), np.int64(0), np.int64(0)
+        for x in range(1, len(row), 3):
+            ups = np.int64(above[x]), np.int64(above[x + 1]), np.int64(above[x + 2])
+            red = (row[x] + _nearest(red, ups[0], corners[0])) & 255
+            green = (row[x + 1] + _nearest(green, ups[1], corners[1])) & 255
+            blue = (row[x + 2] + _nearest(blue, ups[2], corners[2])) & 255
+            row[x], row[x + 1], row[x + 2] = red, green, blue
+            corners = ups
 
 
 @njit(cache=True, nogil=True)
 def _make_table(lengths, count, table, sorted_symbols, counts):  # type: ignore[no-untyped-def]
     """Fill the tables of a Huffman code; False where the lengths are none.
 
-    table (2 ** TABLE_BITS,): symbol * 16 + length of codes that fit, 0 of others, which are found by sorted_symbols and counts.
+    table (2 ** 11,): symbol * 16 + length of codes that fit, 0 of others, which are found by sorted_symbols and counts.
     """
     counts.fill(0)
     for s in range(count):
@@ -180,6 +211,22 @@ def _make_table(lengths, count, table, sorted_symbols, counts):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
+def _make_pairs(table, pairs):  # type: ignore[no-untyped-def]
+    """Of the next bits, the one or two literals that they begin with: bits, how many (256s), first, second byte; 0 where there is none."""
+    for at in range(2048):
+        first = table[at]
+        pairs[at] = 0
+        if first == 0 or first >= 4096:
+            continue
+        used = first & 15
+        second = table[at >> used]
+        if second != 0 and second < 4096 and used + (second & 15) <= 11:
+            pairs[at] = (second >> 4) << 24 | (first >> 4) << 16 | 512 | (used + (second & 15))
+        else:
+            pairs[at] = (first >> 4) << 16 | 256 | used
+
+
+@njit(cache=True, nogil=True)
 def _slow_symbol(hold, sorted_symbols, counts):  # type: ignore[no-untyped-def]
     """Find a symbol bit by bit: symbol * 16 + length, -1 where the bits are no code."""
     code, first, index = np.int64(0), np.int64(0), np.int64(0)
@@ -196,9 +243,26 @@ def _slow_symbol(hold, sorted_symbols, counts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _inflate(source, position, out):  # type: ignore[no-untyped-def]
-    """Unpack a deflate stream into `out`, which it must fill; gives where it ends in the source, -1 where it is broken."""
+def _refill(source, words, position, hold, held):  # type: ignore[no-untyped-def]
+    """Fetch bits: 56 and more, or all that are left. Above `held` stand those that come next, or none: or-ing them again changes nothing."""
+    if position < len(words):
+        return hold | words[position] << np.uint64(held), held | 56, position + ((63 - held) >> 3)
+    while held <= 48 and position < len(source):
+        hold |= np.uint64(source[position]) << np.uint64(held)
+        position += 1
+        held += 8
+    return hold, held, position
+
+
+@njit(cache=True, nogil=True)
+def _inflate(source, words, position, out):  # type: ignore[no-untyped-def]
+    """Unpack a deflate stream into `out`, which it must fill; gives where it ends in the source, -1 where it is broken.
+
+    `hold` has the next `held` bits; words[k]: the eight bytes of the source from its k-th on.
+    """
     size, room, at = len(source), len(out), np.int64(0)
+    num_words = len(words)
+    pairs = np.zeros(2048, np.uint32)
     hold, held = np.uint64(0), np.int64(0)
     lengths = np.zeros(320, np.int64)
     literal, way = np.zeros(2048, np.int64), np.zeros(2048, np.int64)
@@ -206,10 +270,7 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
     literal_counts, way_counts = np.zeros(16, np.int64), np.zeros(16, np.int64)
     is_last = False
     while not is_last:
-        while held <= 48 and position < size:
-            hold |= np.uint64(source[position]) << np.uint64(held)
-            position += 1
-            held += 8
+        hold, held, position = _refill(source, words, position, hold, held)
         if held < 3:
             return np.int64(-1)
         is_last = (hold & np.uint64(1)) == np.uint64(1)
@@ -241,10 +302,7 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
                 lengths[s] = 5
             _make_table(lengths, 30, way, way_symbols, way_counts)
         else:
-            while held <= 48 and position < size:
-                hold |= np.uint64(source[position]) << np.uint64(held)
-                position += 1
-                held += 8
+            hold, held, position = _refill(source, words, position, hold, held)
             num_literals = np.int64(hold & np.uint64(31)) + 257
             num_ways = np.int64((hold >> np.uint64(5)) & np.uint64(31)) + 1
             num_codes = np.int64((hold >> np.uint64(10)) & np.uint64(15)) + 4
@@ -254,10 +312,7 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
                 return np.int64(-1)
             lengths.fill(0)
             for k in range(num_codes):
-                while held <= 48 and position < size:
-                    hold |= np.uint64(source[position]) << np.uint64(held)
-                    position += 1
-                    held += 8
+                hold, held, position = _refill(source, words, position, hold, held)
                 lengths[_ORDER[k]] = np.int64(hold & np.uint64(7))
                 hold >>= np.uint64(3)
                 held -= 3
@@ -266,10 +321,7 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
             lengths.fill(0)
             at_length = np.int64(0)
             while at_length < num_literals + num_ways:
-                while held <= 48 and position < size:
-                    hold |= np.uint64(source[position]) << np.uint64(held)
-                    position += 1
-                    held += 8
+                hold, held, position = _refill(source, words, position, hold, held)
                 entry = literal[np.int64(hold & np.uint64(2047))]
                 if entry == 0 or held < 0:
                     return np.int64(-1)
@@ -302,11 +354,25 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
                 return np.int64(-1)
             if not _make_table(lengths[num_literals:], num_ways, way, way_symbols, way_counts):
                 return np.int64(-1)
+        _make_pairs(literal, pairs)
         while True:
-            while held <= 48 and position < size:
-                hold |= np.uint64(source[position]) << np.uint64(held)
-                position += 1
-                held += 8
+            # Literals, two a look where their codes are short: five looks of at most 11 bits are what one fetch has.
+            is_literal = True
+            while is_literal and position < num_words and at + 16 <= room:
+                hold |= words[position] << np.uint64(held)
+                position += (63 - held) >> 3
+                held |= 56
+                for _ in range(5):
+                    both = np.int64(pairs[np.int64(hold & np.uint64(2047))])
+                    if both < 256:
+                        is_literal = False
+                        break
+                    out[at] = (both >> 16) & 255
+                    out[at + 1] = both >> 24
+                    at += (both >> 8) & 255
+                    hold >>= np.uint64(both & 255)
+                    held -= both & 255
+            hold, held, position = _refill(source, words, position, hold, held)
             entry = literal[np.int64(hold & np.uint64(2047))]
             if entry == 0:
                 entry = _slow_symbol(hold, literal_symbols, literal_counts)
@@ -320,15 +386,6 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
                     return np.int64(-1)
                 out[at] = s
                 at += 1
-                # Another one or two literals while there are bits: refilling is what costs.
-                while held >= 15:
-                    entry = literal[np.int64(hold & np.uint64(2047))]
-                    if entry == 0 or entry >= 4096 or at >= room:
-                        break
-                    hold >>= np.uint64(entry & 15)
-                    held -= entry & 15
-                    out[at] = entry >> 4
-                    at += 1
                 continue
             if s == 256:
                 break
@@ -339,10 +396,7 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
             n = _BASE_LENGTH[s] + np.int64(hold & ((np.uint64(1) << np.uint64(more)) - np.uint64(1)))
             hold >>= np.uint64(more)
             held -= more
-            while held <= 48 and position < size:
-                hold |= np.uint64(source[position]) << np.uint64(held)
-                position += 1
-                held += 8
+            hold, held, position = _refill(source, words, position, hold, held)
             entry = way[np.int64(hold & np.uint64(2047))]
             if entry == 0:
                 entry = _slow_symbol(hold, way_symbols, way_counts)
@@ -359,7 +413,12 @@ def _inflate(source, position, out):  # type: ignore[no-untyped-def]
             held -= more
             if held < 0 or back > at or at + n > room:
                 return np.int64(-1)
-            for k in range(n):
-                out[at + k] = out[at + k - back]
+            if back == 1:  # a run, which is what most of a mask is
+                value = out[at - 1]
+                for k in range(n):
+                    out[at + k] = value
+            else:
+                for k in range(n):
+                    out[at + k] = out[at + k - back]
             at += n
     return position - (held >> 3) if at == room and held >= 0 else np.int64(-1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from cosfly.errors import InputError
@@ -13,9 +15,11 @@ from cosfly.reading.png import parse_png
 from cosfly.reprojection import COLUMNS, View, grid_rows, survey
 from release.columns import PICTURES
 from release.depth import depth_of
+from release.package.pictures import depth_values
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
+from release.verify.sources import Pictures
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
 SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
@@ -26,11 +30,12 @@ MOST_RAYS = 900  # through the box of a person: the score is a share of them
 SCORE = 0.12  # of the visibility: three deviations of a share of so many rays, and pixels on an edge
 MOST_KIND = max(KINDS.values())
 NOTHING = np.empty((0, 0), np.float32)
+NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 Decoded = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # depth, instance, colours at the grid's rows
 
 
-def decode(flight: FlightRows, i: int, files: dict[FrameFile, bytes | None], coding: DepthCoding, findings: Findings) -> Decoded | None:  # fmt: skip
+def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, findings: Findings) -> Decoded | None:  # fmt: skip
     """Unpack the pictures of a row; None, with findings, where one is not a whole picture of the row's size."""
     width, height = (int(n) for n in flight.size_px[i])
     found: dict[FrameFile, np.ndarray] = {}
@@ -40,7 +45,11 @@ def decode(flight: FlightRows, i: int, files: dict[FrameFile, bytes | None], cod
             if not data:
                 raise InputError("no picture", got="null" if data is None else "0 bytes")
             if file == "depth":
-                found[file] = depth_of(data, coding, where)
+                is_raw = coding.coding == "float32"
+                found[file] = (
+                    depth_values(memoryview(data), Path(where)) if is_raw else depth_of(bytes(data), coding, where)
+                )
+                found[file].flags.writeable = False  # the compiled checks are compiled for such, once
                 size = found[file].shape[::-1]
             else:
                 png = parse_png(data, where)
@@ -114,20 +123,20 @@ def _check_instance(
             if not (instance[y0 : y1 + 1, x0 : x1 + 1, 0] == KINDS["Pedestrians"]).any():
                 findings.error("mask", where, "no pedestrian at target_bbox", "pixels of the person, who is visible")
         return
-    found = box.astype(np.float64) if counts[3] else np.full(4, np.nan)
+    found = box.astype(np.float64) if counts[1] else np.full(4, np.nan)
     if not np.array_equal(found, flight.mask_box[i], equal_nan=True):
-        got = "no pixel of the person" if not counts[3] else f"pixels in {found.tolist()}"
+        got = "no pixel of the person" if not counts[1] else f"pixels in {found.tolist()}"
         recorded = flight.mask_box[i]
         expected = (
             "none: target_mask_bbox is null" if np.isnan(recorded).any() else f"{recorded.tolist()}, target_mask_bbox"
         )
         findings.error("mask", where, got, expected)
-    if counts[4]:
-        findings.error("mask", where, f"{counts[4]} pixels of the person of another kind", f"kind {KINDS['Pedestrians']}")  # fmt: skip
+    if counts[2]:
+        findings.error("mask", where, f"{counts[2]} pixels of the person of another kind", f"kind {KINDS['Pedestrians']}")  # fmt: skip
     if kinds[MOST_KIND + 1 :].any():
         findings.error("mask", where, f"kind {int(np.flatnonzero(kinds)[-1])}", f"kinds of 0 to {MOST_KIND}")
-    if has_depth and counts[2]:
-        findings.error("sky", where, f"{counts[2]:,} pixels are sky in one of instance and depth", "the same sky in both")  # fmt: skip
+    if has_depth and counts[0]:
+        findings.error("sky", where, f"{counts[0]:,} pixels are sky in one of instance and depth", "the same sky in both")  # fmt: skip
 
 
 def _check_person_depth(

@@ -1,7 +1,7 @@
 """The pictures of a flight against each other: what stands still is carried from frame to frame through the poses (cosfly/reprojection.py).
 
 That is where exchanged pictures, poses and cameras come to light: each of them may be right alone. Thresholds lie between what honest
-flights of nine towns showed at worst and what the smallest exchange, that of two frames half a second apart, shows typically
+flights of six runs showed at worst and what the smallest exchange, that of two frames half a second apart, shows typically
 (docs/releases.md).
 """
 
@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.products.frames import FrameFile
 from cosfly.reprojection import Agreement, View, compare_views
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
 from release.verify.rows import FlightRows
+from release.verify.sources import Pictures
 
 LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share to mean something
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things
@@ -50,7 +50,7 @@ class _Pairs:
 
 
 def check_pictures(
-    flight: FlightRows, pictures: Iterator[dict[FrameFile, bytes | None]], coding: DepthCoding, findings: Findings
+    flight: FlightRows, pictures: Iterator[Pictures], coding: DepthCoding, findings: Findings
 ) -> list[tuple[int, int]]:
     """Check all pictures of a flight, one after the other; memory holds three frames.
 
@@ -79,11 +79,13 @@ def check_pictures(
     return keys
 
 
-def _keys(files: dict[FrameFile, bytes | None], decoded: object) -> tuple[int, int]:
+def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
     """Numbers that are the same for the same pictures: the checksum of a PNG's pixels, and one of the depth's samples."""
     colour, depth = files.get("rgb") or b"", files.get("depth") or b""
     # The last bytes before the IEND chunk (12): the stream's own checksum and that of its chunk (4 each).
-    return int.from_bytes(colour[-20:-12], "big"), zlib.crc32(depth[:: max(1, len(depth) // 8192)]) if decoded else 0
+    return int.from_bytes(colour[-20:-12], "big"), zlib.crc32(
+        bytes(depth[:: max(1, len(depth) // 8192)])
+    ) if decoded else 0
 
 
 def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: dict[int, int], findings: Findings) -> None:

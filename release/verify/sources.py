@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import pyarrow as pa
+
 from cosfly.errors import InputError
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Place, flight_ids
@@ -20,7 +22,7 @@ from cosfly.reading.tables import open_table, read_row_group
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed
 from release.verify.rows import FlightRows, Row
 
-Pictures = dict[FrameFile, bytes | None]
+Pictures = dict[FrameFile, bytes | memoryview | None]
 
 
 @dataclass(frozen=True)
@@ -130,9 +132,12 @@ def rows_of_table(table: Any, path: Path) -> list[Row]:
         raise InputError("not text", where=path, got=str(error)) from None
 
 
-def _bytes_at(column: Any, row: int) -> bytes | None:
-    value = column[row].as_py()
-    return value.get("bytes") if isinstance(value, dict) else value
+def _bytes_at(column: Any, row: int) -> memoryview | None:
+    """Give a picture where it lies in the table's memory."""
+    value = column[row]
+    if value.is_valid and pa.types.is_struct(value.type):
+        value = value["bytes"]
+    return memoryview(value.as_buffer()).cast("B") if value.is_valid else None
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------

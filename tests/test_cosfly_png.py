@@ -1,0 +1,91 @@
+"""The PNG reader against a library's, on pictures of every filter, packing and number of channels; and what damage does to it."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly.errors import InputError
+from cosfly.reading.png import parse_png
+
+KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
+
+
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def png_of(lines: np.ndarray, channels: int, level: int, strategy: int, piece: int) -> bytes:
+    """A PNG of filtered rows, (h, 1 + w * channels)."""
+    height, width = lines.shape[0], (lines.shape[1] - 1) // channels
+    packer = zlib.compressobj(level, strategy=strategy)
+    packed = packer.compress(lines.tobytes()) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, KIND_OF[channels], 0, 0, 0)
+    parts = (packed[k : k + piece] for k in range(0, len(packed), piece))
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + b"".join(chunk(b"IDAT", p) for p in parts) + chunk(b"IEND", b"")
+    )
+
+
+def content(rng: np.random.Generator, height: int, stride: int) -> np.ndarray:
+    """Rows of noise, of few values and of runs, with filters as they come."""
+    lines = rng.integers(0, int(rng.choice([2, 6, 40, 256])), (height, stride), dtype=np.uint8)
+    if rng.random() < 0.5:
+        lines = np.repeat(lines, 7, axis=1)[:, :stride]
+    lines[:, 0] = rng.integers(0, 5, height)
+    return lines
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 90), st.sampled_from([1, 3, 4]), st.integers(0, 9),
+    st.sampled_from([zlib.Z_DEFAULT_STRATEGY, zlib.Z_FILTERED, zlib.Z_HUFFMAN_ONLY, zlib.Z_RLE, zlib.Z_FIXED]),
+)  # fmt: skip
+def test_pixels_are_a_librarys(seed, height, width, channels, level, strategy):
+    rng = np.random.default_rng(seed)
+    data = png_of(content(rng, height, 1 + width * channels), channels, level, strategy, int(rng.integers(40, 9000)))
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).reshape(height, width, channels)
+    if channels > 1:
+        expected[..., :3] = expected[..., 2::-1].copy()
+    np.testing.assert_array_equal(parse_png(data, "x").pixels(), expected)
+    wanted = np.unique(rng.integers(0, height, 5))
+    np.testing.assert_array_equal(parse_png(memoryview(data), "x").rows(wanted), expected[wanted])
+
+
+def test_a_picture_of_grey_and_opacity_is_read():
+    lines = np.array([[1, 10, 20, 1, 2], [2, 1, 1, 1, 1]], np.uint8)
+    pixels = parse_png(png_of(lines, 2, 6, zlib.Z_DEFAULT_STRATEGY, 100), "x").pixels()
+    assert pixels.tolist() == [[[10, 20], [11, 22]], [[11, 21], [12, 23]]]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_a_changed_byte_is_found_or_changes_nothing(seed, is_mended):
+    """Also where the chunk's checksum is made right again."""
+    rng = np.random.default_rng(seed)
+    lines = content(rng, 30, 1 + 40 * 3)
+    data = bytearray(png_of(lines, 3, 6, zlib.Z_RLE, 1 << 20))
+    expected = parse_png(bytes(data), "x").pixels()
+    (length,) = struct.unpack_from(">I", data, 33)
+    data[41 + int(rng.integers(0, length))] ^= int(rng.integers(1, 256))
+    if is_mended:
+        struct.pack_into(">I", data, 41 + length, zlib.crc32(data[37 : 41 + length]))
+    try:
+        found = parse_png(bytes(data), "x").pixels()
+    except InputError:
+        return
+    assert is_mended
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("cut", [0, 7, 20, 33, 60, -1, -12, -20])
+def test_a_cut_picture_is_refused(cut):
+    data = png_of(content(np.random.default_rng(0), 20, 61), 3, 6, zlib.Z_RLE, 500)
+    with pytest.raises(InputError):
+        parse_png(data[:cut], "x")
