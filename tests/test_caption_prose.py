@@ -105,7 +105,7 @@ def test_the_third_set_passes_and_its_errors_are_caught():
         for one in read_gold_prose(THIRD_SET)
     )
     assert flagged <= 0.03
-    assert caught["all"] >= 0.62
+    assert caught["all"] >= 0.64
     assert caught["numbers"] >= 0.65
     assert caught["sides"] >= 0.7
 

@@ -111,8 +111,11 @@ def _has_subject(token: Token, clause: Clause, language: str, found: Statement) 
 
 
 def _is_of_frame(clause: Clause) -> bool:
-    """Tell whether a clause speaks of the current frame, of named ones, or of all."""
-    return all(t.value in ("now", "window", "mean", "since") or t.value[1:].isdigit() for t in clause.of("time"))
+    """Tell whether a clause speaks of the current frame, of named ones, of the first or last few, or of all."""
+    times = clause.of("time")
+    few = [t for t in times if t.value.startswith(("last:", "first:"))]
+    times = [t for t in times if not any(t.end > one.start - 7 and t.start < one.end for one in few)]  # "first three"
+    return all(t.value in ("now", "window", "mean", "since") or t.value[1:].isdigit() for t in times)
 
 
 def _is_side(found: Statement, token: Token, part: str, sentence: Sentence, clause: Clause) -> bool:

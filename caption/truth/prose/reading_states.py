@@ -102,7 +102,8 @@ class StateReader(ClauseWords):
         spans = [t for t in self.clause.of("time") if t.value.startswith(("last:", "first:"))]
         part = self.text[self.clause.start : self.clause.end]
         spans += [t for t in self.clause.of("time", "since") if times_of(self.clause)]
-        many = len({t.start for t in self.clause.of("visibility")}) > 1 and bool(times_of(self.clause))
+        is_one = {t.value for t in self.clause.of("visibility")} == {"hidden", "partly"}  # "partly", "hidden"
+        many = len({t.start for t in self.clause.of("visibility")}) > 1 and bool(times_of(self.clause)) and not is_one
         loose = many or (not spans and (counted or _UNSURE[self.language].search(part) is not None))
         self._add(token, kind="visibility", word=word, negated=negated, frames=None if loose else self._frames(token))
 
