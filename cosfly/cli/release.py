@@ -118,7 +118,7 @@ def release_stats(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
 ) -> None:
-    """Compute every table that the paper gives of its data again from the rows, and draw what is covered beside the plain run that ships."""
+    """Compute every table that the paper gives of its data again from the rows, and draw what is covered."""
     from release.stats import stats
 
     options.resolve(config, overrides)

@@ -12,10 +12,11 @@ from pydantic import BaseModel
 
 from cosfly.errors import InputError, RenderError
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from release.depth import MM_A_METRE
 from release.package.pictures import depth_values
 from release.record import DepthCoding, DepthCodingName
 
-MM_A_METRE, MOST_MM = 1000.0, 65534
+MOST_MM = 65534
 SKY_MM = 65535  # what 16 bits have left for the sky
 MOST_PNG_M = 65.5  # beyond, 16 bits of millimetres end
 

@@ -17,7 +17,6 @@ from release.verify.findings import Findings
 
 ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
 SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap checks
-MOST_FILES = 5_000_000
 
 
 def files_below(folder: Path) -> Iterator[str]:

@@ -22,7 +22,6 @@ from release.subsample import RULE, select_frames
 from release.verify.across import Summary
 from release.verify.findings import Findings
 
-MOST_LINES = 5  # of a card that differ
 Numbers = dict[str, Any]
 
 
