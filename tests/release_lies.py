@@ -546,6 +546,20 @@ def walk_renamed(rows):
             row["walk"] = "another/walk"
 
 
+def walk_of_nobody(rows):
+    walk = clean(rows)[0]["walk"]
+    for row in rows:
+        if row["walk"] == walk:
+            row["walk"] = walk[:-1] + ("0" if walk[-1] != "0" else "1")
+
+
+def clock_that_starts_late(rows):
+    trajectory = clean(rows)[0]["trajectory"]
+    for row in rows:
+        if row["trajectory"] == trajectory:
+            row["time_s"] += 10.0
+
+
 def pair_lost(rows):
     for row in clean(rows):
         row["pair"] = None
@@ -565,6 +579,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             number_wrong_in_both_languages, captions_of_two_windows_exchanged, texts_of_two_windows_exchanged,
             decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
             all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
+            walk_of_nobody, clock_that_starts_late,
             time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
         )),
         (True, (

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+from collections import Counter, defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from cosfly.products.boxes import MapHeader
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, read_captions, write_captions
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
+    RESULTS,
     FlightFunnel,
     FlightInspection,
     Funnel,
@@ -107,10 +109,12 @@ def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspect
         issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
         place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
         flights.append(FlightInspection(**place, result=result, issues=issues, metrics={}))
-    n = len({flight.trajectory for flight in flights})
-    trajectories = TrajectoryFunnel(
-        planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, accepted=n, review=0, rejected=0
-    )
+    results: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for flight in flights:
+        results[flight.town, flight.trajectory].add(flight.result)
+    n, worst = len(results), Counter(max(found, key=RESULTS.index) for found in results.values())
+    parts = {result: worst[result] for result in RESULTS}
+    trajectories = TrajectoryFunnel(planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, **parts)
     counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
     funnel = FlightFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
     return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)

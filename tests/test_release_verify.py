@@ -30,6 +30,7 @@ from cosfly.settings import RunConfig
 from release.package import stage as package
 from release.package.sources import Source
 from release.package.stage import ReleaseConfig
+from release.splits import split_groups
 from release.verify.findings import EXAMPLES, Findings
 from release.verify.verify import verify
 
@@ -125,7 +126,41 @@ RECORD_LIES = {
     "a run that is no source": lambda r: r["provenance"]["sources"][0].update(run="elsewhere"),
     "fewer frames available": lambda r: r["flights"][0].update(frames_available=r["flights"][0]["frames"]),
     "splits by town": lambda r: r["splits"].update(by="town"),
+    "another rule of splits": lambda r: r["splits"].update(rule="by taste"),
+    "another seed of splits": lambda r: r["splits"].update(seed=_seed_of_other_splits(r)),
+    "shares above one": lambda r: r["splits"]["fractions"].update(test=1.5),
+    "fewer asks than captions": lambda r: r["provenance"].update(asks=1),
+    "rules that take tokens": lambda r: r["provenance"]["tokens"].update(completion_tokens=1_000_000),
+    "captions of another tree": lambda r: _stage(r, "caption")["inputs"].update(data="0" * 64),
+    "an inspection of another tree": lambda r: _stage(r, "inspect")["inputs"].update(data="0" * 64),
+    "a flight rejected for nothing": lambda r: _one_less(r, "rejected"),
+    "a town of another map": lambda r: r["maps"][0].update(name="Delft"),
 }
+
+
+def _seed_of_other_splits(record: dict) -> int:
+    """The first seed under which the walks of the record stand in other splits."""
+    told = record["splits"]
+    walks = {flight["walk"]: flight["split"] for flight in record["flights"]}
+    return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
+
+
+def _stage(record: dict, name: str) -> dict:
+    return next(stage for stage in record["provenance"]["sources"][0]["stages"] if stage["stage"] == name)
+
+
+def _one_less(record: dict, reason: str) -> None:
+    """One flight more was found, and left out."""
+    flights = record["history"]["flights"]
+    flights["found"] += 1
+    flights["left_out"][reason] = 1
+
+
+def test_rejected_flights_without_a_rejected_trajectory_are_told(honest, tmp_path):
+    """A warning: flights that nobody planned count for no trajectory."""
+    forged = forge(honest, tmp_path / "forged", change_record=lambda r: _one_less(r, "rejected: jerk"))
+    report = verify(forged, level="structure")
+    assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "sum")]
 
 
 @pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])

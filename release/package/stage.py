@@ -48,16 +48,12 @@ from release.record import (
     Splits,
     content_digest,
 )
+from release.splits import SPLIT_RULE
 from release.subsample import RULE
 from release.verify.verify import verify
 
 MB = 1024 * 1024
 NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
-SPLIT_RULE = (
-    "whole walks (a walk: flights of one town, in any of its builds, whose person is at the same places at the same seconds), or whole towns; ranked "
-    "by sha256 of the seed and the name, the first to test, the next to validation, the rest to train, one at least for each split that has a share; "
-    "fewer than splits fill train, then validation"
-)
 
 
 class ReleaseConfig(Config):

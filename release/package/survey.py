@@ -12,14 +12,12 @@ from cosfly.console import progress_bar
 from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
 from cosfly.products.playback import Flight, read_flight
-from cosfly.splits import Course, Split, assign_splits, town_family, walks_of
+from cosfly.splits import Course, town_family, walks_of
 from release.columns import SplitName
 from release.package.sources import Candidate, Track
 from release.record import Pairs, SplitBy
+from release.splits import split_groups
 
-NAME_OF: dict[Split, SplitName] = {
-    "train": "train", "val": "validation", "test": "test",
-}  # fmt: skip
 MOST_NAMED = 3  # flights of each kind in a message
 
 
@@ -206,14 +204,13 @@ def place_flights(
     group_of = {
         f.name: walks[f.candidate.trajectory] if by == "walk" else town_family(f.candidate.place.town) for f in flights
     }
-    shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
-    splits = assign_splits(group_of.values(), shares, seed, too_few="fill", what=f"{by}s")
+    splits = split_groups(group_of.values(), fractions, seed, f"{by}s")
     by_track = {(f.candidate.trajectory, f.track): f.name for f in flights}
     other: dict[Track, Track] = {"clean": "perturbed", "perturbed": "clean"}
     return {
         f.name: Placing(
             walks[f.candidate.trajectory],
-            NAME_OF[splits[group_of[f.name]]],
+            splits[group_of[f.name]],
             by_track.get((f.candidate.trajectory, other[f.track])),
         )
         for f in flights

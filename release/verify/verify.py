@@ -25,7 +25,7 @@ from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
 from release.export.manifest import read_export
 from release.record import ReleaseRecord, read_record
-from release.verify import records
+from release.verify import by_rule, records
 from release.verify.across import Summary, check_across
 from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
@@ -85,6 +85,7 @@ def _verify_release(folder: Path, level: Level, workers: int, reader: CaptionRea
     small = [name for name in good if (folder / name).stat().st_size <= SMALL_BYTES and name in RECORDS]
     check_digests(folder, digests, small, findings)
     records.check_record(record, findings)
+    by_rule.check_rules(record, findings)
     readable = records.check_footers(folder, record, good, findings)
     records.check_card(folder, record, findings)
     shards = [shard.path for shard in record.shards]
@@ -118,6 +119,7 @@ def _verify_rows(
     _check_shard_splits(record, entries, flights, findings)
     try:
         records.check_numbers(folder, record, findings)
+        by_rule.check_clock(folder, record, findings)
     except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
         findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
 
