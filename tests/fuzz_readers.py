@@ -566,7 +566,7 @@ READERS: dict[str, Reader] = {
     "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
     "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
     "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
-    "evaluate": Reader(("predictions.jsonl", "train/val.jsonl", "train/train.jsonl"), _evaluated, hashes=True),
+    "evaluate": Reader(("predictions.jsonl", "train/val.parquet", "train/train.parquet"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),
     "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
