@@ -136,8 +136,10 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
         share, through = pair.agree / pair.seen, pair.through / pair.seen
         where = flight.where(i)
         if (gap <= NEAR_FRAMES and (share < least or through > THROUGH_MOST)) or pair.error > limit:
-            got = f"{share:.0%} of the points where the frame before has them, {through:.1%} before what is drawn, planes {pair.error:.2%} off"  # fmt: skip
-            findings.error("scene_depth", where, got, "depth, pose and camera that agree with the frame before")
+            off = f", planes {pair.error:.2%} off" if np.isfinite(pair.error) else ""
+            got = f"{share:.0%} of the points where the frame before has them, {through:.1%} before what is drawn{off}"
+            expected = f"at least {least:.0%}, at most {THROUGH_MOST:.1%} and planes {limit:.2%} off: depth, pose and camera that agree with the frame before"  # fmt: skip
+            findings.error("scene_depth", where, got, expected)
             continue
         if pair.agree < LEAST_AGREE:
             continue
