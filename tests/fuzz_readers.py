@@ -576,7 +576,7 @@ READERS: dict[str, Reader] = {
     "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
     "release record": _one("release/dataset/release.json", read_record),
     "release, verify": Reader(
-        ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", CHECKSUMS, "README.md"))),
+        ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", "croissant.json", CHECKSUMS, "README.md"))),
         lambda root, _: _verified(root), share=0.4, hashes=True),
     "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4, hashes=True),
     "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4, hashes=True),

@@ -84,7 +84,7 @@ def test_nothing_answered_is_asked_twice(place, tmp_path):
     out = tmp_path / "out"
     cfg = settings(endpoint={"stop_after_failures": 2})
     with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
-        with pytest.raises(TeacherError, match=r"2 samples in a row got no answer.*http_500.*same command"):
+        with pytest.raises(TeacherError, match=r"[2-9] samples in a row got no answer.*http_500.*same command"):
             infer_with(cfg, place, server.url, out)
         num_kept = len(kept_answers(out))
         assert num_kept >= 5 - ENDPOINT["concurrency"]

@@ -77,12 +77,12 @@ def test_every_file_that_is_documented_is_read_by_one_of_them_or_by_nobody():
 
 
 # The same format as one that is fuzzed, under another name.
-ALIKE = ["roi_polygon.json", "step2_simplified.json", "test.jsonl"]
+ALIKE = ["roi_polygon.json", "step2_simplified.json", "test.parquet"]
 # Written, and read by no command.
 FOR_PEOPLE = [
-    "bench.json", "caption_report.json", "compare_overlay.png", "compare_radar.png", "compare_series.png", "compare_strategies.json",
+    "bench.json", "caption_report.json", "comparison.json", "compare_overlay.png", "compare_radar.png", "compare_series.png", "compare_strategies.json",
     "contact_sheet.png", "instance_ids.json", "map.png", "paths.png", "pedestrians_report.json", "perturbation_report.json", "plan.png",
-    "report.json", "simplify.png", "simplify_report.json",
+    "preflight.json", "report.json", "simplify.png", "simplify_report.json",
 ]  # fmt: skip
 
 
