@@ -64,7 +64,7 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
             reasoning_trace=f"行人{chinese[1]}。",
             flight_decision=decision,
         ),
-        "label_from": "flight",
+        "label_from": "flight" if variant == "ORI" else "twin",
         "label": None if frame % 3 == 0 else decision,
         "verdict": "ABSTAIN" if frame % 3 == 0 else "CONSISTENT",  # as geometry cannot tell
         "status": "accepted",
