@@ -153,9 +153,10 @@ def read_scores(path: Path) -> Scores:
     """
     columns: dict[str, list[Any]] = {name: [] for name in _NAMES}
     for group in row_groups(path):
-        missing = [name for name in _NAMES if name not in group.column_names]
-        if missing:
-            raise InputError("not the scores of an evaluation", where=path, got=f"no column {missing[0]}")
+        wrong = [name for name in _NAMES if group.column_names.count(name) != 1]
+        if wrong:
+            got = f"{group.column_names.count(wrong[0])} columns {wrong[0]}"
+            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one")
         for name in _NAMES:
             columns[name] += group.column(name).to_pylist()
     try:
