@@ -160,9 +160,16 @@ def joined(device: Device) -> Iterator[Ranks]:
     if size == 1:
         yield Ranks(0, 1, name)
         return
-    torch.distributed.init_process_group("nccl" if name == "cuda" else "gloo", timeout=PATIENCE)
+    backend = "nccl" if name == "cuda" else "gloo"
+    torch.distributed.init_process_group(backend, timeout=PATIENCE)
     if rank:
         logging.getLogger("distill").setLevel(logging.WARNING)  # what all would say, the first says
-    yield Ranks(rank, size, name)
-    # After an error nobody waits for anybody: this process ends, its connections break, and the launcher ends the others.
-    torch.distributed.destroy_process_group()
+    ended_well = False
+    try:
+        yield Ranks(rank, size, name)
+        ended_well = True
+    finally:
+        # After an error nobody waits for anybody: NCCL would, so its connections break with the process. The threads of gloo have
+        # to be ended, or the interpreter's end sometimes turns the error into an abort.
+        if ended_well or backend == "gloo":
+            torch.distributed.destroy_process_group()
