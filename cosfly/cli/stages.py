@@ -149,12 +149,17 @@ def plan_compare(
     typer.echo(product)
 
 
-@app.command()
+render_app = typer.Typer(invoke_without_command=True, help="Step 5: frames of flights.")
+app.add_typer(render_app, name="render")
+
+
+@render_app.callback()
 def render(
-    map_: options.Map,
-    simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
-    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: Annotated[Path, typer.Option(help="Output folder, the playback tree.")],
+    context: typer.Context,
+    map_: Annotated[Path | None, typer.Option("--map", help="Boxes: boxes_3d.json. [required]")] = None,
+    simplified: Annotated[Path | None, typer.Option(help="Simplified map: step2_simplified.json. [required]")] = None,
+    traces: Annotated[Path | None, typer.Option(help="Flights: drone_trace.json. [required]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder, the playback tree. [required]")] = None,
     others: Annotated[
         Path | None, typer.Option(help="Who else moves: others.json, beside the walks' path.json.")
     ] = None,
@@ -167,14 +172,18 @@ def render(
     repair: options.Repair = False,
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
+    if context.invoked_subcommand is not None:
+        return
     from cosfly.render import stage
 
+    box_map, plain_map = _needed("--map", map_), _needed("--simplified", simplified)
+    flights, folder = _needed("--traces", traces), _needed("--out", out)
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(out, repair)
-    options.verify_first(verify, map_, simplified, traces, others, out)
+    options.set_aside(folder, repair)
+    options.verify_first(verify, box_map, plain_map, flights, others, folder)
     given = options.manner(cfg, resume) | {"seed": cfg.seed, "others": others}
-    product = stage.run(cfg.render, map_, simplified, traces, out, **given)
-    options.tell_product(product, out, cfg)
+    product = stage.run(cfg.render, box_map, plain_map, flights, folder, **given)
+    options.tell_product(product, folder, cfg)
 
 
 @app.command()
