@@ -120,7 +120,10 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
         hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
         return f"{field}: unknown setting{hint}"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
-    what = "not a group of settings" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
+    kind = detail["type"]
+    if kind in ("list_type", "tuple_type"):
+        return f"{field}: not a list, got {detail['input']!r}; write [{detail['input']}]"
+    what = "not a group of settings" if kind == "model_type" else detail["msg"].removeprefix("Value error, ")
     return f"{field}: {what}{got}"
 
 

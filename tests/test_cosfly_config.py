@@ -1,12 +1,17 @@
 """Settings: strict, all problems at once, the nearest name."""
 
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from pydantic import Field
+from pydantic import BaseModel, Field
+from typer.testing import CliRunner
 
+from cosfly.cli import app
 from cosfly.config import Config, apply_overrides, load, shipped
 from cosfly.errors import ConfigError
+from cosfly.settings import RunConfig
+from cosfly.settings_guide import as_page, explain, nested
 
 
 class Inner(Config):
@@ -101,3 +106,71 @@ def test_a_former_name_leads_to_the_present_one():
 def test_where_no_name_is_near_the_known_ones_are_listed():
     with pytest.raises(ConfigError, match=r"plan\.xyz: unknown setting \(there are altitude_m\)"):
         load(Outer, None, ["plan.xyz=3"])
+
+
+# --- the settings explained --------------------------------------------------------------------------------------------
+
+
+def test_every_setting_is_explained_once_with_its_value():
+    """The plain way to find them: walk the resolved settings."""
+    cfg = RunConfig()
+
+    def names(group: BaseModel, above: str) -> list[str]:
+        found = []
+        for name in type(group).model_fields:
+            value = getattr(group, name)
+            found += [above + name, *(names(value, f"{above}{name}.") if isinstance(value, BaseModel) else [])]
+        return found
+
+    explained = explain(cfg)
+    assert [setting.name for setting in explained] == names(cfg, "")
+    assert all(setting.meaning for setting in explained)
+    assert nested(explained) == cfg.model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("seed", "whole number"),
+        ("workers", "whole number >= 0"),
+        ("item_limit_s", "number >= 0, or null"),
+        ("roi", "path, or null"),
+        ("maps.source", "one of synthetic, simworld, cityjson"),
+        ("render.fovs_deg", "list of: number"),
+        ("plan.muco", ""),
+    ],
+)
+def test_what_a_setting_may_be_is_said_in_words(name, kind):
+    assert explain(RunConfig(), name)[0].kind == kind
+
+
+def test_a_section_that_is_not_there_has_a_neighbour():
+    with pytest.raises(ConfigError, match=r"did you mean 'plan\.muco'"):
+        explain(RunConfig(), "plan.mucco")
+
+
+def test_the_page_of_the_settings_is_up_to_date():
+    page = Path(__file__).parents[1] / "docs/settings.md"
+    assert page.read_text(encoding="utf-8") == as_page(explain(RunConfig())), (
+        "cosfly config show --describe --markdown > docs/settings.md"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("plan.muco",), "track_distance_m: 28.0"),
+        (("quickstart", "pedestrians"), "num_paths: "),
+        (("--describe", "render.fovs_deg"), "one is drawn for each walk"),
+    ],
+)
+def test_a_section_is_shown_alone(words, told):
+    result = CliRunner().invoke(app, ["config", "show", *words])
+    assert result.exit_code == 0
+    assert told in " ".join(result.output.split())
+    assert "caption" not in result.output
+
+
+def test_one_value_where_a_list_is_wanted_is_shown_as_one():
+    with pytest.raises(ConfigError, match=r"render\.fovs_deg: not a list, got 60; write \[60\]"):
+        load(RunConfig, None, ["render.fovs_deg=60"])

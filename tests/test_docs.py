@@ -108,7 +108,7 @@ def test_the_tree_of_the_architecture_is_the_disk():
         str(p.relative_to(ROOT))
         for folder in FOLDERS
         for p in (ROOT / folder).rglob("*")
-        if p.is_file() and p.name != "__init__.py" and p.suffix != ".pyc"
+        if p.is_file() and p.name not in ("__init__.py", "py.typed") and p.suffix != ".pyc"
     }
     shown = {name: {p for p in disk if fnmatch(p, name) and p.count("/") == name.count("/")} for name in drawn}
     assert [name for name, files in shown.items() if not files] == []

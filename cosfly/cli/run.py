@@ -82,15 +82,51 @@ def config_check(
 @config_app.command("show")
 def config_show(
     config: Annotated[
-        Path | None, typer.Argument(help="YAML file, or the name of one that ships; none: the defaults.")
+        str | None,
+        typer.Argument(help="YAML file, or the name of one that ships; none: the defaults. Or a section."),
     ] = None,
+    section: Annotated[str | None, typer.Argument(help="Only this section or setting, for instance plan.muco.")] = None,
     overrides: options.Overrides = None,
+    describe: Annotated[bool, typer.Option("--describe", help="Say what each setting means and may be.")] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="With --describe: as the page docs/settings.md.")
+    ] = False,
 ) -> None:
-    """Print the resolved configuration: every setting with its value."""
+    """Print the resolved configuration: every setting with its value, and with --describe what it means."""
     import yaml
 
-    cfg = options.resolve(config, overrides)
-    typer.echo(yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True), nl=False)
+    from cosfly import settings_guide
+    from cosfly.console import answer_console
+
+    if section is None and config is not None and _is_section(config):
+        config, section = None, config
+    cfg = options.resolve(None if config is None else Path(config), overrides)
+    explained = settings_guide.explain(cfg, section)
+    if markdown:
+        typer.echo(settings_guide.as_page(explained), nl=False)
+    elif describe:
+        for line in settings_guide.as_lines(explained):
+            answer_console.print(line)
+    else:
+        values = settings_guide.nested(explained)
+        typer.echo(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), nl=False)
+
+
+def _is_section(word: str) -> bool:
+    """Tell whether a word is no file and no configuration that ships."""
+    from cosfly.config import shipped
+
+    path = Path(word)
+    return not path.exists() and path.suffix not in (".yaml", ".yml") and not shipped(f"{path.name}.yaml").exists()
+
+
+@config_app.command("schema")
+def config_schema() -> None:
+    """Print the JSON schema of a configuration file, for editors that complete and check one."""
+    from cosfly.settings import RunConfig
+    from cosfly.store import dump_json
+
+    typer.echo(dump_json(RunConfig.model_json_schema(), indent=1))
 
 
 @app.command()

@@ -67,7 +67,9 @@ class MucoConfig(Config):
     """Settings of the MuCO optimiser (subsec:appendix_planner_muco)."""
 
     formerly: ClassVar = {"gradient": "it goes with the step: muco.step=paper takes differences, newton does not"}
-    track_distance_m: float = Field(28.0, gt=0, description="wanted distance to the target, m")
+    track_distance_m: float = Field(
+        28.0, gt=0, description="wanted slant distance to the target (through the air, not over ground), m"
+    )
     weight_tracking: float = Field(2.0, ge=0, description="weight of (distance - track_distance_m)^2")
     weight_smoothness: float = Field(4.0, ge=0, description="weight of the squared second difference")
     weight_jerk: float = Field(3.0, ge=0, description="weight of the squared third difference")

@@ -57,7 +57,7 @@ class RenderConfig(Config):
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
-        description="horizontal fields of view, degrees; each flight draws one and keeps it, a single value fixes it",
+        description="horizontal fields of view, degrees; one is drawn for each walk, and both its tracks keep it; a list of one fixes it",
     )
     town: str | None = Field(
         None,
