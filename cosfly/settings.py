@@ -25,6 +25,7 @@ from distill.evaluation.compare import CompareConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
+from distill.prepare.dual_track import DualTrackConfig
 from distill.prepare.samples import PrepareConfig
 from distill.training.settings import TrainConfig
 from release.package.stage import ReleaseConfig
@@ -36,6 +37,7 @@ class DistillConfig(Config):
     """Settings of the student's four steps."""
 
     prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
+    dual_track: DualTrackConfig = Field(default_factory=DualTrackConfig, description="windows over both tracks")
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
     merge: MergeConfig = Field(default_factory=MergeConfig, description="an adapter into its base's weights")

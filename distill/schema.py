@@ -222,31 +222,18 @@ def open_split(dataset: Path, split: Split) -> Samples:
     return Samples(dataset, split)
 
 
-@contextlib.contextmanager
-def write_training_set(out: Path) -> Iterator[TrainingSetWriter]:
-    """Write the splits of a training set; their files appear when the block ends without an error."""
-    with contextlib.ExitStack() as stack:
-        writer = TrainingSetWriter(out, stack)
-        yield writer
-        writer.flush()
+class SplitFiles:
+    """Rows to one parquet file a split, one by one; of each split at most a row group waits in memory. paths: what was written."""
 
-
-class TrainingSetWriter:
-    """Takes the samples one by one; of each split at most a row group waits in memory. files: what was written."""
-
-    def __init__(self, out: Path, stack: contextlib.ExitStack) -> None:
-        self._out, self._stack = out, stack
-        self.files: list[Path] = []
-        self.samples: dict[Split, int] = dict.fromkeys(SPLITS, 0)
-        self._systems: dict[str, int] = {}
+    def __init__(self, out: Path, columns: pa.Schema, stack: contextlib.ExitStack) -> None:
+        self._out, self._columns, self._stack = out, columns, stack
+        self.paths: list[Path] = []
+        self.counts: dict[Split, int] = dict.fromkeys(SPLITS, 0)
         self._rows: dict[Split, list[dict[str, Any]]] = {}
         self._writers: dict[Split, pq.ParquetWriter] = {}
 
-    def add(self, split: Split, sample: Sample) -> None:
-        row = sample.model_dump(mode="json")
-        row["system"] = self._systems.setdefault(sample.prompt.system, len(self._systems))
-        row["prompt"] = sample.prompt.user
-        self.samples[split] += 1
+    def add(self, split: Split, row: dict[str, Any]) -> None:
+        self.counts[split] += 1
         waiting = self._rows.setdefault(split, [])
         waiting.append(row)
         if len(waiting) == ROWS_AT_ONCE:
@@ -261,30 +248,69 @@ class TrainingSetWriter:
         if split not in self._writers:
             path = split_path(self._out, split)
             file = self._stack.enter_context(atomic_file(path))
-            self._writers[split] = self._stack.enter_context(pq.ParquetWriter(file, COLUMNS, compression="zstd"))
-            self.files.append(path)
-        self._writers[split].write_table(pa.Table.from_pylist(self._rows[split], schema=COLUMNS))
+            self._writers[split] = self._stack.enter_context(pq.ParquetWriter(file, self._columns, compression="zstd"))
+            self.paths.append(path)
+        self._writers[split].write_table(pa.Table.from_pylist(self._rows[split], schema=self._columns))
         self._rows[split] = []
+
+
+@contextlib.contextmanager
+def write_splits(out: Path, columns: pa.Schema) -> Iterator[SplitFiles]:
+    """Write rows by split; the files appear when the block ends without an error."""
+    with contextlib.ExitStack() as stack:
+        files = SplitFiles(out, columns, stack)
+        yield files
+        files.flush()
+
+
+@contextlib.contextmanager
+def write_training_set(out: Path) -> Iterator[TrainingSetWriter]:
+    """Write the splits of a training set; their files appear when the block ends without an error."""
+    with write_splits(out, COLUMNS) as splits:
+        yield TrainingSetWriter(out, splits)
+
+
+class TrainingSetWriter:
+    """Takes the samples one by one. files: what was written."""
+
+    def __init__(self, out: Path, splits: SplitFiles) -> None:
+        self._out, self._splits = out, splits
+        self.files: list[Path] = []
+        self._systems: dict[str, int] = {}
+
+    def add(self, split: Split, sample: Sample) -> None:
+        row = sample.model_dump(mode="json")
+        row["system"] = self._systems.setdefault(sample.prompt.system, len(self._systems))
+        row["prompt"] = sample.prompt.user
+        self._splits.add(split, row)
 
     def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
         """Write the record and the page, after the block ended and the splits stand."""
-        record = TrainingSet(split_by=split_by, trees=list(trees), samples=self.samples, systems=list(self._systems))
+        samples = self._splits.counts
+        record = TrainingSet(split_by=split_by, trees=list(trees), samples=samples, systems=list(self._systems))
         write_model(self._out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
-        write_bytes(self._out / PAGE, _page(record).encode())
-        self.files += [self._out / RECORD, self._out / PAGE]
+        write_bytes(self._out / PAGE, _page(record))
+        self.files = [*self._splits.paths, self._out / RECORD, self._out / PAGE]
         return record
 
 
 _SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}  # as `datasets` calls them
 
 
-def _page(record: TrainingSet) -> str:
-    found = [split for split in SPLITS if record.samples[split]]
+def page_of(title: str, samples: Mapping[Split, int], text: str) -> bytes:
+    """Give the README.md of a folder of splits, whose header lets `datasets.load_dataset` open it."""
+    found = [split for split in SPLITS if samples[split]]
     files = "".join(f"  - split: {_SPLIT_NAMES[split]}\n    path: {split}.parquet\n" for split in found)
-    counts = "".join(f"- {_SPLIT_NAMES[split]}: {record.samples[split]} samples\n" for split in found)
-    return (
-        f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n# Training set\n\n{counts}\n"
+    counts = "".join(f"- {_SPLIT_NAMES[split]}: {samples[split]} samples\n" for split in found)
+    header = f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n"
+    return f"{header}# {title}\n\n{counts}\n{text}".encode()
+
+
+def _page(record: TrainingSet) -> bytes:
+    return page_of(
+        "Training set",
+        record.samples,
         f"No two splits share a {record.split_by}. `system` is the place of a sample's system prompt in `systems` of `{RECORD}`,\n"
         f"`prompt` its question, `answer` what it should say; its pictures are frames `window` of the playback trees of\n"
-        f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n"
+        f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n",
     )

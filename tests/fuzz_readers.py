@@ -77,6 +77,7 @@ from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
 from distill.evaluation.scores import read_scores
 from distill.inference.outcome import make_prediction
+from distill.prepare import dual_track
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
@@ -84,6 +85,8 @@ from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
 from distill.student.taught import taught_by
+from distill.tracks import RECORD as TRACKS
+from distill.tracks import read_track_samples
 from release.export import stage as export
 from release.export.contract import ExportConfig
 from release.export.manifest import read_export
@@ -252,8 +255,13 @@ def _prepare(captions: Path, tree: Path, out: Path) -> Path:
     return prepare.run(PrepareConfig(unbound="accept"), [Prepared.of_files(tree, captions)], out)
 
 
+def _windows(tree: Path, out: Path) -> Path:
+    return dual_track.run(dual_track.DualTrackConfig(too_few="fill"), [tree], out)
+
+
 def _students(root: Path, captions: Path, tree: Path) -> None:
     _prepare(captions, tree, root / "train")
+    _windows(tree, root / "tracks")
     samples = list(open_split(root / "train", "val"))
     lines = [make_prediction(sample, "val", sample.answer, 20, True).model_dump_json() for sample in samples]
     (root / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -565,6 +573,7 @@ READERS: dict[str, Reader] = {
     "evaluation's scores": _one("evaluation/scores.parquet", read_scores),
     "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
     "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
+    "track_samples": Reader((f"tracks/{TRACKS}", "tracks/train.parquet"), lambda root, _: list(read_track_samples(root / "tracks", "train")), hashes=True),
     "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
     "evaluate": Reader(("predictions.jsonl", "train/val.parquet", "train/train.parquet"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),

@@ -59,6 +59,28 @@ def distill_prepare(
     typer.echo(prepare.run(cfg.distill.prepare, sources, out, seed=cfg.seed, resume=resume))
 
 
+@app.command("dual-track")
+def distill_dual_track(
+    out: options.Out,
+    runs: Annotated[list[Path] | None, typer.Argument(help="Run folders, as `cosfly run` makes them.")] = None,
+    data: options.Trees = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    verify: options.Verify = False,
+    resume: options.Resume = "if-same",
+) -> None:
+    """Windows over clean and perturbed flights, to learn denoising and prediction from, by split."""
+    from distill.prepare import dual_track
+
+    trees = [folder / "render" for folder in runs or []]
+    if data or not trees:
+        trees += options.data_folders(data)
+    cfg = options.resolve(config, overrides, {"seed": seed})
+    options.verify_first(verify, *trees, out)
+    options.tell_product(dual_track.run(cfg.distill.dual_track, trees, out, seed=cfg.seed, resume=resume), out, cfg)
+
+
 @app.command("train")
 def distill_train(
     dataset: DatasetOption,

@@ -41,6 +41,8 @@ from cosfly.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
+# A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of 0.6 (tab:augmentation_states).
+STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
 # What the record of a flight's presets may be called: the paper names it, no public file shows it.
 WEATHER_KEYS = {
@@ -165,9 +167,29 @@ class Flight:
         told = object_of(points[index], "perturbation") if index < len(points) else {}
         return {event: told[event] for event in EVENTS} if all(isinstance(told.get(e), str) for e in EVENTS) else None
 
+    @cached_property
+    def states(self) -> list[str | None]:
+        """Which of STATES each frame is in, after fallbacks; None where the file does not say."""
+        raw = [object_of(point, "perturbation") for point in self.raw.get("points", [])] or [{}] * len(self)
+        names, found = tuple(STATES), []
+        for i, told in enumerate(raw):
+            shifted = _was_moved((self.drone_offsets_m[i], self.target_offsets_m[i]), told.get("drone_position"))
+            turned = _was_moved((self.rotation_offsets_deg[i],), told.get("drone_rotation"))
+            found.append(None if shifted is None or turned is None else names[shifted + 2 * turned])
+        return found
+
     def missing_frames(self, names: tuple[str, ...] = FRAME_FILES) -> list[int]:
         """Indices of the points that lack one of the files."""
         return [i for i in range(len(self)) if not all((self.frame_folder(i) / name).is_file() for name in names)]
+
+
+def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
+    """Tell whether any offset is not zero; where they are not known, what the file says of the first; None where it says nothing."""
+    if any((offset != 0).any() and not np.isnan(offset).any() for offset in offsets):
+        return True
+    if any(np.isnan(offset).any() for offset in offsets):
+        return told if isinstance(told, bool) else None
+    return False
 
 
 def sample_id(flight_id: str, frame_index: int) -> str:

@@ -4,16 +4,36 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Mapping
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from cosfly.errors import VerifyError
 from cosfly.splits import town_family
-from distill.schema import Sample
 
 
-def check_no_leak(splits: Mapping[str, Iterable[Sample]], split_by: Literal["walk", "town"] = "walk") -> dict[str, int]:
+class Placed(Protocol):
+    """Of any kind of sample, what says whose it is; `window` are the frames of its pictures."""
+
+    @property
+    def key(self) -> str: ...
+    @property
+    def run(self) -> str: ...
+    @property
+    def town(self) -> str: ...
+    @property
+    def trajectory(self) -> str: ...
+    @property
+    def variant(self) -> str: ...
+    @property
+    def walk(self) -> str: ...
+    @property
+    def window(self) -> tuple[int, ...]: ...
+    @property
+    def language(self) -> str: ...
+
+
+def check_no_leak(splits: Mapping[str, Iterable[Placed]], split_by: Literal["walk", "town"] = "walk") -> dict[str, int]:
     """Check that no walk, trajectory, flight or (if asked) town stands in two splits, no trajectory in two walks, and no sample twice.
 
     A sample's pictures are frames of its own flight, so that splits share no picture either. Holds eight bytes a sample.

@@ -6,18 +6,17 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, parse_answer
-from cosfly.splits import SPLITS, Split
 from cosfly.store import dump_json
+from distill.prepare.splitting import SplitConfig
 from distill.schema import Sample
 
 Rung = Literal["hint", "multi_sample", "anchored", "fix_label"]
 
 
-class PrepareConfig(Config):
+class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
     languages: tuple[Language, ...] = Field(
@@ -28,16 +27,6 @@ class PrepareConfig(Config):
     )
     text_state: bool = Field(
         True, description="the prompt holds what was measured on the frames, and the mission; false: pictures alone"
-    )
-    split_by: Literal["walk", "town"] = Field(
-        "walk",
-        description="what may not be shared by two splits: all flights after one person on one way, or all builds of a town",
-    )
-    val_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
-    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
-    too_few: Literal["refuse", "fill"] = Field(
-        "refuse",
-        description="with fewer walks (towns) than splits: refuse, or fill train, then val, and leave the rest empty",
     )
     unbound: Literal["refuse", "accept"] = Field(
         "refuse",
@@ -82,19 +71,12 @@ class PrepareConfig(Config):
     )
 
     @model_validator(mode="after")
-    def _fractions_leave_something(self) -> PrepareConfig:
-        if self.val_fraction + self.test_fraction >= 1.0:
-            raise ValueError("val_fraction + test_fraction must stay below 1, or nothing is left to train on")
+    def _there_is_something_to_learn(self) -> PrepareConfig:
         if not self.modalities and not self.text_state:
             raise ValueError("without pictures and text_state there is nothing to answer from")
         if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
             raise ValueError("languages and modalities may name each entry once")
         return self
-
-    @property
-    def fractions(self) -> dict[Split, float]:
-        shares: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
-        return {split: shares[split] for split in SPLITS if shares.get(split)}
 
 
 def make_sample(

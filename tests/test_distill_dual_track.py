@@ -1,0 +1,196 @@
+"""distill/prepare/dual_track.py, distill/tracks.py: windows over both tracks of a flight."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import InputError, NothingKept
+from cosfly.products.playback import STATES, read_flight, write_flight
+from cosfly.splits import SPLITS
+from cosfly.stage_folder import read_failures, read_manifest
+from distill.prepare import dual_track
+from distill.prepare.dual_track import DualTrackConfig, windows_of
+from distill.tracks import TrackSample, read_track_samples, read_track_set
+from specimens import make_flight, make_playback_tree
+
+NUM_POINTS = 24
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("run") / "render"
+    return make_playback_tree(root, num_flights=4, num_points=NUM_POINTS, towns=("Town01", "Town03"), with_images=False)
+
+
+@pytest.fixture(scope="module")
+def dataset(tree, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("windows") / "set"
+    return dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [tree], out)
+
+
+@pytest.fixture
+def own_tree(tree, tmp_path) -> Path:
+    return Path(shutil.copytree(tree, tmp_path / "run" / "render"))
+
+
+def samples(dataset: Path) -> dict[str, list[TrackSample]]:
+    return {split: list(read_track_samples(dataset, split)) for split in SPLITS}
+
+
+def run(tree: Path, out: Path, **settings: object) -> Path:
+    return dual_track.run(DualTrackConfig.model_validate({"too_few": "fill", **settings}), [tree], out)
+
+
+# --- how many windows -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
+)
+def test_the_papers_windows(num_frames, expected):
+    """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
+    found = list(windows_of(num_frames, DualTrackConfig()))
+    assert (len(found) if isinstance(expected, int) else found) == expected
+
+
+@given(st.integers(0, 300), st.integers(1, 12), st.integers(0, 12), st.integers(1, 9))
+def test_windows_are_those_that_fit(num_frames, observed, predicted, stride):
+    cfg = DualTrackConfig(observed=observed, predicted=predicted, stride=stride)
+    slow = [i for i in range(num_frames) if i % stride == 0 and i + observed + predicted <= num_frames]
+    assert list(windows_of(num_frames, cfg)) == slow
+
+
+# --- what stands in them ----------------------------------------------------------------------------------------------
+
+
+def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
+    found = [sample for split in samples(dataset).values() for sample in split]
+    assert len(found) == 4 * ((NUM_POINTS - 10) // 3 + 1)
+    for sample in found:
+        folder = tree / sample.town / sample.trajectory
+        noisy, clean = read_flight(folder / sample.variant), read_flight(folder / "ORI")
+        assert sample.variant == "aug_001"
+        first = sample.window[0]
+        assert sample.window == tuple(range(first, first + 5))
+        assert sample.future == tuple(range(first + 5, first + 10))
+        assert sample.sample_id == f"{sample.trajectory}_aug_001_frame_{first + 4:05d}"
+        seen, after = list(sample.window), list(sample.future)
+        np.testing.assert_array_equal(sample.time_s, clean.time_s[seen + after])
+        np.testing.assert_array_equal(sample.observed_position_m, noisy.positions_m[seen])
+        np.testing.assert_array_equal(sample.observed_rotation_deg, noisy.rotations_deg[seen])
+        np.testing.assert_array_equal(sample.clean_position_m, clean.positions_m[seen])
+        np.testing.assert_array_equal(sample.future_position_m, clean.positions_m[after])
+        np.testing.assert_array_equal(sample.future_target_m, clean.targets_m[after])
+        # What was added is what the flight's record says was added.
+        np.testing.assert_allclose(
+            np.subtract(sample.observed_position_m, sample.clean_position_m), noisy.drone_offsets_m[seen], atol=1e-9
+        )
+
+
+def test_no_walk_is_in_two_splits(dataset):
+    walks = [{sample.walk for sample in found} for found in samples(dataset).values()]
+    assert all(walks)
+    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
+    assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}
+
+
+def test_datasets_opens_it(dataset, tmp_path):
+    datasets = pytest.importorskip("datasets")
+    opened = datasets.load_dataset(str(dataset), cache_dir=str(tmp_path))
+    own = samples(dataset)
+    assert {name: len(rows) for name, rows in opened.items()} == {
+        "train": len(own["train"]), "validation": len(own["val"]), "test": len(own["test"]),
+    }  # fmt: skip
+    assert opened["train"][0]["observed_position_m"] == [list(row) for row in own["train"][0].observed_position_m]
+
+
+def test_the_same_again_and_other_settings(tree, dataset, tmp_path):
+    again = dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [tree], tmp_path / "again")
+    assert (again / "train.parquet").read_bytes() == (dataset / "train.parquet").read_bytes()
+    short = run(tree, tmp_path / "short", observed=3, predicted=0, stride=1)
+    one = next(read_track_samples(short, "train"))
+    assert (len(one.observed_position_m), one.future, one.future_position_m) == (3, (), ())
+
+
+# --- states -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_four_states_of_a_flight():
+    flight, _ = make_flight(4, variant="aug_001")
+    flight.drone_offsets_m[:] = [[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]]
+    flight.rotation_offsets_deg[:] = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 1, 0]]
+    assert flight.states == list(STATES) == ["unperturbed", "position only", "rotation only", "full"]
+
+
+def test_states_of_a_public_flight_are_what_it_tells(tmp_path):
+    """Public files say that there was a perturbation, not which."""
+    flight, _ = make_flight(4, variant="aug_001", trajectory="trajectory_1")
+    folder = tmp_path / "Town01/trajectory_1/aug_001"
+    folder.mkdir(parents=True)
+    write_flight(folder, flight)
+    raw = json.loads((folder / "trajectory.json").read_text())
+    told = [{"drone_position": True, "drone_rotation": False}, {"drone_position": False, "drone_rotation": True},
+            {"drone_position": True, "drone_rotation": True}, {}]  # fmt: skip
+    for point, events in zip(raw["points"], told, strict=True):
+        point["perturbation"] = events
+    (folder / "trajectory.json").write_text(json.dumps(raw))
+    assert read_flight(folder, strict=False).states == ["position only", "rotation only", "full", None]
+
+
+# --- what cannot be used ----------------------------------------------------------------------------------------------
+
+
+def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
+    flights = sorted(own_tree.glob("*/*/aug_001"))
+    (flights[0] / "trajectory.json").write_text("{")
+    shutil.rmtree(flights[1].parent / "ORI")
+    raw = json.loads((flights[2] / "trajectory.json").read_text())
+    raw["points"] = raw["points"][:20]
+    raw["points"][-1]["nav_waypoint"]["t1_world"] = None
+    (flights[2] / "trajectory.json").write_text(json.dumps(raw))
+    out = run(own_tree, tmp_path / "set")
+    counts = read_manifest(out).counts
+    assert (counts.input, counts.kept) == (4, 1)
+    assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}
+    assert counts.failed.total() == 1
+    assert flights[0].parent.name in read_failures(out / "failures.jsonl")[0].id
+
+
+def test_windows_over_a_gap_are_left_out(own_tree, tmp_path):
+    for folder in sorted(own_tree.glob("*/*"))[0].iterdir():
+        raw = json.loads((folder / "trajectory.json").read_text())
+        for point in raw["points"][12:]:
+            point["timing"]["trace_timestamp"] += 5.0
+        (folder / "trajectory.json").write_text(json.dumps(raw))
+    out = run(own_tree, tmp_path / "set")
+    # Of the begins 0, 3, 6, 9, 12 those of 3, 6, 9 reach over the step from frame 11 to frame 12.
+    assert read_manifest(out).facts["windows_left_out"] == {"uneven_steps": 3}
+    assert sum(read_track_set(out).samples.values()) == 4 * 5 - 3
+
+
+def test_flights_too_short_give_one_error(tmp_path):
+    tree = make_playback_tree(tmp_path / "run/render", num_flights=1, num_points=9, with_images=False)
+    with pytest.raises(NothingKept, match=r"shorter_than_a_window 1.*a perturbed flight of 10 frames"):
+        run(tree, tmp_path / "set")
+
+
+def test_too_few_walks_to_split_is_an_error_unless_told(tree, tmp_path):
+    with pytest.raises(InputError, match=r"too few towns with both tracks.*dual_track\.too_few=fill"):
+        dual_track.run(DualTrackConfig(val_fraction=0.3, test_fraction=0.3, split_by="town"), [tree], tmp_path / "set")
+
+
+def test_the_command(tree, tmp_path):
+    result = CliRunner().invoke(
+        app, ["distill", "dual-track", "--data", str(tree), "--out", str(tmp_path / "set"), "--set", "distill.dual_track.stride=5"]
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert read_track_set(tmp_path / "set").stride == 5
