@@ -50,6 +50,7 @@ from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
 from cosfly.planners.compare_tables import text_tables
+from cosfly.png.read import parse_png
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
@@ -64,7 +65,6 @@ from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
-from cosfly.reading.png import parse_png
 from cosfly.render import older_trees
 from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify

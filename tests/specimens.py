@@ -273,9 +273,9 @@ def paint(scene: Scene, flight: Flight, i: int) -> tuple[np.ndarray, np.ndarray,
 def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
     rgb, depth, semantic, instance = paint(scene, flight, i)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "rgb.png").write_bytes(rgb_bytes(rgb, 1))
+    (folder / "rgb.png").write_bytes(rgb_bytes(rgb))
     (folder / "depth.npy").write_bytes(depth_bytes(depth))
-    (folder / "instance.png").write_bytes(instance_bytes(semantic, instance, 1))
+    (folder / "instance.png").write_bytes(instance_bytes(semantic, instance))
     (folder / "meta.json").write_bytes(_meta(flight, i, int((instance == PERSON_ID).sum())).to_bytes())
 
 

@@ -1,7 +1,8 @@
-"""The PNG reader against a library's, on pictures of every filter, packing and number of channels; and what damage does to it."""
+"""The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels; and what damage does."""
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.reading.png import parse_png
+from cosfly.png.deflate import deflate
+from cosfly.png.read import parse_png
+from cosfly.png.write import areas_png, colours_png
 
 KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
 
@@ -89,3 +93,63 @@ def test_a_cut_picture_is_refused(cut):
     data = png_of(content(np.random.default_rng(0), 20, 61), 3, 6, zlib.Z_RLE, 500)
     with pytest.raises(InputError):
         parse_png(data[:cut], "x")
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def drawn(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Areas of one colour, some with texture, some of one row repeated."""
+    picture = np.repeat(rng.integers(0, 256, (height, 1 + width // 9, 3), dtype=np.uint8), 9, axis=1)[:, :width]
+    if rng.random() < 0.7:
+        picture[height // 3 :] = picture[height // 3]
+    if rng.random() < 0.7:
+        noise = rng.normal(0.0, float(rng.choice([0.5, 3.0, 60.0])), (height - height // 2, width, 3))
+        picture[height // 2 :] = np.clip(picture[height // 2 :] + noise, 0, 255).astype(np.uint8)
+    return picture
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 50), st.integers(1, 300))
+def test_what_is_written_is_read_by_libraries(seed, height, width):
+    rng = np.random.default_rng(seed)
+    picture = drawn(rng, height, width)
+    alone = np.unique(rng.integers(0, height, 4))
+    for data in (colours_png(picture, alone), areas_png(*np.moveaxis(picture, 2, 0))):
+        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), picture)
+        np.testing.assert_array_equal(parse_png(data, "x").pixels(), picture)
+        np.testing.assert_array_equal(parse_png(data, "x").rows(alone), picture[alone])
+
+
+def test_rows_that_stand_alone_lean_on_no_other():
+    alone = np.array([3, 11])
+    filters = parse_png(colours_png(drawn(np.random.default_rng(1), 20, 30), alone), "x").lines[:, 0]
+    assert filters[alone].tolist() == [1, 1]
+    assert (np.delete(filters, alone) == 3).all()
+
+
+@pytest.mark.parametrize("stride", [7, 32767, 32768, 40000])
+def test_a_row_above_beyond_the_window_is_not_looked_for(stride):
+    row = np.random.default_rng(stride).integers(0, 256, stride, dtype=np.uint8)
+    lines = np.ascontiguousarray(np.broadcast_to(row, (4, stride)))
+    packed = deflate(lines, 3, stride)
+    assert zlib.decompress(packed) == lines.tobytes()
+    assert (len(packed) < 2 * stride) == (7 < stride < 32768)
+
+
+def test_codes_that_would_be_too_long_are_shortened():
+    """Bytes as frequent as Fibonacci's numbers have codes one bit longer each."""
+    counts = [1, 1]
+    while len(counts) < 24:
+        counts.append(counts[-1] + counts[-2])
+    values = np.repeat(np.arange(24, dtype=np.uint8) * 7, counts)
+    lines = np.random.default_rng(2).permutation(values)[None]
+    assert zlib.decompress(deflate(lines, 3, 0)) == lines.tobytes()
+
+
+def test_noise_that_cannot_be_packed_fits():
+    lines = np.random.default_rng(3).integers(0, 256, (50, 4001), dtype=np.uint8)
+    packed = deflate(lines, 3, 4001)
+    assert zlib.decompress(packed) == lines.tobytes()
+    assert len(packed) < 1.01 * lines.size

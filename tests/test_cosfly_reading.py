@@ -350,7 +350,7 @@ def _png(width: int, height: int) -> bytes:
 
 
 def test_a_picture_is_measured_before_it_is_decoded(limited, monkeypatch):
-    picture = rgb_bytes(np.zeros((40, 60, 3), np.uint8), 1)
+    picture = rgb_bytes(np.zeros((40, 60, 3), np.uint8))
     assert arrays.png_size(picture) == (60, 40)
     assert arrays.parse_picture(picture, "x").shape == (40, 60, 3)
     monkeypatch.setattr(cv2, "imdecode", None)

@@ -656,7 +656,7 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     cfg = RenderConfig(**size, first_timestamp=1_776_000_000)
     script = script_flight(trace, 0, "perturbed", "T", around, cfg, 1)
     curtain = Curtain(x_m=float(trace.targets_m[30, 0]))
-    flight = render_flight(curtain, script, tmp_path, Writing(("rgb",), 0, 0.1))
+    flight = render_flight(curtain, script, tmp_path, Writing(("rgb",), 0.1))
     is_seen = trace.targets_m[:, 0] <= curtain.x_m
     np.testing.assert_array_equal(flight.target_visible | ~is_seen, True)
     states = [point["perturbation"] for point in flight.raw["points"]]

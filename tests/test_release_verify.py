@@ -306,9 +306,7 @@ def _zero_focal(rows):
 
 
 def _palette(rows):
-    rows[1]["instance"]["bytes"] = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16), 9)[
-        :-30
-    ]
+    rows[1]["instance"]["bytes"] = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))[:-30]
 
 
 def _flat_depth(rows):

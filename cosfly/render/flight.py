@@ -69,7 +69,6 @@ class Writing:
     """How frames are written."""
 
     files: tuple[FrameFile, ...]
-    png_compression: int
     visible_threshold: float
 
 
@@ -142,9 +141,9 @@ def _draw(renderer: Renderer, script: FlightScript, i: int, poses: Poses, thresh
 def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
     """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
     makers: dict[FrameFile, Callable[[], bytes]] = {
-        "rgb": lambda: frames.rgb_bytes(frame.rgb, writing.png_compression),
+        "rgb": lambda: frames.rgb_bytes(frame.rgb),
         "depth": lambda: frames.depth_bytes(frame.depth),
-        "instance": lambda: frames.instance_bytes(frame.kinds, frame.ids, writing.png_compression),
+        "instance": lambda: frames.instance_bytes(frame.kinds, frame.ids),
     }
     contents = {frames.FILE_NAMES[file]: makers[file]() for file in writing.files}
     contents["meta.json"] = meta.to_bytes()

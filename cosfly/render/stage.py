@@ -77,7 +77,6 @@ class RenderConfig(Config):
     modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
     )
-    png_compression: int = Field(1, ge=0, le=9, description="zlib level of the PNG files; 0 for none, 9 is slow")
     visible_threshold: float = Field(
         0.1,
         ge=0,
@@ -335,7 +334,7 @@ def make_worker(
     companies = _companies(others, all_traces)
     num_others = num_others_of(companies)
     renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, num_others)
-    writing = Writing(tuple(cfg.modalities), cfg.png_compression, cfg.visible_threshold)
+    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload

@@ -8,10 +8,10 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
+from cosfly.png.read import parse_png
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.png import parse_png
 from cosfly.reprojection import COLUMNS, View, grid_rows, survey
 from release.columns import PICTURES
 from release.depth import depth_of

@@ -76,9 +76,9 @@ def _paint_files(folder: Path, flight: Flight, scene: Scene, i: int) -> Path:
     folder.mkdir(parents=True)
     rgb, depth, kinds, ids = paint(scene, flight, i)
     noise = np.random.default_rng(i).integers(-3, 4, rgb.shape)  # texture: without it a PNG packs to nothing
-    (folder / "rgb.png").write_bytes(rgb_bytes(np.clip(rgb + noise, 0, 255).astype(np.uint8), 1))
+    (folder / "rgb.png").write_bytes(rgb_bytes(np.clip(rgb + noise, 0, 255).astype(np.uint8)))
     (folder / "depth.npy").write_bytes(depth_bytes(depth))
-    (folder / "instance.png").write_bytes(instance_bytes(kinds, ids, 1))
+    (folder / "instance.png").write_bytes(instance_bytes(kinds, ids))
     return folder
 
 
