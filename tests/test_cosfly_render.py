@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,8 @@ from cosfly.render.contract import (
     PERSON_ID,
     SHARED_ID,
     Frame,
+    PosedCar,
+    PosedOther,
     PosedPerson,
     has_own_ids,
     instance_ids,
@@ -44,12 +47,14 @@ from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
 from cosfly.render.gl.scene import build_scene
+from cosfly.render.gl.view import View
 from cosfly.render.others import NOBODY, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.stage import RenderConfig, open_renderer, run, script_flight
 from cosfly.store import read_checksums
 
+LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street", "first_timestamp": 1776000000}
@@ -193,6 +198,38 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
     assert 0.80 < offset[:, 2].max() < 0.93, "the head ends at 1.8 m"
     assert ((body.records["tag"] >> 16) == PERSON_ID).all()
     assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
+
+
+@needs_gl
+@pytest.mark.parametrize("elevation_deg", [8.0, 42.0, 80.0])
+def test_shadows_of_those_who_move_lie_in_their_rectangles(elevation_deg, monkeypatch):
+    """Drawing only rectangles with these shadows gives the picture that drawing everything with them gives."""
+    look = Look(sun_elevation_deg=elevation_deg)
+    renderer = open_renderer("gl", street(), *LARGER, look, 3)
+    clothes = choose_clothes(np.random.default_rng(3))
+    walker = PosedPerson(np.array([4.0, -3.0, 0.9]), 0.7, 1.2, 1.0, clothes)
+    others = [
+        PosedOther(other_id(0), replace(walker, hip_m=np.array([5.2, -2.4, 0.9]))),  # its rectangle meets the walker's
+        PosedOther(other_id(1), PosedCar(np.array([-9.0, 2.0, 0.75]), 0.6, (2.2, 0.9, 0.75), 0.3)),
+        PosedOther(other_id(2), replace(walker, hip_m=np.array([-2.0, -14.8, 0.9]))),  # beside a wall
+    ]
+    whole = (0, 0, *LARGER)
+    for eye in ((-4.0, -24.0, 15.0), (4.0, -3.0, 30.0), (3.0, -5.0, 2.0)):
+        pose, intrinsic = pose_towards(eye, (2.0, -3.0, 0.0)), intrinsic_matrix(*LARGER, 90.0)
+        frame = renderer.render(pose, intrinsic, walker, others)
+        with monkeypatch.context() as patch:
+            patch.setattr(View, "rectangle_px", lambda *_: whole)
+            expected = renderer.render(pose, intrinsic, walker, others)
+            patch.setattr(View, "rectangle_px", lambda *_: None)
+            without = renderer.render(pose, intrinsic, walker, others)
+        assert (without.rgb != expected.rgb).any(axis=-1).sum() > 100, "shadows are seen"
+        differs = np.abs(frame.rgb.astype(int) - expected.rgb).max(axis=-1)
+        assert differs.max() <= 1
+        assert (differs > 0).mean() < 1e-3
+        for one in (expected, without):
+            np.testing.assert_array_equal(one.depth, frame.depth)
+            np.testing.assert_array_equal(one.ids, frame.ids)
+    renderer.close()
 
 
 def test_others_of_another_run_are_refused(tmp_path):

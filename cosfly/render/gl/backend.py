@@ -24,6 +24,7 @@ from cosfly.render.gl.figure import Body, make_body
 from cosfly.render.gl.moving import MOST_CAPSULES, capsules_of, draw_others, placed
 from cosfly.render.gl.parts import LOOSE_VERTEX, PART
 from cosfly.render.gl.scene import Scene, build_scene
+from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import View
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
@@ -31,7 +32,7 @@ AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from 
 LARGEST_SHADOW_AREA_M = 420.0
 MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
-DEPTH_ONLY, MESH_STRIDE = -1, 64
+MESH_STRIDE = 64
 PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
 
 
@@ -81,13 +82,14 @@ class GlRenderer:
 
     def _make_programs(self) -> None:
         make = self.context.program
-        self._materials = [
-            make(
-                _source("part.glsl", "scene.vert.glsl"),
-                _source("light.glsl", "scene.frag.glsl").replace("MATERIAL;", f"{material};"),
-            )
-            for material in range(part_tables.NUM_MATERIALS)
-        ]
+        vertex, fragment = _source("part.glsl", "scene.vert.glsl"), _source("light.glsl", "scene.frag.glsl")
+        self._materials, self._near_movers = (
+            [
+                make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near_movers};"))
+                for material in range(part_tables.NUM_MATERIALS)
+            ]
+            for near_movers in ("false", "true")
+        )
         self._depth_program = make(_source("part.glsl", "depth.vert.glsl"), _source("depth.frag.glsl"))
         self._sky_program = make(_source("screen.vert.glsl"), _source("light.glsl", "sky.frag.glsl"))
         self._sky = self.context.vertex_array(self._sky_program, [])
@@ -114,19 +116,20 @@ class GlRenderer:
         ]
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
         self._groups = _groups(self.scene.parts.records, self.scene.parts.mesh)
-        self._loose = {material: self._loose_array(material, rows) for material, rows in self.scene.loose.items()}
+        self._loose = {material: self._loose_arrays(material, rows) for material, rows in self.scene.loose.items()}
 
-    def _loose_array(self, material: int, vertices: np.ndarray) -> Any:
-        """Vertex array of triangles that are no instances: every vertex brings its part along."""
+    def _loose_arrays(self, material: int, vertices: np.ndarray) -> dict[int, Any]:
+        """Vertex arrays, one a program, of triangles that are no instances: every vertex brings its part along."""
         names = [f"in_{name}" for name in LOOSE_VERTEX.names or ()]
-        buffer = self.context.buffer(vertices.tobytes())
-        content = _attributes(self._materials[material], buffer, "3f 3f 3f 3f 4f 4f 1u 1f", tuple(names))
-        return self.context.vertex_array(self._materials[material], [content])
+        buffer, arrays = self.context.buffer(vertices.tobytes()), {}
+        for program in (self._materials[material], self._near_movers[material]):
+            content = _attributes(program, buffer, "3f 3f 3f 3f 4f 4f 1u 1f", tuple(names))
+            arrays[program.glo] = self.context.vertex_array(program, [content])
+        return arrays
 
-    def _array(self, material: int, mesh: int) -> tuple[Any, Any]:
-        """Vertex array and instance buffer of a material (or DEPTH_ONLY) on a mesh."""
-        if (material, mesh) not in self._arrays:
-            program = self._depth_program if material == DEPTH_ONLY else self._materials[material]
+    def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
+        """Vertex array and instance buffer of a program on a mesh."""
+        if (program.glo, mesh) not in self._arrays:
             vertices, triangles = self._meshes[mesh]
             instances = self.context.buffer(reserve=PART.itemsize, dynamic=True)
             content = [
@@ -137,8 +140,8 @@ class GlRenderer:
                 ),
             ]  # fmt: skip
             array = self.context.vertex_array(program, content, index_buffer=triangles)
-            self._arrays[material, mesh] = array, instances
-        return self._arrays[material, mesh]
+            self._arrays[program.glo, mesh] = array, instances
+        return self._arrays[program.glo, mesh]
 
     # --- what holds for a whole flight ---
 
@@ -167,7 +170,7 @@ class GlRenderer:
         self._draw_depth(self._shadow_target, clip_from_world, casting)
         to_texture = np.diag([0.5, 0.5, 0.5, 1.0])
         to_texture[:3, 3] = 0.5
-        for program in self._materials:
+        for program in (*self._materials, *self._near_movers):
             _set(program, "shadow_from_world", to_texture @ clip_from_world)
 
     def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
@@ -191,7 +194,7 @@ class GlRenderer:
         target.release()
         texture.release()
         low = middle[:2] - half
-        for program in self._materials:
+        for program in (*self._materials, *self._near_movers):
             _set(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
 
     def _ground_z(self, low: np.ndarray, pixel_m: float) -> np.ndarray | float:
@@ -208,7 +211,7 @@ class GlRenderer:
         self.context.enable_only(self.context.DEPTH_TEST)
         _set(self._depth_program, "clip_from_world", clip_from_world)
         for mesh in range(len(self._meshes)):
-            self._draw(DEPTH_ONLY, mesh, self.scene.parts.records[rows[self.scene.parts.mesh[rows] == mesh]])
+            self._draw(self._depth_program, mesh, self.scene.parts.records[rows[self.scene.parts.mesh[rows] == mesh]])
 
     # --- one frame ---
 
@@ -227,10 +230,10 @@ class GlRenderer:
         )
         moving = [] if body is None else [placed(body, self.scene.origin_m)]
         moving += draw_others(others, self.scene.origin_m, view)
+        bones = self._bones(body)
+        shades = shades_of(bones, capsules_of(others, self.scene.origin_m, view), self.look.sun_direction(), view)
         with self.context:
-            self._set_camera(camera_pose[:3, :3], view.eye, intrinsic)
-            self._set_person(body)
-            self._set_others(capsules_of(others, self.scene.origin_m, view))
+            self._set_camera(self._materials, camera_pose[:3, :3], view.eye, intrinsic)
             rows = view.rows(self.scene.parts)
             self._image.use()
             self._image.clear(depth=1.0)
@@ -239,13 +242,20 @@ class GlRenderer:
             self.context.depth_func = "<="
             self._shadow.use(0)
             self._height.use(1)
-            self._draw_scene(rows, moving)
+            self._draw_scene(self._materials, rows, moving)
+            if shades:
+                self._set_camera(self._near_movers, camera_pose[:3, :3], view.eye, intrinsic)
+                self._set_person(body)
+            for shade in shades:
+                self._draw_shaded(shade, bones, rows, moving)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
             return self._read()
 
-    def _set_camera(self, world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray) -> None:
+    def _set_camera(
+        self, programs: list[Any], world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray
+    ) -> None:
         common = {
             "lens": np.array([*np.diag(intrinsic)[:2], *intrinsic[:2, 2]]),
             "image_size": np.array([self.width_px, self.height_px]),
@@ -263,48 +273,59 @@ class GlRenderer:
             "sky_depth_m": SKY_DEPTH_M,
             "sky_tag": KINDS["Sky"],
         }
-        for program in (*self._materials, self._sky_program):
+        for program in (*programs, self._sky_program):
             for name, value in common.items():
                 _set(program, name, value)
 
-    def _set_person(self, body: Body | None) -> None:
-        """Hand the body's shadow to the shader."""
-        bones = np.zeros((MAX_BONES, 2, 4), np.float32)
-        count, center = 0, np.zeros(3)
+    def _bones(self, body: Body | None) -> np.ndarray:
+        """Capsules of the person's shadow, relative to the origin, as `moving.capsules_of` gives those of others."""
+        bones = np.zeros((0 if body is None else len(body.bones_m), 2, 4), np.float32)
         if body is not None:
-            count, center = len(body.bones_m), body.center_m - self.scene.origin_m
-            assert count <= MAX_BONES
-            bones[:count, :, :3] = body.bones_m - self.scene.origin_m
-            bones[:count, 0, 3] = body.bone_radii_m
-        for program in self._materials:
-            if "person_bones" in program:
-                program["person_bones"].write(bones.tobytes())
-            _set(program, "person_num_bones", count)
+            bones[..., :3], bones[:, 0, 3] = body.bones_m - self.scene.origin_m, body.bone_radii_m
+        return bones
+
+    def _set_person(self, body: Body | None) -> None:
+        center = np.zeros(3) if body is None else body.center_m - self.scene.origin_m
+        for program in self._near_movers:
             _set(program, "person_center", center)
 
-    def _set_others(self, capsules: np.ndarray) -> None:
-        """Hand the shadows of the others to the shader, (k, 2, 4)."""
-        bones = np.zeros((MOST_CAPSULES, 2, 4), np.float32)
-        bones[: len(capsules)] = capsules
-        for program in self._materials:
-            if "other_bones" in program:
-                program["other_bones"].write(bones.tobytes())
-            _set(program, "num_others", len(capsules))
+    def _draw_shaded(
+        self, shade: Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
+    ) -> None:
+        """Draw what lies in a rectangle once more, with the shadows of those who move. What is nearest is nearest again."""
+        center, radius = shade.sphere()
+        person = bones if shade.has_person else bones[:0]
+        for name, count, most, capsules in (
+            ("person_bones", "person_num_bones", MAX_BONES, person),
+            ("other_bones", "num_others", MOST_CAPSULES, shade.capsules),
+        ):
+            padded = np.zeros((most, 2, 4), np.float32)
+            padded[: len(capsules)] = capsules
+            for program in self._near_movers:
+                if name in program:
+                    program[name].write(padded.tobytes())
+                _set(program, count, len(capsules))
+        parts = self.scene.parts
+        away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
+        x0, y0, x1, y1 = shade.rectangle_px
+        self._image.scissor = x0, y0, x1 - x0, y1 - y0
+        self._draw_scene(self._near_movers, rows[away < radius], moving)
+        self._image.scissor = None
 
-    def _draw_scene(self, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Draw standing things before the ground, near before far: what is hidden costs nothing. moving: records and meshes."""
         records = np.concatenate([*(part for part, _ in moving), self.scene.parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
-                self._draw(material, mesh, records[groups == material * MESH_STRIDE + mesh])
+                self._draw(programs[material], mesh, records[groups == material * MESH_STRIDE + mesh])
             if material in self._loose:
-                self._loose[material].render()
+                self._loose[material][programs[material].glo].render()
 
-    def _draw(self, material: int, mesh: int, records: np.ndarray) -> None:
+    def _draw(self, program: Any, mesh: int, records: np.ndarray) -> None:
         if len(records) == 0:
             return
-        array, instances = self._array(material, mesh)
+        array, instances = self._array(program, mesh)
         instances.orphan(2 * records.nbytes if instances.size < records.nbytes else -1)  # -1: as it was
         instances.write(records.tobytes())
         array.render(instances=len(records))

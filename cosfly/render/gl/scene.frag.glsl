@@ -31,6 +31,7 @@ const int PLAIN = 0, FACADE = 1, ROAD = 2, SIDEWALK = 3, GRASS = 4, LEAVES = 5, 
     METAL = 10, BRICK = 11, WATER = 12, FENCE = 13, ROAD_LINE = 14, LAMP = 15, GRAVEL = 16, SIGNAL = 17, BUS = 18, CLOTH = 19,
     CONCRETE = 20;
 const int material = MATERIAL;
+const bool near_movers = NEAR_MOVERS;   // whether this text is for pixels that somebody who moves may darken: two loops that every pixel pays for
 
 struct Surface { vec3 albedo; vec3 normal; float mirror; float shade; vec3 glow; };
 
@@ -357,15 +358,15 @@ void main() {
     float sun = mix(max(facing, 0.0), 0.5 + 0.5 * facing, translucent);
     if (sun > 0.001 && (dot(geometric, sun_direction) > 0.0 || translucent > 0.0)) {
         sun *= sun_reaches(v_world, geometric);
-        if (material != CLOTH) sun *= person_lets_sun(v_world);
+        if (near_movers && material != CLOTH) sun *= person_lets_sun(v_world);
     } else sun = 0.0;
     float around = texture(height_map, (v_world.xy - height_area.xy) * height_area.zw).r - v_world.z;
     float open_sky = 1.0 / (1.0 + 0.16 * max(around, 0.0));
-    if (person_num_bones > 0 && material != CLOTH) {
+    if (near_movers && person_num_bones > 0 && material != CLOTH) {
         vec2 d = v_world.xy - person_center.xy;
         open_sky *= 1.0 - 0.45 * exp(-9.0 * dot(d, d)) * step(v_world.z, person_center.z);
     }
-    if (num_others > 0) {
+    if (near_movers && num_others > 0) {
         vec2 light = others_let(v_world);
         sun *= light.x;
         open_sky *= light.y;

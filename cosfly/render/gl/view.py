@@ -37,6 +37,20 @@ class View:
         in_camera, radii = self._in_camera(center[None]), np.array([radius], np.float32)
         return bool(self._is_inside(in_camera, radii)[0] and self._size_px(in_camera, radii)[0] >= SMALLEST_PX)
 
+    def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
+        """Pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None where it is out of the picture."""
+        in_camera = self._in_camera(points)
+        if in_camera[:, 2].max() <= NEAR_M:
+            return None
+        if in_camera[:, 2].min() <= NEAR_M:
+            return 0, 0, self.width_px, self.height_px
+        places = in_camera @ self.intrinsic.T
+        places = places[:, :2] / places[:, 2:]
+        size = [self.width_px, self.height_px]
+        x0, y0 = np.clip(np.floor(places.min(axis=0)) - 1, 0, size).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(places.max(axis=0)) + 1, 0, size).astype(int).tolist()
+        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
     def _in_camera(self, centers: np.ndarray) -> np.ndarray:
         return (centers - self.eye.astype(np.float32)) @ self.world_from_camera.astype(np.float32)
 
