@@ -176,18 +176,25 @@ def read_checksums(folder: Path) -> dict[str, str]:
     """Read `checksums.sha256`: relative name -> hex digest."""
     path = folder / CHECKSUMS
     digests: dict[str, str] = {}
-    known: set[str] = set()  # folders that were looked at: of a flight's thousands of files many stand in one
+    plain_folders, root = {""}, f"{folder}{os.sep}"
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
             raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
         plain = _plain_name(folder, name)
-        above = os.path.dirname(plain)
-        if above not in known or os.path.islink(folder / plain):
+        if not _is_plain_folder(root, os.path.dirname(plain), plain_folders) or os.path.islink(root + plain):
             check_stays_below(folder / plain, folder)
-            known.add(above)
         digests[plain] = digest
     return digests
+
+
+def _is_plain_folder(root: str, name: str, known: set[str]) -> bool:
+    """Tell whether no part of a folder's name is a link; `known` are those of which that is known, each looked at once."""
+    if name not in known:
+        if not _is_plain_folder(root, os.path.dirname(name), known) or os.path.islink(root + name):
+            return False
+        known.add(name)
+    return True
 
 
 @contextlib.contextmanager

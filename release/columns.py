@@ -7,6 +7,7 @@ list stands in a row except the caption's window, picture size and states of sen
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -124,11 +125,12 @@ class Column:
 
     def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> Any:
         value = getattr(placed, self.name) if self.value is None else self.value(flight, i, caption)
-        if isinstance(self.type, tuple):  # adding 0.0 turns -0.0 into 0.0
-            is_null = value is None or np.isnan(value).any()
-            return None if is_null else dict(zip(self.type, (value + 0.0).tolist(), strict=True))
+        if isinstance(self.type, tuple):  # of few numbers Python's own are faster than an array
+            numbers = [] if value is None else value.tolist()
+            is_null = not numbers or any(map(math.isnan, numbers))
+            return None if is_null else {name: x + 0.0 for name, x in zip(self.type, numbers, strict=True)}  # no -0.0
         if self.type == "float64":
-            return None if value is None or np.isnan(value) else float(value)
+            return None if value is None or math.isnan(value) else float(value)
         return bool(value) if self.type == "bool" else value
 
 

@@ -135,10 +135,14 @@ def object_of(group: dict, key: str) -> dict:
 
 def vector_of(value: Any, names: tuple[str, ...]) -> np.ndarray:
     """Read {"x": .., "y": ..} or [.., ..]; anything else, nulls included, is NaN."""
+    return np.array(_parts_of(value, names), dtype=np.float64)
+
+
+def _parts_of(value: Any, names: tuple[str, ...]) -> list:
     parts = [value.get(n) for n in names] if isinstance(value, dict) else value
     if isinstance(parts, list) and len(parts) == len(names) and all(map(_is_number, parts)):
-        return np.array(parts, dtype=np.float64)
-    return np.full(len(names), np.nan)
+        return parts
+    return [np.nan] * len(names)
 
 
 def _is_number(value: Any) -> bool:
@@ -146,7 +150,10 @@ def _is_number(value: Any) -> bool:
 
 
 def vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
-    return np.array([vector_of(group.get(key), names) for group in groups]).reshape(-1, len(names))
+    parts = [
+        _parts_of(group.get(key), names) for group in groups
+    ]  # one array of all: of each alone it takes twice as long
+    return np.array(parts, dtype=np.float64).reshape(-1, len(names))
 
 
 def mask_boxes(targets: list[dict]) -> np.ndarray | None:
@@ -167,7 +174,7 @@ def offsets_of(points: list[dict], key: str, names: tuple[str, ...], is_original
 
 def numbers_of(groups: list[dict], key: str) -> np.ndarray:
     """Read one number of each group, (n,); anything else, nulls included, is NaN."""
-    return np.array([vector_of([group.get(key)], (key,))[0] for group in groups])
+    return np.array([_parts_of([group.get(key)], (key,))[0] for group in groups], dtype=np.float64)
 
 
 def flags_of(groups: list[dict], key: str, default_key: str = "") -> np.ndarray:

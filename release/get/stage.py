@@ -32,7 +32,7 @@ from release.columns import PLACE, SPLIT_NAMES, SplitName, schema
 from release.get.choice import RECORD, Choice, chosen_flights, fetch_record
 from release.get.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
 from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
-from release.package.shards import open_writer
+from release.package.rows import open_writer
 from release.record import (
     PartOf,
     ReleasedFlight,

@@ -29,7 +29,8 @@ from release.package.depth import depth_record
 from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
 from release.package.origin import provenance_of
 from release.package.plan import PlannedShard, selected_bytes, shards_of
-from release.package.shards import ShardPlan, Written, write_shard
+from release.package.rows import ShardPlan
+from release.package.shards import Written, write_shard
 from release.package.sources import Material, Source, Track, choose_licence, gather, input_names, maps_of
 from release.package.survey import Placing, Surveyed, check_alike, keep_pairs, place_flights, survey
 from release.record import (
