@@ -45,7 +45,7 @@ from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.items import Item
 from cosfly.journal import Journal
-from cosfly.maps import cityjson, simworld
+from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
@@ -212,6 +212,22 @@ def _maps(root: Path) -> None:
             "holes": [[[0, 0], [1, 0], [1, 1]]],
             "polygons": [{"points_world": ring, "holes": []}],
         },
+    )
+    around = [[*ring, ring[0]]]
+    house = {
+        "type": "Feature",
+        "properties": {"type": "Buildings", "height": 9, "yaw": 0},
+        "geometry": {"type": "Polygon", "coordinates": around},
+    }
+    tree = {
+        "type": "Feature",
+        "properties": {"type": "Vegetation", "height": 5, "length": 2, "width": 2},
+        "geometry": {"type": "Point", "coordinates": [40, 9]},
+    }
+    (root / "own.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [house, tree]}))
+    (root / "roi.geojson").write_text(json.dumps({"type": "MultiPolygon", "coordinates": [around, around]}))
+    (root / "own.csv").write_text(
+        "id,type,x,y,z,length,width,height,yaw\n1,Buildings,0,0,4,9,9,8,30\n2,Roads,20,0,0,9,90,,0\n"
     )
     (root / "city.json").write_text(json.dumps(CITY))
     (root / "city.json.gz").write_bytes(gzip.compress(json.dumps(CITY).encode(), mtime=0))
@@ -536,6 +552,9 @@ PICTURES = tuple(f"{TREE}/ORI/{FRAME}/{name}" for name in ("rgb.png", "depth.npy
 READERS: dict[str, Reader] = {
     "boxes": _one("boxes_3d.json", read_boxes),
     "region of interest": _one("roi.json", read_roi),
+    "region of interest, GeoJSON": _one("roi.geojson", read_roi),
+    "table of boxes": _one("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
+    "boxes, GeoJSON": _one("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
     "walks": _one("path.json", read_paths),
     "others": _one("others.json", read_others),
     "traces": _one("drone_trace.json", read_traces),

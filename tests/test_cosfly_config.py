@@ -135,7 +135,7 @@ def test_every_setting_is_explained_once_with_its_value():
         ("workers", "whole number >= 0"),
         ("item_limit_s", "number >= 0, or null"),
         ("roi", "path, or null"),
-        ("maps.source", "one of synthetic, simworld, cityjson"),
+        ("maps.source", "one of synthetic, simworld, cityjson, boxes"),
         ("render.fovs_deg", "list of: number"),
         ("plan.muco", ""),
     ],

@@ -21,7 +21,7 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
-from cosfly.maps.footprints import check_outline, cover, polygons_of, rectangle_polygon, united
+from cosfly.maps.footprints import CUT_SHARES, check_outline, cover, polygons_of, rectangle_polygon, united
 from cosfly.maps.terrain import ground_of
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.ground import Ground, GroundGrid
@@ -198,10 +198,10 @@ def _add_solid(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint,
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
     high = max(float(z.max()), float(z.min()) + 0.1)
-    shares, outlines = (0.25, 0.4, 0.5, 0.6, 0.75), []
+    outlines = []
     for polygon in polygons_of(footprint):
         outline = polygon.simplify(0.05)
-        for rectangle in cover(outline, min_fill=cfg.solid_fill, min_size_m=cfg.solid_piece_m, shares=shares):
+        for rectangle in cover(outline, min_fill=cfg.solid_fill, min_size_m=cfg.solid_piece_m, shares=CUT_SHARES):
             boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
             outlines.append(rectangle_polygon(rectangle))
     return united(outlines)

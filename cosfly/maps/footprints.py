@@ -16,6 +16,8 @@ MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
 PAIRS_AT_ONCE = 1_000_000  # of edges that are compared before the count is looked at
 MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
 
+CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses are tried to be cut: few boxes and little empty area in them
+
 Share = tuple[float, float]
 
 

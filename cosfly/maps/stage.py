@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.config import Config
-from cosfly.maps import cityjson, simworld, synthetic
+from cosfly.maps import boxfile, cityjson, simworld, synthetic
+from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
@@ -19,18 +21,24 @@ from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes
 from cosfly.topview import TopView, draw_map, png_bytes
 
+log = logging.getLogger(__name__)
+
 SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
     "synthetic": synthetic.load, "simworld": simworld.load, "cityjson": cityjson.load,
+    "boxes": boxfile.load,
 }  # fmt: skip
 
 
 class MapsConfig(Config):
     """Where the map comes from."""
 
-    source: Literal["synthetic", "simworld", "cityjson"] = Field("synthetic", description="which source to read")
+    source: Literal["synthetic", "simworld", "cityjson", "boxes"] = Field(
+        "synthetic", description="which source to read"
+    )
     synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
     simworld: SimWorldConfig = Field(default_factory=SimWorldConfig, description="a SimWorld world with asset sizes")
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
+    boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes of your own: JSON, CSV or GeoJSON")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
 
     @property
@@ -63,5 +71,6 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     dropped = box_map.header.dropped_objects
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
+    log.info("%d boxes of %d objects", len(box_map), num_objects)
     stage.finish([product, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

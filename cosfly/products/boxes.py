@@ -21,6 +21,10 @@ from cosfly.reading.documents import check_schema, read_json, validation_errors
 from cosfly.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
+AXES = "right-handed, metres, x east, y north, z up; degrees"
+CORNER_M = (
+    0.05  # how far a told corner may be from the one that follows: exporters round, and turn boxes in single precision
+)
 COMPUTED = {
     "schema",
     "schema_version",
@@ -193,15 +197,19 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
 
 
 class _Box(BaseModel):
-    """What is read of a box; its other fields follow from these."""
+    """What is read of a box; the fields with a default follow from the others, and are compared with them."""
 
-    model_config = ConfigDict(strict=True)  # no numbers in quotes
+    model_config = ConfigDict(strict=True, extra="forbid")  # no numbers in quotes
 
     type: str
     id: int = Field(ge=0, lt=2**64)
     center: Vector
     extent: Vector
     rotation: Vector
+    semantic_id: int | None = None
+    color: str | None = None
+    min: Vector | None = None
+    max: Vector | None = None
 
     @field_validator("type")
     @classmethod
@@ -229,7 +237,7 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
         "schema": BOXES_SCHEMA,
         "schema_version": BOXES_VERSION,
         **told,
-        "axes": "right-handed, metres, x east, y north, z up; degrees",
+        "axes": AXES,
         "bounds": {"min": rounded(low), "max": rounded(high)},
         "num_boxes": len(box_map),
         "counts": box_map.counts(),
@@ -278,4 +286,38 @@ def read_boxes(path: Path) -> BoxMap:
     kinds, ids = [KINDS[box.type] for box in boxes], [box.id for box in boxes]
     box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
     check_boxes(box_map, path)
+    _check_told(value if isinstance(value, dict) else {}, boxes, box_map, path)
     return box_map
+
+
+def _check_told(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
+    """Compare what a file tells beside its boxes with what follows from them; a wrong one is a sign of other axes, units or sizes.
+
+    Raises:
+        InputError: names the box and the field.
+    """
+    told = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
+    for name, follows in told:
+        if header.get(name, follows) != follows:
+            raise InputError(
+                "not what its boxes are",
+                where=f"{path}: {name}",
+                got=str(header[name])[:200],
+                expected=str(follows)[:200],
+            )
+    for box in boxes:
+        if box.semantic_id not in (None, KINDS[box.type]):
+            raise InputError(
+                "not the number of its type",
+                where=f"{path}: box {box.id}: semantic_id",
+                got=box.semantic_id,
+                expected=f"{KINDS[box.type]}, {box.type}",
+            )
+    for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
+        for row, box in enumerate(boxes):
+            corner = getattr(box, name)
+            if corner is not None and not np.allclose(corner, corners[row], atol=CORNER_M, rtol=1e-6):
+                raise InputError(
+                    "does not follow from center, extent and rotation", where=f"{path}: box {box.id}: {name}", got=str(corner),
+                    expected=str(rounded(corners[row])), fix="extent is half the size, in metres; rotation is pitch, yaw, roll in degrees",
+                )  # fmt: skip

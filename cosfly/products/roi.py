@@ -1,16 +1,21 @@
-"""`roi_polygon.json`: where pedestrians may walk. The paper's form, and ours with holes and several outer rings."""
+"""`roi_polygon.json`: where pedestrians may walk. The paper's form, ours with holes and several outer rings, and GeoJSON in the map's metres."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import shapely
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
 from cosfly.reading.documents import read_json, validation_errors
+from cosfly.reading.geojson import features_of, is_geojson
 from cosfly.reading.limits import limits, over_limit
+
+SMALLEST_M = 1.0  # nobody walks in less; a region drawn in degrees is smaller
 
 
 class RoiPolygon(BaseModel):
@@ -35,9 +40,15 @@ def read_roi(path: Path) -> Roi:
     """Read a region of interest.
 
     Raises:
-        InputError: malformed, not closed, or a ring of fewer than three finite points.
+        InputError: malformed, not closed, crossing itself, or a ring of fewer than three finite points.
     """
     value = read_json(path, what="region of interest")
+    if is_geojson(value):
+        value = {
+            "polygons": [
+                _polygon_of(part, feature.where, path) for feature in features_of(value, path) for part in feature.parts
+            ]
+        }
     with validation_errors(path):
         roi = Roi.model_validate(value)
     if not roi.closed:
@@ -53,4 +64,24 @@ def read_roi(path: Path) -> Roi:
             if len(ring) < 3 or not is_in_range(np.array(ring, dtype=np.float64)):
                 where, got = f"{path}: polygon {number}", f"{len(ring)} points"
                 raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
+            reason = shapely.is_valid_reason(shapely.Polygon(ring))
+            if reason != "Valid Geometry":
+                raise InputError(
+                    "a ring crosses itself",
+                    where=f"{path}: polygon {number}",
+                    got=reason,
+                    fix="draw it again without crossings",
+                )
     return roi
+
+
+def _polygon_of(rings: list[np.ndarray], where: str, path: Path) -> dict[str, Any]:
+    """Give a polygon of GeoJSON, whose rings repeat their first point, in the form of this file."""
+    spread = np.ptp(rings[0], axis=0).max()
+    if len(rings[0]) < 4 or spread < SMALLEST_M:
+        raise InputError(
+            "not a region in metres", where=f"{path}: {where}", got=f"{len(rings[0])} points within {spread:.3g}",
+            expected="a polygon in the map's world metres, x east and y north; longitude and latitude are not",
+        )  # fmt: skip
+    points, *holes = (ring[:-1].tolist() for ring in rings)
+    return {"points_world": points, "holes": holes}

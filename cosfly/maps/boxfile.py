@@ -1,0 +1,373 @@
+"""Boxes of one's own: a `boxes_3d.json`, a table (CSV), or GeoJSON.
+
+A row of a table is a box: its middle, its size or half of it, its yaw, its type, under any of the NAMES. A feature of GeoJSON is a point with these
+properties, or an outline with a height; an outline that is no rectangle becomes the rectangles that cover it. All that is wrong with a file is told at once.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from pydantic import Field, field_validator
+from shapely.geometry import Polygon
+
+from cosfly.config import Config
+from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
+from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
+from cosfly.products.columns import LARGEST
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.reading.files import read_text
+from cosfly.reading.geojson import read_features
+
+log = logging.getLogger(__name__)
+
+# What a table may call its columns, and GeoJSON its properties. Sizes are before turning: length along the yaw's direction.
+NAMES: dict[str, tuple[str, ...]] = {
+    "x": ("x", "center_x", "centre_x"),
+    "y": ("y", "center_y", "centre_y"),
+    "z": ("z", "center_z", "centre_z"),
+    "length": ("length", "size_x"),
+    "width": ("width", "size_y"),
+    "height": ("height", "size_z"),
+    "half_length": ("half_length", "half_x", "extent_x"),
+    "half_width": ("half_width", "half_y", "extent_y"),
+    "half_height": ("half_height", "half_z", "extent_z"),
+    "low": ("low", "bottom", "z_min", "base"),
+    "high": ("high", "top", "z_max"),
+    "yaw_deg": ("yaw_deg", "yaw"),
+    "yaw_rad": ("yaw_rad",),
+    "type": ("type", "category", "kind", "class"),
+    "id": ("id",),
+}
+FIELDS = {name: field for field, names in NAMES.items() for name in names}
+SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
+WIDEST_M = 20_000.0  # no map is wider
+FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
+TALL_M = 400.0  # the usual building is lower
+DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
+EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
+MOST_TOLD = 12  # problems in a message
+
+
+class BoxesConfig(Config):
+    """Boxes of one's own."""
+
+    name: str = Field("Boxes", min_length=1, description="map name, the head of the playback tree's folder names")
+    path: Path | None = Field(
+        None, description="boxes_3d.json, .csv or .geojson; what columns may be called: docs/files.md"
+    )
+    types: dict[str, str] = Field(
+        {}, description="names of the file -> types of cosfly, for instance {house: Buildings}"
+    )
+    ignore: list[str] = Field(
+        [], description="columns or properties that are not read; ['*']: all that have no meaning here"
+    )
+    metres_per_unit: float = Field(
+        1.0, gt=0.0, description="metres of one unit of the file: 0.01 for centimetres, as Unreal has them"
+    )
+    left_handed: bool = Field(
+        False, description="y points to the right of x and yaw turns clockwise, as in CARLA and Unreal"
+    )
+    ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
+    outline_fill: float = Field(
+        0.9, gt=0.0, le=1.0, description="share of each box that an outline, which is no rectangle, fills"
+    )
+    outline_piece_m: float = Field(
+        3.0, gt=0.0, description="pieces of an outline of at most this length are not cut again, m"
+    )
+    licence: LicenceId = Field(
+        UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0); goes into every release"
+    )
+    credits: str = Field("", description="who must be named: the map's makers, one sentence or more")
+    tool: str = Field("", description="tool and version that made the file, for the records")
+
+    @field_validator("types")
+    @classmethod
+    def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
+        for name, kind in types.items():
+            if kind not in KINDS:
+                raise ValueError(
+                    f"{name}: there is no type {kind!r}{nearest(kind, KINDS)}; there are {', '.join(KINDS)}"
+                )
+        return types
+
+    def inputs(self) -> dict[str, Path]:
+        if self.path is None:
+            fix = "--set maps.boxes.path=..."
+            raise ConfigError("no file is given", where="maps.boxes.path", expected="a path", fix=fix)
+        return {"boxes": self.path}
+
+
+class _Row(NamedTuple):
+    """One row or feature: what its columns say, by field; `outline` of a feature that has one, in metres."""
+
+    where: str
+    values: Mapping[str, Any]
+    outline: Polygon | None = None
+
+
+class _Wrong(Exception):
+    """What is wrong with one row, in words."""
+
+
+def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
+    """Read boxes; the seed changes nothing.
+
+    Raises:
+        ConfigError: no file is given. InputError: says all that is wrong with the file, row by row.
+    """
+    path = cfg.inputs()["boxes"]
+    readers = {".csv": _table_rows, ".geojson": _feature_rows}
+    if path.suffix.lower() == ".json":
+        return _told(_read_ours(cfg, path), cfg, path)
+    if path.suffix.lower() not in readers:
+        raise InputError(
+            "not a kind of map that is known",
+            where=path,
+            got=path.suffix or "no suffix",
+            expected=".json, .csv or .geojson",
+        )
+    rows = list(readers[path.suffix.lower()](cfg, path))
+    if not rows:
+        raise InputError("the map holds no boxes", where=path)
+    boxes, ids, problems = BoxList(), list[Any](), list[str]()
+    for row in rows:
+        try:
+            _add(boxes, row, cfg)
+        except _Wrong as wrong:
+            problems.append(f"{row.where}: {wrong}")
+        ids.append(row.values.get("id"))
+    types = (
+        f"types are {', '.join(KINDS)}; maps.boxes.types translates others"
+        if any("type" in told for told in problems)
+        else None
+    )
+    _raise_all(problems, path, types)
+    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
+    box_map = boxes.box_map(header)
+    if len(box_map) == len(rows) and all(ids):
+        box_map = replace(box_map, ids=_ids(ids, path))
+    return _told(box_map, cfg, path)
+
+
+def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
+    if cfg.types or cfg.ignore or cfg.metres_per_unit != 1.0 or cfg.left_handed:
+        raise ConfigError(
+            "boxes_3d.json has its own types, metres and axes", where="maps.boxes",
+            got=", ".join(sorted(cfg.model_fields_set - {"path", "name", "licence", "credits", "tool"})), fix="leave these settings out, or give a .csv",
+        )  # fmt: skip
+    return read_boxes(path)
+
+
+def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
+    """Give the map with what the settings say of it, near the origin, if its size can be."""
+    low, high = box_map.bounds()
+    tall = box_map.half_extents[box_map.kinds == KINDS["Buildings"], 2] * 2
+    if (high - low)[:2].max() > WIDEST_M or (len(tall) and float(np.median(tall)) > TALL_M):
+        raise InputError(
+            "the map is too wide, or its buildings too high: are these centimetres?", where=path,
+            got=" x ".join(f"{size:.6g}" for size in high - low) + " m", expected="at most 20 km, buildings of usually less than 400 m",
+            fix="--set maps.boxes.metres_per_unit=0.01; or mend the stray box",
+        )  # fmt: skip
+    given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
+    source = MapSource(tool=cfg.tool or box_map.header.source.tool or "boxes", file=path.name)
+    header = box_map.header.model_copy(update={**given, "source": source})
+    middle = np.round((low + high)[:2] / 2)
+    if np.abs(middle).max() > FAR_M and header.ground is None:
+        log.info("%s: the middle of the map, %s, becomes the origin", path.name, middle.tolist())
+        offset = {"x": float(middle[0]), "y": float(middle[1]), "z": 0.0}
+        header = header.model_copy(update={"offset_m": offset})
+        box_map = replace(box_map, centers=box_map.centers - [*middle, 0.0])
+    return replace(box_map, header=header)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
+    lines = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
+    names: list[str] = []
+    try:
+        for line in lines:
+            if not any(cell.strip() for cell in line):
+                continue
+            if not names:
+                names = line
+                fields = _fields(names, cfg, path)
+                continue
+            if len(line) != len(names):
+                _raise_all([f"line {lines.line_num}: {len(line)} cells, where the first line has {len(names)}"], path)
+            cells = ((field, cell.strip()) for field, cell in zip(fields, line, strict=True) if field)
+            yield _Row(f"line {lines.line_num}", {field: cell for field, cell in cells if cell})
+    except csv.Error as error:
+        raise InputError("not a table", where=f"{path}: line {lines.line_num}", got=str(error)) from None
+
+
+def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
+    features = read_features(path, what="map")
+    names = list(dict.fromkeys(name for feature in features for name in feature.properties))
+    fields = dict(zip(names, _fields(names, cfg, path, is_needed=False), strict=True))
+    project = _projection([ring for feature in features for part in feature.parts for ring in part])
+    for feature in features:
+        row = {
+            field: value for name, value in feature.properties.items() if value is not None and (field := fields[name])
+        }
+        for part in feature.parts:
+            rings = [project(ring) for ring in part]
+            if len(rings[0]) == 1:
+                yield _Row(feature.where, {**row, "x": rings[0][0, 0], "y": rings[0][0, 1]})
+            else:
+                yield _Row(feature.where, row, Polygon(rings[0], rings[1:]))
+
+
+def _projection(rings: list[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
+    """Give what turns coordinates, (n, 2), into metres: nothing; or, where a whole map is within 2 units, the plane that touches the Earth in its middle."""
+    places = np.concatenate(rings) if rings else np.zeros((1, 2))
+    low, high = places.min(axis=0), places.max(axis=0)
+    if (high - low).max() > DEGREES_AT_MOST or (np.abs(places) > [180.0, 90.0]).any():
+        return lambda ring: ring
+    middle = (low + high) / 2
+    log.info("longitude and latitude: metres east and north of %.6f, %.6f", *middle)
+    latitude = math.radians(middle[1])
+    bent = 1 - EARTH_E2 * math.sin(latitude) ** 2
+    east_m, north_m = EARTH_M / math.sqrt(bent) * math.cos(latitude), EARTH_M * (1 - EARTH_E2) / bent**1.5  # a radian
+    return lambda ring: np.radians(ring - middle) * [east_m, north_m]
+
+
+def _fields(names: Sequence[str], cfg: BoxesConfig, path: Path, *, is_needed: bool = True) -> list[str | None]:
+    """Give the field that each column holds, None of those that are not read; tells all that is wrong with the names."""
+    fields = [None if name in cfg.ignore else FIELDS.get(name.strip().lower()) for name in names]
+    problems = []
+    if "*" not in cfg.ignore:
+        problems += [
+            f"column {name!r} has no meaning here{nearest(name.strip().lower(), FIELDS)}"
+            for name, field in zip(names, fields, strict=True) if field is None and name not in cfg.ignore
+        ]  # fmt: skip
+    hint = f"columns {', '.join(FIELDS)}; maps.boxes.ignore leaves others out" if problems else None
+    for field, count in Counter(field for field in fields if field).items():
+        if count > 1:
+            problems.append(
+                f"{count} columns are the {field}: {', '.join(n for n, f in zip(names, fields, strict=True) if f == field)}"
+            )
+    if is_needed:
+        problems += [
+            f"no column for {field} ({', '.join(NAMES[field])})" for field in ("x", "y", "type") if field not in fields
+        ]
+    _raise_all(problems, path, hint)
+    return fields
+
+
+def _raise_all(problems: list[str], path: Path, hint: str | None = None) -> None:
+    if problems:
+        more = f"; and {len(problems) - MOST_TOLD} more" if len(problems) > MOST_TOLD else ""
+        count = f"{len(problems)} to mend" if len(problems) > 1 else None
+        raise InputError("; ".join(problems[:MOST_TOLD]) + more, where=path, expected=hint, fix=count)
+
+
+def _ids(given: list[Any], path: Path) -> np.ndarray:
+    """Give the ids of the rows, which must be whole numbers, each once."""
+    texts = [str(value) for value in given]
+    problems = [
+        f"id {text!r} is not a whole number below 2^63"
+        for text in texts
+        if not (text.isascii() and text.isdecimal() and int(text) < 2**63)
+    ]
+    problems += [f"id {text} occurs {count} times" for text, count in Counter(texts).items() if count > 1]
+    _raise_all(problems, path)
+    return np.array([int(text) for text in texts], dtype=np.uint64)
+
+
+# --- a row to boxes ---------------------------------------------------------------------------------------------------
+
+
+def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
+    kind = _kind(row.values, cfg)
+    numbers = {name: _number(name, value) for name, value in row.values.items() if name not in ("type", "id")}
+    if "yaw_deg" in numbers and "yaw_rad" in numbers:
+        raise _Wrong("yaw twice, in degrees and in radians")
+    yaw_deg = numbers.pop("yaw_deg", math.degrees(numbers.pop("yaw_rad", 0.0)))
+    metres = {name: value * cfg.metres_per_unit for name, value in numbers.items()}
+    low_m, high_m = _span(metres, kind, cfg.ground_z_m)
+    turn = -1.0 if cfg.left_handed else 1.0
+    if row.outline is None:
+        missing = [name for name in ("x", "y") if name not in metres]
+        if missing:
+            raise _Wrong(f"no {' and no '.join(missing)}")
+        size = (_size(metres, "length"), _size(metres, "width"))
+        boxes.add(kind, (metres["x"], turn * metres["y"]), size, low_m, high_m, turn * yaw_deg)
+        return
+    outline = shapely.transform(row.outline, lambda places: places * [cfg.metres_per_unit, turn * cfg.metres_per_unit])
+    check_outline(outline, row.where)
+    if not outline.is_valid:
+        raise _Wrong(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
+    for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):
+        boxes.add(kind, rectangle.center, rectangle.size, low_m, high_m, rectangle.yaw_deg)
+
+
+def _kind(values: Mapping[str, Any], cfg: BoxesConfig) -> str:
+    name = str(values.get("type", ""))
+    kind = cfg.types.get(name, name)
+    if kind not in KINDS or kind == "NONE":
+        alike = {known.lower(): known for known in [*KINDS, *cfg.types]}
+        close = get_close_matches(name.lower(), alike, n=1)
+        raise _Wrong(
+            f"unknown type {name[:40]!r}" + (f" (did you mean {alike[close[0]]!r}?)" if close else "")
+            if name
+            else "no type"
+        )
+    return kind
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not abs(number) <= LARGEST:
+        raise _Wrong(f"{name} is not a finite number: {str(value)[:40]!r}")
+    return number
+
+
+def _size(metres: Mapping[str, float], name: str) -> float:
+    """Give a full size, which may be told as its half."""
+    half = metres.get(f"half_{name}")
+    if (name in metres) == (half is not None):
+        raise _Wrong(f"{name} twice, whole and half" if half is not None else f"neither {name} nor half_{name}")
+    size = metres[name] if half is None else 2 * half
+    if not size > 0:
+        raise _Wrong(f"{name} is not more than 0: {size:g} m")
+    return size
+
+
+def _span(metres: Mapping[str, float], kind: str, ground_m: float) -> tuple[float, float]:
+    """Give the lowest and highest point: of low and high, of the middle and a height, or of a height over the ground."""
+    has_height = "height" in metres or "half_height" in metres
+    if "high" in metres:
+        if has_height or "z" in metres:
+            raise _Wrong("its heights are told twice: high beside height or z")
+        low, high = metres.get("low", ground_m), metres["high"]
+    elif not has_height and KINDS[kind] in GROUND_KINDS:
+        top = metres.get("z", metres.get("low", ground_m))
+        low, high = top - SLAB_M, top
+    else:
+        height = _size(metres, "height")
+        if "z" in metres and "low" in metres:
+            raise _Wrong("its heights are told twice: low beside z")
+        low = metres["z"] - height / 2 if "z" in metres else metres.get("low", ground_m)
+        high = low + height
+    if not high > low:
+        raise _Wrong(f"its top, {high:g} m, is not above its foot, {low:g} m")
+    return low, high

@@ -1,0 +1,197 @@
+"""Maps of one's own: tables and GeoJSON of boxes in the forms that people write, and what is wrong with others, all at once."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from cosfly.errors import ConfigError, InputError
+from cosfly.maps.boxfile import BoxesConfig, load
+from cosfly.maps.synthetic import SyntheticConfig
+from cosfly.maps.synthetic import load as invent
+from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
+from cosfly.products.kinds import KIND_NAMES
+
+# Three boxes, as a table would have them: a turned house, a tree, a road.
+PLAIN = """\
+id,type,x,y,z,length,width,height,yaw_deg
+7,Buildings,10,20,4,12,8,8,30
+8,Vegetation,40,-5,3,4,4,6,0
+9,Roads,25,0,-0.15,90,7,0.3,0
+"""
+FORMS = {
+    "plain": (PLAIN, {}),
+    "with a byte order mark, blanks and other names": (
+        "\ufeffid, Category ,center_x,center_y,center_z,size_x,size_y,size_z,yaw\n"
+        "7,Buildings, 10 ,20,4,12,8,8,30\n\n8,Vegetation,40,-5,3,4,4,6,\n9,Roads,25,0,-0.15,90,7,0.3,0\n",
+        {},
+    ),
+    "half sizes and radians": (
+        "id,kind,x,y,z,half_x,half_y,half_z,yaw_rad\n"
+        "7,Buildings,10,20,4,6,4,4,0.5235987755982988\n8,Vegetation,40,-5,3,2,2,3,0\n9,Roads,25,0,-0.15,45,3.5,0.15,0\n",
+        {},
+    ),
+    "foot and top": (
+        "id,class,x,y,length,width,bottom,top,yaw\n"
+        "7,Buildings,10,20,12,8,0,8,30\n8,Vegetation,40,-5,4,4,0,6,0\n9,Roads,25,0,90,7,-0.3,0,0\n",
+        {},
+    ),
+    "heights over the ground, own names": (
+        "id,type,x,y,length,width,height,yaw,note\n7,house,10,20,12,8,8,30,a\n8,tree,40,-5,4,4,6,0,b\n9,road,25,0,90,7,,0,c\n",
+        {"types": {"house": "Buildings", "tree": "Vegetation", "road": "Roads"}, "ignore": ["note"]},
+    ),
+    "centimetres of a left-handed engine": (
+        "id,type,x,y,z,extent_x,extent_y,extent_z,yaw\n"
+        "7,Buildings,1000,-2000,400,600,400,400,-30\n8,Vegetation,4000,500,300,200,200,300,0\n9,Roads,2500,0,-15,4500,350,15,0\n",
+        {"metres_per_unit": 0.01, "left_handed": True},
+    ),
+}  # fmt: skip
+
+
+def town() -> BoxMap:
+    return invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
+
+
+def loaded(tmp_path: Path, text: str, suffix: str = ".csv", **settings: object) -> BoxMap:
+    path = tmp_path / f"own{suffix}"
+    path.write_text(text, encoding="utf-8")
+    return load(BoxesConfig(path=path, **settings))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_table_in_any_form_says_the_same(tmp_path, form):
+    text, settings = FORMS[form]
+    box_map = loaded(tmp_path, text, **settings)
+    assert [KIND_NAMES[int(kind)] for kind in box_map.kinds] == ["Buildings", "Vegetation", "Roads"]
+    assert box_map.ids.tolist() == [7, 8, 9]
+    assert_allclose(box_map.centers, [[10, 20, 4], [40, -5, 3], [25, 0, -0.15]], atol=1e-9)
+    assert_allclose(box_map.half_extents, [[6, 4, 4], [2, 2, 3], [45, 3.5, 0.15]], atol=1e-9)
+    assert_allclose(box_map.rotations_deg[:, 1], [30, 0, 0], atol=1e-9)
+
+
+def collection(*features: dict, **more: object) -> str:
+    return json.dumps({"type": "FeatureCollection", "features": list(features), **more})
+
+
+def feature(kind: str, coordinates: list, **properties: object) -> dict:
+    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
+
+
+def test_outlines_and_points_of_geojson(tmp_path):
+    angled = [[0, 0], [20, 0], [20, 5], [5, 5], [5, 20], [0, 20], [0, 0]]
+    box_map = loaded(
+        tmp_path,
+        collection(
+            feature("Polygon", [[[100, 0], [110, 0], [110, 6], [100, 6], [100, 0]]], type="Buildings", height=9),
+            feature("Polygon", [angled], type="Buildings", height=12, base=1.0),
+            feature("Point", [50, 50], type="Vegetation", length=4, width=4, height=6),
+            feature("Polygon", [[[0, -10], [120, -10], [120, -4], [0, -4], [0, -10]]], type="Roads"),
+        ),
+        ".geojson",
+    )
+    assert box_map.header.num_objects == 4
+    assert box_map.counts() == {"Buildings": 3, "Roads": 1, "Vegetation": 1}  # the angled house is two boxes
+    assert_allclose(sorted(np.prod(box_map.half_extents[box_map.kinds == 3][:, :2] * 2, axis=1)), [60, 75, 100])
+    house = int(np.argmin(np.linalg.norm(box_map.centers - [105, 3, 4.5], axis=1)))
+    assert_allclose(box_map.centers[house], [105, 3, 4.5])
+    assert_allclose(box_map.maxs[box_map.kinds == 1][0], [120, -4, 0])
+
+
+def test_longitude_and_latitude_become_metres(tmp_path):
+    """A degree of latitude at 52 degrees north is 111,267 m on the ellipsoid, one of longitude 68,677 m (tables of WGS 84)."""
+    ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
+    box_map = loaded(tmp_path, collection(feature("Polygon", [ring], type="Buildings", height=9)), ".geojson")
+    size = sorted(box_map.half_extents[0, :2] * 2)
+    assert_allclose(size, [68.677, 111.267], rtol=2e-4)
+
+
+def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
+    write_boxes(tmp_path / "own.json", town())
+    box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
+    assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
+    with pytest.raises(ConfigError, match=r"maps\.boxes: boxes_3d\.json has its own types.*got metres_per_unit"):
+        load(BoxesConfig(path=tmp_path / "own.json", metres_per_unit=0.01))
+
+
+def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
+    text = (
+        PLAIN.replace(",10,20,4", ",500010,5000020,4")
+        .replace(",40,-5,3", ",500040,4999995,3")
+        .replace(",25,0,-", ",500025,5000000,-")
+    )
+    box_map = loaded(tmp_path, text)
+    assert box_map.header.offset_m == {"x": 500025.0, "y": 5000010.0, "z": 0.0}
+    assert np.abs(box_map.centers).max() < 100
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "words"),
+    [
+        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {}, r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are NONE, Roads.*2 to mend"),
+        (PLAIN.replace(",yaw_deg", ",yaw_dge"), {}, r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
+        (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]}, r"no column for type \(type, category, kind, class\)"),
+        (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
+        (PLAIN.replace("height,yaw_deg", "height,center_z"), {}, "2 columns are the z: z, center_z"),
+        (PLAIN.replace(",12,8,8,30", ",12,8,8"), {}, "line 2: 8 cells, where the first line has 9"),
+        (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {}, r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
+        (PLAIN.replace("7,Buildings", "8,Buildings"), {}, "id 8 occurs 2 times"),
+        (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),
+        (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
+        (PLAIN.replace("12,8,8,30", "1200,800,800,30"), {}, r"are these centimetres\?"),
+        ("", {}, "holds no boxes"),
+        (PLAIN + "\"a", {}, "not a table"),
+    ],
+)  # fmt: skip
+def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, settings, words):
+    with pytest.raises(InputError, match=words):
+        loaded(tmp_path, text, **settings)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")), "feature 0: not a geometry that has a place here; got LineString"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")), "feature 0: its coordinates are not rings"),
+        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")), "not rings of places"),
+        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)), r"feature 0: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
+        (collection(feature("Point", [5, 5], type="Vegetation", height=3)), "feature 0: neither length nor half_length"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")), "feature 0: neither height nor half_height"),
+        (json.dumps({"type": "Topology"}), "not GeoJSON"),
+        (collection(), "holds no boxes"),
+    ],
+)  # fmt: skip
+def test_all_that_is_wrong_with_geojson_is_told(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        loaded(tmp_path, text, ".geojson")
+
+
+def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
+    with pytest.raises(ConfigError, match=r"--set maps\.boxes\.path"):
+        load(BoxesConfig())
+    with pytest.raises(InputError, match=r"expected \.json, \.csv or \.geojson"):
+        loaded(tmp_path, PLAIN, ".txt")
+    with pytest.raises(ValueError, match="there is no type 'House'"):
+        BoxesConfig(types={"haus": "House"})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"extent":', '"size":', r"boxes\[0\]\.extent: Field required|boxes\[0\]\.size"),
+        ('"id":1,', '"id":1,"yaw":3,', r"boxes\[0\]\.yaw: Extra inputs"),
+        ("x east, y north", "x forward, y right", r"axes: not what its boxes are.*expected right-handed"),
+        ('"num_boxes": ', '"num_boxes": 1', "num_boxes: not what its boxes are"),
+        ('"Buildings": ', '"Buildings": 1', "counts: not what its boxes are"),
+        ('"semantic_id":3', '"semantic_id":4', "semantic_id: not the number of its type; got 4; expected 3, Buildings"),
+        ('"max":[', '"max":[8', "max: does not follow from center, extent and rotation"),
+    ],
+)
+def test_what_a_map_tells_beside_its_boxes_must_follow_from_them(tmp_path, old, new, words):
+    path = tmp_path / "boxes_3d.json"
+    write_boxes(path, town())
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=words):
+        read_boxes(path)
