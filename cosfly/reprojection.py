@@ -38,7 +38,7 @@ class Agreement:
     """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there (agree), lie behind
     it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance. error: median of those on
     planes, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
-    the three channels, less that of brightness, grey levels.
+    the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
     """
 
     seen: int
@@ -49,6 +49,7 @@ class Agreement:
     error: float
     correlation: float
     tint: float
+    shade: float
 
 
 def grid_rows(height_px: int) -> np.ndarray:
@@ -68,11 +69,12 @@ def compare_views(one: View, other: View, intrinsics: np.ndarray) -> Agreement:
         one.depth, one.instance, other.depth, other.instance, intrinsics.astype(np.float64), turn, shift, MOVING
     )
     pairs: np.ndarray = np.empty((0, 2))
-    tint = np.nan
+    tint = shade = np.nan
     if one.colours is not None and other.colours is not None:
         here, there = _colours_at(brightness, one.colours, other.colours, one.depth.shape[0])
         pairs = np.stack([here.mean(axis=1), there.mean(axis=1)], axis=1)
         if len(pairs) >= 60:
+            shade = float(np.median(pairs[:, 1] - pairs[:, 0]))
             hue = (there - pairs[:, 1:]) - (here - pairs[:, :1])
             tint = float(np.median(np.abs(hue).max(axis=1)))
     correlation = np.nan
@@ -80,7 +82,16 @@ def compare_views(one: View, other: View, intrinsics: np.ndarray) -> Agreement:
         correlation = float(np.corrcoef(pairs.T)[0, 1])
     error = float(np.median(errors)) if len(errors) >= 30 else np.nan
     seen, agree, hidden, through, same = (int(n) for n in counts)
-    return Agreement(seen, agree, hidden, through, same, error, correlation, tint)
+    return Agreement(seen, agree, hidden, through, same, error, correlation, tint, shade)
+
+
+def usual_correlation(correlations: np.ndarray, least_drop: float) -> tuple[float, float]:
+    """Give the usual correlation of a flight's frames with the one before each, and how much less is too little; NaN where none is known."""
+    known = correlations[np.isfinite(correlations)]
+    if not len(known):
+        return np.nan, np.nan
+    usual = float(np.median(known))
+    return usual, max(least_drop, 8.0 * float(np.median(np.abs(known - usual))))
 
 
 def _colours_at(matches: np.ndarray, one: np.ndarray, other: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -190,8 +201,11 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, turn, shift, moving):  
                 # Of a plane 1 / z is linear in the picture, so that between four pixels it is exact.
                 x0, y0 = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
                 a, b = s - 0.5 - x0, t - 0.5 - y0
-                q00, q01 = 1.0 / depth_b[y0, x0], 1.0 / depth_b[y0, x0 + 1]
-                q10, q11 = 1.0 / depth_b[y0 + 1, x0], 1.0 / depth_b[y0 + 1, x0 + 1]
+                d00, d01 = float(depth_b[y0, x0]), float(depth_b[y0, x0 + 1])
+                d10, d11 = float(depth_b[y0 + 1, x0]), float(depth_b[y0 + 1, x0 + 1])
+                if min(d00, d01, d10, d11) <= 0.0:  # invalid
+                    continue
+                q00, q01, q10, q11 = 1.0 / d00, 1.0 / d01, 1.0 / d10, 1.0 / d11
                 is_plane = abs(q00 + q11 - q01 - q10) < 1e-5 / z
                 if is_plane:
                     q = (1 - b) * ((1 - a) * q00 + a * q01) + b * ((1 - a) * q10 + a * q11)

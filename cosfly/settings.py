@@ -13,7 +13,7 @@ from caption.schema import CaptionConfig
 from cosfly.chance import rng_for
 from cosfly.config import Config, build
 from cosfly.errors import ConfigError
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig

@@ -42,7 +42,7 @@ from cosfly.cli.options import resolve
 from cosfly.config import apply_overrides, build
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.inspection import stage as inspection
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.items import Item
 from cosfly.journal import Journal
 from cosfly.maps import boxfile, cityjson, simworld

@@ -17,7 +17,7 @@ from caption.teachers.foreign import read_foreign, read_student
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError
 from cosfly.inspection import stage as inspection
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
 from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction

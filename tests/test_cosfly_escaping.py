@@ -170,7 +170,7 @@ def tree(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def inspection(tree, tmp_path_factory) -> Path:
-    from cosfly.inspection.flight import InspectConfig
+    from cosfly.inspection.settings import InspectConfig
 
     return inspect(InspectConfig(jerk_rms_max_mps3=1e6), None, None, tree, tmp_path_factory.mktemp("inspected"))
 

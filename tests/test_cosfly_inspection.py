@@ -17,14 +17,16 @@ from hypothesis import strategies as st
 
 from cosfly.errors import InputError, NothingKept
 from cosfly.geometry import mask_box
-from cosfly.inspection.flight import InspectConfig, check_motion, check_plan, is_shifted
-from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region, png_problem
+from cosfly.inspection import frames
+from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
+from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region
 from cosfly.inspection.others import check_others, others_told
+from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.issues import Issue, Report
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
-from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, tree_position
+from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, read_meta, tree_position
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight, write_flight
@@ -77,6 +79,7 @@ def workplace(specimen, tmp_path) -> Path:
 
 # The specimen's drone is jerkier than a planned one, so the plan's rules get their own tests below.
 CFG = InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
+NO_SUMS = CFG.model_copy(update={"check_checksums": False})
 
 
 def inspect(workplace: Path, cfg: InspectConfig = CFG, out: str = "out", **more):
@@ -223,7 +226,10 @@ def test_a_shift_that_hides_what_the_clean_flight_shows_goes_to_review(workplace
 
 
 def edit(folder: Path, change) -> None:
-    path = folder / "trajectory.json"
+    edit_json(folder / "trajectory.json", change)
+
+
+def edit_json(path: Path, change) -> None:
     value = read_json(path)
     change(value)
     path.write_text(json.dumps(value))
@@ -298,7 +304,161 @@ DEFECTS = {
     "projection_differs": lambda f: edit(f, at_point("target", "image_uv", [1.0, 2.0])),
     "target_missing": lambda f: edit(f, at_point("target", "world_location", None)),
     "layout": lambda f: edit(f, lambda t: t.update(schema_version="6.0.0")),
+    "pose_differs in place": lambda f: edit(
+        f, lambda t: t["points"][3]["drone_pose"].update(z=t["points"][3]["drone_pose"]["z"] + 0.1)
+    ),
+    "pose_differs of the person": lambda f: edit(f, lambda t: t["points"][3]["target"]["world_location"].update(x=9.0)),
+    "projection_differs of the box": lambda f: edit(
+        f, at_point("target", "bbox_2d", {"xmin": 1, "ymin": 2, "xmax": 3, "ymax": 4})
+    ),
+    "projection_differs in depth": lambda f: edit(f, at_point("target", "depth", 1.0)),
+    "target_missing in the picture": lambda f: edit(f, at_point("target", "image_uv", None)),
+    "teleport": lambda f: edit(f, lambda t: t["points"][3]["drone_pose"].update(x=99.0)),
+    "missing_file that is listed": lambda f: (f / FRAME / "meta.json").unlink(),
+    "broken_annotation of another frame": lambda f: edit_json(f / FRAME / "meta.json", lambda m: m.update(index=4)),
+    "wrong_format of instances": lambda f: edit_image(f / FRAME / "instance.png", lambda image: image[:54, :96]),
+    "broken_image in grey": lambda f: cv2.imwrite(
+        str(f / FRAME / "rgb.png"), np.arange(192 * 108, dtype=np.uint8).reshape(108, 192)
+    ),
+    "checksum of the list": lambda f: (f / "checksums.sha256").write_text("frame_00003"),
+    "depth_range everywhere": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: d * 0 + 7),
 }
+
+
+def largest_surface(folder: Path) -> np.ndarray:
+    """Pixels of the surface that fills most of frame 3, (h, w) bool."""
+    kinds, ids = read_instance(folder / FRAME)
+    numbers, counts = np.unique(ids[(kinds != KINDS["Pedestrians"]) & (kinds != KINDS["NONE"])], return_counts=True)
+    return ids == numbers[counts.argmax()]
+
+
+def with_grain(image: np.ndarray) -> np.ndarray:
+    grain = np.random.default_rng(0).integers(-6, 7, image.shape)
+    return np.clip(image.astype(int) + grain, 0, 255).astype(np.uint8)
+
+
+def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
+    """Give all of frame 3 grain, and its largest surface a colour (blue, green, red), with grain or without."""
+    surface = largest_surface(folder)
+
+    def change(image: np.ndarray) -> np.ndarray:
+        image = image.copy()
+        image[surface] = color
+        grainy = with_grain(image)
+        return grainy if grain else np.where(surface[..., None], image, grainy)
+
+    edit_image(folder / FRAME / "rgb.png", change)
+
+
+def let_fight(folder: Path) -> None:
+    """Give every other column of the largest surface to another one."""
+    surface = largest_surface(folder)
+    surface[:, ::2] = False
+
+    def change(image: np.ndarray) -> np.ndarray:
+        image = image.copy()
+        image[surface] = (1, 77, KINDS["Walls"])
+        return image
+
+    edit_image(folder / FRAME / "instance.png", change)
+
+
+def at_upper_left(values: np.ndarray, metres: float) -> np.ndarray:
+    """Depth with a part that lies farther off: what stood there is gone."""
+    values = values.copy()
+    part = values[: len(values) // 2, : values.shape[1] // 2]
+    part[part < 900] += np.float32(metres)
+    return values
+
+
+# What a person has to look at; where None stands, the finding is of the whole flight.
+TO_REVIEW = {
+    "missing_texture of one colour": lambda f: paint(f, (120, 125, 130), grain=False),
+    "missing_texture magenta": lambda f: paint(f, (240, 20, 240), grain=True),
+    "z_fighting": let_fight,
+    "temporal_jump gone": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: at_upper_left(d, 60.0)),
+    "temporal_jump near": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(d < 900, 0.8 * d, d).astype("f4")),
+    "temporal_jump of the picture": lambda f: edit_image(f / FRAME / "rgb.png", lambda image: image[:, ::-1]),
+    "temporal_jump of brightness": lambda f: edit_image(f / FRAME / "rgb.png", lambda image: np.clip(image.astype(int) + 40, 0, 255)),
+    "invalid_depth": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(np.arange(len(d))[:, None] < 5, 0, d).astype("f4")),
+    "shorter_than_planned": lambda f: edit(f, lambda t: (t["points"].pop(), t["points"][-1]["nav_waypoint"].update(t1_world=None))),
+    "never_visible": lambda f: edit(f, lambda t: [p["target"].update(visible=False) for p in t["points"]]),
+    "track_quality": lambda f: [edit_image(f / frame_name(i) / "instance.png", slimmer) for i in range(NUM_POINTS)],
+    "stray_frame": lambda f: shutil.copytree(f / frame_name(0), f / frame_name(99)),
+    "no_trace": lambda f: edit(f, lambda t: t["source"].update(scenario_id="another")),
+}  # fmt: skip
+
+
+def slimmer(image: np.ndarray) -> np.ndarray:
+    """A person of whom the uppermost row of pixels is left."""
+    image = image.copy()
+    is_person = image[..., 2] == KINDS["Pedestrians"]
+    rows = np.flatnonzero(is_person.any(axis=1))
+    if len(rows):
+        is_person[rows[0]] = False
+        image[is_person] = (0, 1, KINDS["Roads"])
+    return image
+
+
+@pytest.mark.parametrize("defect", TO_REVIEW)
+def test_a_planted_defect_puts_a_flight_before_a_person(workplace, defect):
+    broken = first_flight(workplace)
+    before = codes_of(inspect(workplace, NO_SUMS, "before"), broken)
+    TO_REVIEW[defect](broken)
+    with contextlib.suppress(NothingKept):
+        inspect(workplace, NO_SUMS)
+    found = read_inspection(workplace / "out" / "inspect.json")
+    code = defect.split()[0]
+    assert code not in before
+    assert codes_of(found, broken).get(code) == "warning", codes_of(found, broken)
+    first = next(i for f in found.flights for i in f.issues if i.code == code)
+    assert str(workplace) not in first.where
+    others = {
+        c
+        for f in found.flights
+        if not f.folder.endswith(f"{broken.parent.name}/ORI")
+        for c in codes_of(found, Path(f.folder))
+    }
+    assert code not in others
+
+
+def test_a_time_that_nobody_planned(workplace):
+    folder = first_flight(workplace)
+    late_s = read_flight(folder).time_s.copy()
+    late_s[3] += 0.1
+    report = Report()
+    check_poses(replace(read_flight(folder), time_s=late_s), plan_of(folder), CFG, report)
+    assert [(i.code, i.where) for i in report.issues] == [
+        ("pose_differs", "trajectory.json: points[3].timing.trace_timestamp")
+    ]
+
+
+def test_a_flight_that_its_tree_does_not_list(workplace):
+    """The tree's manifest lists the other flights, and another digest of one."""
+    tree, broken, twin = workplace / "tree", first_flight(workplace), first_flight(workplace, "aug_001")
+    files = [folder / "trajectory.json" for folder in find_flights(tree) if folder != broken]
+    outputs = [
+        {"path": p.relative_to(tree).as_posix(), "bytes": 1, "sha256": "0" * 64 if p.parent == twin else sha256_file(p)}
+        for p in files
+    ]
+    write_json(tree / "manifest.json", {"schema": "cosfly.manifest", "schema_version": "1.0", "outputs": outputs})
+    found = inspect(workplace)
+    assert codes_of(found, broken) == {"not_of_this_tree": "error"}
+    assert codes_of(found, twin) == {"checksum": "error"}
+    assert found.funnel.flights.accepted == 2
+
+
+def test_every_check_has_a_planted_defect():
+    """Codes are found in the sources; `elsewhere` names those whose defects are planted in tests of their own."""
+    sources = "".join(path.read_text() for path in Path(frames.__file__).parent.glob("*.py"))
+    codes = set(re.findall(r"report\.(?:error|warn)\(\s*\"(\w+)\"", sources)) | {"collision", "clearance"}
+    elsewhere = {
+        "acceleration", "jerk", "smoothness", "prefiltered", "collision", "clearance", "five_ray_visibility", "hidden_by_shift",
+        "no_twin", "unreadable", "not_of_this_tree",
+    }  # fmt: skip
+    planted = {name.split()[0] for name in (*DEFECTS, *TO_REVIEW)}
+    assert not planted & elsewhere
+    assert codes == planted | elsewhere
 
 
 @pytest.mark.parametrize("defect", DEFECTS)
@@ -311,7 +471,7 @@ def test_a_planted_defect_rejects_that_flight_alone(workplace, defect):
     assert [f.result for f in found.flights].count("accepted") == 3
     assert found.funnel.flights.rejected == found.funnel.trajectories.rejected == 1
     issue = next(i for f in found.flights for i in f.issues if i.code == code)
-    assert "frame_00003" in issue.where or "points[3]" in issue.where or code == "layout"
+    assert "frame_00003" in issue.where or "points[3]" in issue.where or code in ("layout", "checksum")
     assert str(workplace) not in issue.where  # a report can be handed on
 
 
@@ -355,7 +515,7 @@ def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes
 
 def test_a_flight_without_others_has_no_figures_of_them(workplace):
     flight, report, metrics = read_flight(first_flight(workplace)), Report(), {}
-    assert others_told(flight, list(range(len(flight)))) == {}
+    assert others_told(flight, {i: read_meta(flight.frame_folder(i)) for i in range(len(flight))}) == {}
     check_others(flight, {}, 2.5, report, metrics)
     assert (metrics, report.issues) == ({}, [])
 
@@ -436,18 +596,6 @@ def test_pixels_can_be_sampled_or_left_out(workplace):
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
-
-
-def test_png_problem_finds_every_flipped_byte():
-    _, data = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8))
-    image = data.tobytes()
-    assert png_problem(image) is None
-    for position in range(len(image)):
-        broken = bytearray(image)
-        broken[position] ^= 1
-        assert png_problem(bytes(broken)) is not None, position
-    for length in range(len(image)):
-        assert png_problem(image[:length]) is not None
 
 
 boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))

@@ -24,7 +24,7 @@ from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.errors import InputError, VerifyError
 from cosfly.inspection import stage as inspection
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.frames import read_meta
 from cosfly.products.inspection import read_inspection

@@ -22,7 +22,7 @@ from cosfly.config import build
 from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.frame_views import PEDESTRIAN_RGB, read_view
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
 from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes

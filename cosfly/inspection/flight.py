@@ -1,4 +1,4 @@
-"""What the inspection finds out about one flight: its thresholds, its checks of plan, poses and motion, its record (sec:step6).
+"""What the inspection finds out about one flight: its checks of plan, poses and motion, its record (sec:step6).
 
 The poses that were drawn are measured against the map themselves: a perturbed flight is not its plan.
 """
@@ -7,37 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
-from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.flight_metrics import (
-    ACCEL_RMS_MAX_MPS2,
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
-    FIVE_RAY_MEAN_MIN,
-    JERK_RMS_MAX_MPS3,
-    RELAXED_SAFETY_M,
     accel_rms,
     jerk_rms,
     length_m,
     smoothness_score,
 )
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
-from cosfly.inspection.frames import (
-    FrameNumbers,
-    check_checksums,
-    check_files,
-    check_pixels,
-    check_recorded,
-    choose_frames,
-    target_box,
-)
+from cosfly.inspection.files import Checksums, check_files, check_recorded
+from cosfly.inspection.frames import FrameNumbers, check_frames, choose_frames, target_box
 from cosfly.inspection.others import check_others, others_told
 from cosfly.inspection.report import FlightView, draw_flight
+from cosfly.inspection.settings import InspectConfig
 from cosfly.issues import Report
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.inspection import FlightInspection
@@ -51,56 +40,6 @@ if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3
-
-
-class InspectConfig(Config):
-    """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
-
-    accel_rms_max_mps2: float = Field(
-        ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
-    )
-    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
-    smoothness_min: float = Field(
-        0.5, ge=0, le=1, description="smoothness score S below this goes to review; 0 turns the rule off"
-    )
-    five_ray_mean_min: float = Field(
-        FIVE_RAY_MEAN_MIN,
-        ge=0,
-        le=1,
-        description="mean five-ray visibility of the flight's poses below this rejects; 0 turns the rule off",
-    )
-    clearance_min_m: float = Field(
-        RELAXED_SAFETY_M, ge=0, description="a drone nearer than this to an obstacle rejects, m; 0: only one inside"
-    )
-    check_pixels: Literal["all", "sample", "none"] = Field(
-        "all",
-        description="decode every frame, an even sample, or none (then only names, headers and poses are checked)",
-    )
-    pixel_sample: int = Field(16, ge=1, description="frames per flight that check_pixels: sample decodes")
-    check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")
-    pose_tolerance_m: float = Field(1e-3, ge=0, description="distance allowed between a flight's pose and its plan, m")
-    rotation_tolerance_deg: float = Field(0.01, ge=0, description="turn allowed between a flight's pose and its plan")
-    reprojection_tolerance_px: float = Field(
-        0.5, gt=0, description="distance allowed between the recorded and the projected target, px"
-    )
-    drone_speed_max_mps: float = Field(25.0, gt=0, description="a faster step between two frames is a teleport, m/s")
-    target_speed_max_mps: float = Field(10.0, gt=0, description="the same for the person, m/s")
-    track_quality_min: float = Field(
-        0.25,
-        ge=0,
-        le=1,
-        description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off",
-    )
-    mask_visibility_min: float = Field(
-        0.5, ge=0, le=1, description="a frame at least this visible must show pedestrian pixels at the target's box"
-    )
-    invalid_depth_max: float = Field(
-        0.01, ge=0, le=1, description="share of invalid depth pixels above this in any frame goes to review"
-    )
-    thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
-
-
-# --- one flight -------------------------------------------------------------------------------------------------------
 
 
 class Inspected(BaseModel):
@@ -335,13 +274,14 @@ def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None
 def _check_frames(
     flight: Flight, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> FrameNumbers:
-    complete = check_files(flight, report)
-    told = others_told(flight, complete)
+    metas = check_files(flight, report)
+    told = others_told(flight, metas)
     check_others(flight, told, cfg.clearance_min_m, report, metrics)
-    if cfg.check_checksums:
-        check_checksums(flight, report)
-    chosen = choose_frames(complete, cfg.check_pixels, cfg.pixel_sample)
-    return check_pixels(flight, chosen, told, cfg.mask_visibility_min, report)
+    checksums = Checksums(flight, report, is_wanted=cfg.check_checksums)
+    chosen = choose_frames(list(metas), cfg.check_pixels, cfg.pixel_sample)
+    numbers = check_frames(flight, chosen, metas, told, checksums, cfg, report)
+    checksums.compare_others()
+    return numbers
 
 
 def _rendered_metrics(
@@ -353,6 +293,7 @@ def _rendered_metrics(
     invalid = max(frames.invalid_depth_shares, default=None)
     metrics.update(
         num_frames_checked=frames.num_checked,
+        num_frames_compared=frames.num_compared,
         length_m=length_m(flight.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,

@@ -1,13 +1,11 @@
-"""Checks on the files of one flight: are they all there, do they decode, and do they show what the poses say?
+"""Checks on the pictures of one flight: do they decode, and do they show what the poses and the frames before say?
 
 The inspection's eyes. It judges nothing: findings go into a Report, numbers into FrameNumbers; the thresholds that make a
-flight acceptable stand in stage.py.
+flight acceptable stand in flight.py.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,27 +15,25 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import box_corners, mask_box, project, world_from_camera
+from cosfly.inspection.files import Checksums
+from cosfly.inspection.jumps import Jumps
+from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
+from cosfly.inspection.settings import InspectConfig
 from cosfly.issues import Report
 from cosfly.products.frames import (
-    FRAME_FILES,
-    FRAMES_DIR,
+    FILE_NAMES,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
+    FrameMeta,
     OthersMeta,
     frame_name,
-    read_depth,
-    read_instance,
-    read_meta,
-    read_rgb,
     tree_of,
 )
-from cosfly.products.kinds import KINDS
+from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.arrays import PNG_SIGNATURE, array_header, picture_size
-from cosfly.reading.files import read_bytes, sha256_file
+from cosfly.reading.files import read_bytes
 from cosfly.runner import advance
-from cosfly.store import CHECKSUMS, read_checksums
 
 SMALL_PX = (128, 72)  # frames are shrunk to this before they are compared with each other
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street still has more than 5
@@ -51,136 +47,9 @@ class FrameNumbers:
     """What the pixels of one flight say; lists run over the checked frames that show the target."""
 
     num_checked: int = 0
+    num_compared: int = 0  # with the frame before
     track_ious: list[float] = field(default_factory=list)
     invalid_depth_shares: list[float] = field(default_factory=list)
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
-def png_problem(data: bytes) -> str | None:
-    """Say what is wrong with the chunks of a PNG, None if every checksum holds and the end is there.
-
-    Decoders let much of this pass and fill the rest with grey.
-    """
-    if not data.startswith(PNG_SIGNATURE):
-        return f"{len(data)} bytes without the PNG signature"
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        kind, end = data[position + 4 : position + 8], position + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(data[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            return f"a damaged {kind.decode('latin-1')} chunk at byte {position}"
-        if kind == b"IEND":
-            return None
-        position = end + 4
-    return f"the file ends at byte {len(data)}, before the image does"
-
-
-def check_files(flight: Flight, report: Report) -> list[int]:
-    """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
-
-    A tree of somebody else may lack a kind of file altogether: `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone.
-
-    Returns:
-        indices of the frames that are complete so far.
-    """
-    assert flight.folder is not None
-    size = (flight.camera.width_px, flight.camera.height_px)
-    complete = []
-    absent = [] if flight.is_ours else [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
-    names = [name for name in FRAME_FILES if name not in absent]
-    for name in absent:
-        report.add(
-            "note", "not_in_this_tree", f"{FRAMES_DIR}/*/{name}", "no such file", "one a frame, in cosfly's trees"
-        )
-    for i in range(len(flight)):
-        advance()
-        problems_before = len(report.issues)
-        for name in names:
-            path, where = flight.frame_folder(i) / name, f"{frame_name(i)}/{name}"
-            if not path.is_file():
-                report.error("missing_file", where, "no such file", "one file per frame and modality")
-            elif name == "meta.json":
-                _check_meta(flight, i, report)
-            else:
-                _check_header(path, size, where, report)
-        if len(report.issues) == problems_before:
-            complete.append(i)
-    known = {Path(frame_name(i)).name for i in range(len(flight))}
-    frames = flight.folder / FRAMES_DIR
-    for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
-        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
-    return complete
-
-
-def _has_any(flight: Flight, name: str) -> bool:
-    return any((flight.frame_folder(i) / name).exists() for i in range(len(flight)))
-
-
-def _check_header(path: Path, size: tuple[int, int], where: str, report: Report) -> None:
-    """Check type and (width, height) of a picture or a depth image, by its header."""
-    is_depth = path.suffix == ".npy"
-    expected = f"float32 ({size[1]}, {size[0]})" if is_depth else f"a PNG of {size[0]} x {size[1]} px"
-    try:
-        if is_depth:
-            found: object = str(array_header(path, tree=tree_of(path.parent)))
-        else:
-            found = picture_size(path, tree=tree_of(path.parent)) or "no PNG header"
-    except InputError as error:
-        found = error.got or error.what
-    if found != (expected if is_depth else size):
-        report.error("wrong_format", where, found, expected)
-
-
-def _check_meta(flight: Flight, i: int, report: Report) -> None:
-    where = f"{frame_name(i)}/meta.json"
-    try:
-        meta = read_meta(flight.frame_folder(i))
-    except InputError as error:
-        report.error("broken_annotation", where, error.got, "a frame annotation")
-        return
-    if meta.index != i:
-        report.error("broken_annotation", f"{where}: index", meta.index, str(i))
-
-
-def check_checksums(flight: Flight, report: Report) -> None:
-    """Compare every file that `checksums.sha256` lists with its digest."""
-    assert flight.folder is not None
-    if not (flight.folder / CHECKSUMS).is_file():
-        report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the flight's files")
-        return
-    try:
-        digests = read_checksums(flight.folder)
-    except InputError as error:
-        report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
-        return
-    for name, digest in digests.items():
-        advance()
-        path = flight.folder / name
-        if not path.is_file():
-            report.error("missing_file", name, "no such file", f"a file, listed in {CHECKSUMS}")
-        elif sha256_file(path) != digest:
-            report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
-
-
-def check_recorded(flight: Flight, root: Path, recorded: Mapping[str, str], report: Report) -> None:
-    """Compare a flight's own records with the manifest of its tree, `recorded`: path in the tree -> sha256; empty without one."""
-    assert flight.folder is not None
-    for name in ("trajectory.json", CHECKSUMS) if recorded else ():
-        path = flight.folder / name
-        digest = recorded.get(path.relative_to(root).as_posix())
-        if digest is None and name == "trajectory.json":
-            report.error(
-                "not_of_this_tree", name, "no such entry in the tree's manifest", "a flight that was made with it"
-            )
-        elif digest is not None and path.is_file() and sha256_file(path) != digest:
-            report.error("checksum", name, "other bytes", "the digest in the tree's manifest")
-
-
-# --- pixels -----------------------------------------------------------------------------------------------------------
 
 
 def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int]:
@@ -192,54 +61,80 @@ def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int
     return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, num_sample).round().astype(int))]
 
 
-def check_pixels(
-    flight: Flight, indices: list[int], told: dict[int, OthersMeta], mask_visibility_min: float, report: Report
+def check_frames(
+    flight: Flight,
+    indices: list[int],
+    metas: Mapping[int, FrameMeta | None],
+    told: Mapping[int, OthersMeta],
+    checksums: Checksums,
+    cfg: InspectConfig,
+    report: Report,
 ) -> FrameNumbers:
-    """Decode frames and compare colour, depth and mask with each other and with the geometry. told: others, by frame."""
-    numbers = FrameNumbers()
+    """Unpack frames and compare colour, depth and mask with each other, with the geometry and with the frame before.
+
+    Each file is read once, for its checksum too.
+
+    Args:
+        metas, told: annotations, and what they tell of others, by frame.
+    """
+    numbers, jumps = FrameNumbers(), Jumps(flight)
     previous: tuple[int, np.ndarray] | None = None
     for i in indices:
         advance()
-        frame, where = flight.frame_folder(i), frame_name(i)
+        where = frame_name(i)
         try:
-            problems = [(name, _png_problem_of(frame / name)) for name in ("rgb.png", "instance.png")]
-            for name, problem in problems:
-                if problem:
-                    report.error("broken_image", f"{where}/{name}", problem, "a PNG that decodes in full")
-            if any(problem for _, problem in problems):
-                continue
-            rgb = read_rgb(frame)
-            depth = read_depth(frame) if (frame / "depth.npy").exists() else None
-            kinds = _kinds_without(told.get(i), frame) if (frame / "instance.png").exists() else None
+            picture = unpack(_read(flight, i, checksums), Path(where))
         except InputError as error:
-            report.error("broken_image", where, f"{error.what}: {error.got}", "files that decode in full")
+            report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
             continue
         numbers.num_checked += 1
-        small = cv2.resize(rgb, SMALL_PX, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(picture.colours, SMALL_PX, interpolation=cv2.INTER_AREA)
         if small.std() < BLANK_STD:
             report.error("blank_frame", f"{where}/rgb.png", f"standard deviation {small.std():.2f}", "a picture")
         if previous is not None and (previous[1] == small).all() and _moved(flight, previous[0], i):
             got = f"the picture of frame {previous[0]}"
             report.error("frozen_frame", f"{where}/rgb.png", got, "another picture: the camera has moved")
         previous = (i, small)
-        if depth is not None and _check_depth(depth, where, report):
-            numbers.invalid_depth_shares.append(float((depth == INVALID_DEPTH_M).mean()))
-            if kinds is not None:
-                _check_mask(flight, i, kinds, depth, mask_visibility_min, numbers, report)
+        left_out = _ids_of(told.get(i))
+        look = look_at(picture, left_out, cfg.flat_pairs_min)
+        _check_surfaces(look, where, cfg, report)
+        if picture.depth.size and _check_depth(picture.depth, where, numbers, report):
+            meta = metas.get(i)
+            jumps.see(i, picture, None if meta is None else meta.look)
+            if picture.instance.size:
+                _check_mask(flight, i, picture, look, left_out, cfg.mask_visibility_min, numbers, report)
+    numbers.num_compared = jumps.judge(cfg, report)
     return numbers
 
 
-def _png_problem_of(path: Path) -> str | None:
-    """As `png_problem`; None for a file of a tree that has none, of which `check_files` said so."""
-    return png_problem(read_bytes(path, what="image", tree=tree_of(path.parent))) if path.exists() else None
+def _read(flight: Flight, i: int, checksums: Checksums) -> dict[str, bytes]:
+    """Read the pictures of a frame that are there; `check_files` said which are not."""
+    folder, files = flight.frame_folder(i), dict[str, bytes]()
+    for name in FILE_NAMES.values():
+        if (path := folder / name).exists():
+            files[name] = read_bytes(path, what="image", tree=tree_of(folder))
+            checksums.compare(f"{frame_name(i)}/{name}", files[name])
+    return files
 
 
-def _kinds_without(told: OthersMeta | None, frame: Path) -> np.ndarray:
-    """Read the kinds of pixels, (h, w); those of others are NONE: the pedestrian who is left is the target."""
-    kinds, ids = read_instance(frame)
-    if told is None:
-        return kinds
-    return np.where(np.isin(ids, [other.instance_id for other in told.others]), KINDS["NONE"], kinds)
+def _ids_of(told: OthersMeta | None) -> np.ndarray:
+    """Ids of people who are not the target, (65536,) bool."""
+    ids = np.zeros(NUM_IDS, dtype=np.bool_)
+    if told is not None:
+        ids[[other.instance_id for other in told.others if other.instance_id < NUM_IDS]] = True
+    return ids
+
+
+def _check_surfaces(look: Look, where: str, cfg: InspectConfig, report: Report) -> None:
+    """Say where a texture may be missing, and where surfaces fight for pixels."""
+    if look.flat > cfg.flat_surface_max:
+        got = f"{look.flat:.1%} of the picture is a surface of one colour ({KIND_NAMES.get(look.flat_kind, look.flat_kind)})"
+        report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {cfg.flat_surface_max:.1%}")
+    if look.magenta > cfg.magenta_max:
+        report.warn("missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {cfg.magenta_max:.2%}")  # fmt: skip
+    if look.fighting > cfg.z_fighting_max:
+        got = f"{look.fighting:.3%} of the pixels alternate between two surfaces of one plane"
+        report.warn("z_fighting", f"{where}/instance.png", got, f"at most {cfg.z_fighting_max:.3%}")
 
 
 def _moved(flight: Flight, i: int, k: int) -> bool:
@@ -249,27 +144,29 @@ def _moved(flight: Flight, i: int, k: int) -> bool:
     return bool(shift_m > 0.5 or turn_deg > 2.0)
 
 
-def _check_depth(depth: np.ndarray, where: str, report: Report) -> bool:
+def _check_depth(depth: np.ndarray, where: str, numbers: FrameNumbers, report: Report) -> bool:
     """Check that depths are metres between invalid (0) and sky (1000)."""
     place = f"{where}/depth.npy"
-    if not np.isfinite(depth).all():
+    low, high = float(depth.min()), float(depth.max())  # NaN if any is
+    if not np.isfinite([low, high]).all():
         report.error("depth_range", place, f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres")
         return False
-    low, high = float(depth.min()), float(depth.max())
     if low < INVALID_DEPTH_M or high > SKY_DEPTH_M:
         report.error("depth_range", place, f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m")
         return False
     if low == high:
         report.error("depth_range", place, f"{low:.3f} m everywhere", "a depth image")
         return False
+    numbers.invalid_depth_shares.append(float((depth == INVALID_DEPTH_M).mean()) if low == INVALID_DEPTH_M else 0.0)
     return True
 
 
 def _check_mask(
     flight: Flight,
     i: int,
-    kinds: np.ndarray,
-    depth: np.ndarray,
+    picture: Picture,
+    look: Look,
+    left_out: np.ndarray,
     visibility_min: float,
     numbers: FrameNumbers,
     report: Report,
@@ -279,8 +176,11 @@ def _check_mask(
     visibility = flight.visibility[i]
     if np.isnan(box).any() or not visibility > 0:
         return
-    where = f"{frame_name(i)}/instance.png"
-    region = pedestrian_region(kinds, box)
+    where, region = f"{frame_name(i)}/instance.png", None
+    x0, y0, x1, y1 = people = look.person_box or (0, 0, 0, 0)
+    corner = np.array([x0, y0, x0, y0], dtype=np.float64)
+    if look.person_box is not None:
+        region = pedestrian_region(_kinds_without(picture.instance[y0:y1, x0:x1], left_out), box - corner)
     if region is None:
         area_px2 = (box[2] - box[0]) * (box[3] - box[1])
         if visibility >= visibility_min and area_px2 >= MASK_MIN_BOX_PX2:
@@ -288,18 +188,25 @@ def _check_mask(
             report.error("mask_disagrees", where, got, "pedestrian pixels where the pose puts the person")
         numbers.track_ious.append(0.0)
         return
-    found = mask_box(region)
+    found = mask_box(region) + corner
     numbers.track_ious.append(box_iou(box, found))
     if flight.target_mask_bbox is not None:
-        recorded, everyone = flight.target_mask_bbox[i], mask_box(kinds == KINDS["Pedestrians"])
+        recorded = flight.target_mask_bbox[i]
         # Between this part of the person and all pedestrian pixels: a pole in front cuts a person into parts. NaN is neither.
-        if not (_encloses(recorded, found) and _encloses(everyone, recorded)):
+        if not (_encloses(recorded, found) and _encloses(np.array(people), recorded)):
             place = f"trajectory.json: points[{i}].target.mask_bbox_2d"
             report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {found.tolist()}")
-    expected_m, found_m = float(flight.target_depth_m[i]), float(np.median(depth[region]))
+    expected_m = float(flight.target_depth_m[i])
+    found_m = float(np.median(picture.depth[y0:y1, x0:x1][region]))
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"
         report.error("depth_disagrees", f"{frame_name(i)}/depth.npy", f"{found_m:.2f} m at the person", expected)
+
+
+def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """Give the kinds of pixels, (h, w); those of ids that are left out are NONE: the pedestrian who stays is the target."""
+    ids = instance[..., 1].astype(np.uint16) | (instance[..., 2].astype(np.uint16) << 8)
+    return np.where(left_out[ids], KINDS["NONE"], instance[..., 0])
 
 
 def target_box(flight: Flight, i: int) -> np.ndarray:
@@ -320,8 +227,8 @@ def pedestrian_region(kinds: np.ndarray, box: np.ndarray) -> np.ndarray | None:
     if not is_person.any():
         return None
     _, labels = cv2.connectedComponents(is_person, connectivity=8)
-    x0, y0 = np.floor(box[:2]).astype(int)
-    x1, y1 = np.ceil(box[2:]).astype(int)
+    x0, y0 = np.maximum(np.floor(box[:2]), 0).astype(int)
+    x1, y1 = np.maximum(np.ceil(box[2:]), 0).astype(int)
     shared = np.bincount(labels[y0:y1, x0:x1].ravel())
     shared[:1] = 0  # the background
     return labels == int(shared.argmax()) if shared.any() else None

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.flight_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.issues import Report
-from cosfly.products.frames import OtherMeta, OthersMeta, read_meta
+from cosfly.products.frames import FrameMeta, OtherMeta, OthersMeta
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.products.others import BUILDS, Other, distances_to_boxes_m
 from cosfly.products.playback import Flight
 
 
-def others_told(flight: Flight, indices: list[int]) -> dict[int, OthersMeta]:
-    """Read what the annotations of frames tell of others, by frame; empty for a flight without, whose first frame says so."""
-    told: dict[int, OthersMeta] = {}
-    for i in indices if flight.is_ours else []:
-        try:
-            others = read_meta(flight.frame_folder(i)).others
-        except InputError:  # `check_files` said so
-            continue
-        if others is None:
-            break
-        told[i] = others
-    return told
+def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:
+    """Give what the annotations of frames tell of others, by frame; empty for a flight without, and for one of somebody else."""
+    if not flight.is_ours:
+        return {}
+    return {i: meta.others for i, meta in metas.items() if meta is not None and meta.others is not None}
 
 
 def check_others(

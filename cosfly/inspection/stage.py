@@ -10,8 +10,9 @@ from collections import Counter
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.inspection.flight import InspectConfig, Inspected, inspect_flight, trace_id
+from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
 from cosfly.inspection.report import FlightView, write_report
+from cosfly.inspection.settings import InspectConfig
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
@@ -21,6 +22,7 @@ from cosfly.products.inspection import (
     Funnel,
     Inspection,
     TrajectoryFunnel,
+    count_trajectories,
     write_inspection,
 )
 from cosfly.products.playback import find_flights, read_flight
@@ -141,23 +143,17 @@ def _trajectory_funnel(flights: list[FlightInspection], planned: list[DroneTrace
 
     Without plans those that are there count as planned.
     """
-    results: dict[str, set[str]] = {}
-    for flight in flights:
-        # Of several runs below one folder, trajectories of one name are several.
-        name = str(Path(flight.folder).parent) if planned is None else flight.trace_id
-        if name is not None:
-            results.setdefault(name, set()).add(flight.result)
-    num_planned, planned = len(results) if planned is None else len(planned), planned or []
-    dropped = Counter(str(t.drop_reason) for t in planned if t.drop_reason is not None and t.path_id not in results)
-    worst = Counter(next(r for r in ("rejected", "review", "accepted") if r in found) for found in results.values())
+    counts = count_trajectories(flights, planned=planned is not None)
+    rendered = {flight.trace_id for flight in flights}
+    dropped = Counter(
+        str(t.drop_reason) for t in planned or [] if t.drop_reason is not None and t.path_id not in rendered
+    )
+    num_planned = counts["rendered"] if planned is None else len(planned)
     return TrajectoryFunnel(
         planned=num_planned,
         dropped=dict(sorted(dropped.items())),
-        not_rendered=num_planned - sum(dropped.values()) - len(results),
-        rendered=len(results),
-        accepted=worst["accepted"],
-        review=worst["review"],
-        rejected=worst["rejected"],
+        not_rendered=num_planned - sum(dropped.values()) - counts["rendered"],
+        **counts,
     )
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.config import Config
+from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.png.write import areas_png, colours_png
 from cosfly.products.places import tree_of_flight
-from cosfly.reading.arrays import read_array, read_picture
+from cosfly.reading.arrays import parse_array_header, read_array, read_picture
 from cosfly.reading.documents import read_model
 from cosfly.reprojection import grid_rows
 from cosfly.store import dump_json
@@ -263,6 +264,19 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
 def read_depth(frame: Path) -> np.ndarray:
     """Read `depth.npy` of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky, 0.0 invalid."""
     return read_array(frame / "depth.npy", dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame))
+
+
+def depth_values(data: memoryview, where: Path) -> np.ndarray:
+    """Give the numbers of a depth image's bytes, (h, w) float32 as `read_depth`, without a copy.
+
+    Raises:
+        InputError: it is no complete array of that type.
+    """
+    header = parse_array_header(data, where, what="depth image")
+    if header.dtype != np.float32 or len(header.shape) != 2:
+        raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
+    values = np.frombuffer(data, np.float32, offset=header.offset)
+    return values.reshape(header.shape, order="F" if header.is_fortran else "C")
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
 from cosfly.issues import Issue
@@ -41,6 +41,8 @@ class FlightInspection(_Strict):
     result: Result
     issues: list[Issue]
     metrics: dict[str, float | int | None]
+    # By a person, after the inspection: `review.py` puts it in, `inspect.json` never holds it.
+    decided: Literal["accepted", "rejected"] | None = Field(None, exclude=True)
 
     @property
     def track(self) -> Literal["clean", "perturbed"]:
@@ -49,7 +51,9 @@ class FlightInspection(_Strict):
 
     @property
     def reason(self) -> str | None:
-        """Code of the worst finding, None when the flight is accepted."""
+        """Code of the worst finding, None when the flight is accepted; `review` of one that a person rejected."""
+        if self.decided == "rejected":
+            return "review"
         return self.issues[0].code if self.result != "accepted" and self.issues else None
 
 
@@ -95,6 +99,21 @@ class Inspection(_Strict):
     funnel: Funnel
     coverage: Coverage | None = None  # of the accepted flights; None in inspections of before
     flights: list[FlightInspection]
+
+
+def count_trajectories(flights: list[FlightInspection], *, planned: bool) -> dict[str, int]:
+    """Count rendered trajectories by the result of their worst flight: `rendered`, `accepted`, `review`, `rejected`.
+
+    Args:
+        planned: by their plans, so that those without one count for none; else by their folders, as names of several runs may be the same.
+    """
+    results: dict[str, set[str]] = {}
+    for flight in flights:
+        name = flight.trace_id if planned else str(Path(flight.folder).parent)
+        if name is not None:
+            results.setdefault(name, set()).add(flight.result)
+    worst = Counter(next(r for r in reversed(RESULTS) if r in found) for found in results.values())
+    return {"rendered": len(results)} | {result: worst[result] for result in RESULTS}
 
 
 def write_inspection(path: Path, inspection: Inspection) -> None:

@@ -11,9 +11,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import InputError, RenderError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values
 from release.depth import MM_A_METRE
-from release.package.pictures import depth_values
 from release.record import DepthCoding, DepthCodingName
 
 MOST_MM = 65534

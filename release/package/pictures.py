@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.frames import SKY_DEPTH_M, FrameFile
-from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, parse_array_header, png_size
+from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
+from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
 
 CHUNK_FRAME_BYTES = 12  # of a PNG's chunk: length, name, checksum
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
@@ -44,19 +44,6 @@ def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], w
         raise InputError(
             "a picture is damaged", where=where, got=f"chunk {chunk} does not have its checksum", fix=RENDER
         )
-
-
-def depth_values(data: memoryview, where: Path) -> np.ndarray:
-    """Give the numbers of a depth image, (h, w) float32, as they stand in the bytes.
-
-    Raises:
-        InputError: it is no complete array of that type.
-    """
-    header = parse_array_header(data, where, what="depth image")
-    if header.dtype != np.float32 or len(header.shape) != 2:
-        raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
-    values = np.frombuffer(data, np.float32, offset=header.offset)
-    return values.reshape(header.shape, order="F" if header.is_fortran else "C")
 
 
 def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> None:

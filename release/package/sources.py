@@ -9,9 +9,10 @@ from typing import Literal
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel, read_inspection
+from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
 from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.playback import find_flights
+from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
 from cosfly.provenance import fingerprint, is_bound, was_made_of
 from cosfly.reading.files import check_stays_below
@@ -34,7 +35,11 @@ class Source:
     def files(self) -> dict[str, Path]:
         """Role -> what stands there."""
         files = {"data": self.data, "captions": self.captions}
-        return files if self.inspect is None else {**files, "inspect": self.inspect}
+        if self.inspect is not None:
+            files["inspect"] = self.inspect
+            if (decisions := self.inspect.with_name(REVIEW)).exists():
+                files["review"] = decisions
+        return files
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:
@@ -128,7 +133,7 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
             for folder in find_flights(source.data):
                 found.append((number, _place(source, folder.relative_to(source.data)), folder, None, None, None))
             continue
-        inspection = read_inspection(source.inspect)
+        inspection = read_settled(source.inspect)
         inspections.append(inspection)
         saw_older = was_made_of(source.inspect, "data") not in (None, fingerprint(source.data))
         for flight in inspection.flights:

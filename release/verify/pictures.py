@@ -9,13 +9,12 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.png.read import parse_png
-from cosfly.products.frames import SKY_DEPTH_M, FrameFile
+from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reprojection import COLUMNS, View, grid_rows, survey
 from release.columns import PICTURES
 from release.depth import depth_of
-from release.package.pictures import depth_values
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows

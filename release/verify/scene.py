@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.reprojection import Agreement, View, compare_views
+from cosfly.reprojection import Agreement, View, compare_views, usual_correlation
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
@@ -124,7 +124,7 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
             return
         limit, least = max(limit, TIMES_ROUGH * usual), AGREE_LEAST
     colours = np.array([pair.correlation for pair in pairs.found])
-    usual_colour, drop = _usual(colours)
+    usual_colour, drop = usual_correlation(colours, COLOUR_DROP)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
     least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
@@ -151,12 +151,3 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
             findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
         elif elsewhere > pair.correlation + BETTER_BY:
             findings.error("scene_colour", where, f"{pair.correlation:.3f} with the frame before", f"less than {elsewhere:.3f}, which these colours have at the next frame's place")  # fmt: skip
-
-
-def _usual(colours: np.ndarray) -> tuple[float, float]:
-    """The usual correlation of a flight's frames, and how much less is too little."""
-    known = colours[np.isfinite(colours)]
-    if not len(known):
-        return np.nan, np.nan
-    usual = float(np.median(known))
-    return usual, max(COLOUR_DROP, 8.0 * float(np.median(np.abs(known - usual))))

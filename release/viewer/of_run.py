@@ -14,9 +14,9 @@ from cosfly.errors import InputError
 from cosfly.frame_views import VIEW_FILES, View, read_view
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import Caption, Coc, Language, read_captions
-from cosfly.products.inspection import read_inspection
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, find_flights, read_flight
+from cosfly.products.review import read_settled
 from release.viewer.choosing import boxes_of, choose_flights, choose_frames, path_of, shown_sentences
 from release.viewer.pictures import Pictures, box_of
 from release.viewer.schema import Shown, ShownBox, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
@@ -130,7 +130,7 @@ def _results(trees: list[Tree]) -> dict[tuple[str, Key], str]:
         (tree.run, (town_folder(flight.town), flight.trajectory, flight.variant)): flight.result
         for tree in trees
         if tree.inspect is not None
-        for flight in read_inspection(tree.inspect).flights
+        for flight in read_settled(tree.inspect).flights
     }
 
 

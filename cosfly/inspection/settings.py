@@ -1,0 +1,111 @@
+"""The thresholds of the inspection, each with why it is where it is."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from cosfly.config import Config
+from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
+
+
+class InspectConfig(Config):
+    """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
+
+    accel_rms_max_mps2: float = Field(
+        ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
+    )
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
+    smoothness_min: float = Field(
+        0.5, ge=0, le=1, description="smoothness score S below this goes to review; 0 turns the rule off"
+    )
+    five_ray_mean_min: float = Field(
+        FIVE_RAY_MEAN_MIN,
+        ge=0,
+        le=1,
+        description="mean five-ray visibility of the flight's poses below this rejects; 0 turns the rule off",
+    )
+    clearance_min_m: float = Field(
+        RELAXED_SAFETY_M, ge=0, description="a drone nearer than this to an obstacle rejects, m; 0: only one inside"
+    )
+    check_pixels: Literal["all", "sample", "none"] = Field(
+        "all",
+        description="decode every frame, an even sample, or none (then only names, headers and poses are checked)",
+    )
+    pixel_sample: int = Field(16, ge=1, description="frames per flight that check_pixels: sample decodes")
+    check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")
+    pose_tolerance_m: float = Field(1e-3, ge=0, description="distance allowed between a flight's pose and its plan, m")
+    rotation_tolerance_deg: float = Field(0.01, ge=0, description="turn allowed between a flight's pose and its plan")
+    reprojection_tolerance_px: float = Field(
+        0.5, gt=0, description="distance allowed between the recorded and the projected target, px"
+    )
+    drone_speed_max_mps: float = Field(25.0, gt=0, description="a faster step between two frames is a teleport, m/s")
+    target_speed_max_mps: float = Field(10.0, gt=0, description="the same for the person, m/s")
+    track_quality_min: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off",
+    )
+    mask_visibility_min: float = Field(
+        0.5, ge=0, le=1, description="a frame at least this visible must show pedestrian pixels at the target's box"
+    )
+    invalid_depth_max: float = Field(
+        0.01, ge=0, le=1, description="share of invalid depth pixels above this in any frame goes to review"
+    )
+    flat_surface_max: float = Field(
+        0.01,
+        gt=0,
+        le=1,
+        description="a surface of one colour that fills more of a picture goes to review (a missing texture); drawn ones have grain, rounding "
+        "and light; 1 turns the rule off",
+    )
+    flat_pairs_min: float = Field(
+        0.99,
+        gt=0,
+        le=1,
+        description="a surface is of one colour where so many of its neighbouring pixels are equal; in renders of three maps at most 0.95 are",
+    )
+    magenta_max: float = Field(
+        1e-3,
+        ge=0,
+        le=1,
+        description="share of a picture in the magenta that engines paint for a texture that they miss; more goes to review; renders have none; "
+        "1 turns the rule off",
+    )
+    z_fighting_max: float = Field(
+        1e-3,
+        ge=0,
+        le=1,
+        description="share of pixels that alternate every 3 px or less between two surfaces in one plane, of other kinds or colours; more goes to "
+        "review; renders of three maps have at most 1.2e-4; 1 turns the rule off",
+    )
+    jump_gone_max: float = Field(
+        0.02,
+        ge=0,
+        le=1,
+        description="share of what stood still in the frame before and is looked through in this one; more goes to review; renders have 0; 1 "
+        "turns the rule off",
+    )
+    jump_agree_min: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="share of what stood still that is where the poses put it, seen from the frame before; less goes to review (the rest is "
+        "hidden by what is nearer); renders have 0.8 and more; 0 turns the rule off",
+    )
+    jump_colour_drop: float = Field(
+        0.35,
+        gt=0,
+        le=2,
+        description="correlation of what stands still with the frame before, so much below the flight's usual one, goes to review; renders of "
+        "three maps differ by 0.2 at most, another picture of the same place by 0.4 and more; 2 turns the rule off",
+    )
+    jump_brightness_max: float = Field(
+        12.0,
+        gt=0,
+        description="median change of brightness of what stands still, between frames of one weather; more goes to review, grey levels; renders "
+        "have 1.4 at most",
+    )
+    thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")

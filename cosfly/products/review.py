@@ -1,0 +1,121 @@
+"""`review.jsonl`: what people decided of flights that the inspection could not. Written by `cosfly inspect review`, read by whoever takes
+flights by their result.
+
+It stands beside `inspect.json` and only grows: a decision is never changed, a later one of the same flight counts instead. Each names the
+inspection that it was made on by the digest of that file; on another one nobody decided anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.errors import InputError
+from cosfly.journal import Journal
+from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
+from cosfly.reading.files import sha256_file
+
+REVIEW = "review.jsonl"
+BY_A_PERSON = "review"  # the code of what a person rejected
+Verdict = Literal["accepted", "rejected"]
+
+
+class Choice(BaseModel):
+    """What somebody says of one flight, by its folder in the playback tree."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    folder: str
+    verdict: Verdict
+    reason: str = Field(min_length=1, max_length=2000)
+
+
+class Decision(Choice):
+    """A line of `review.jsonl`. inspection: sha256 of `inspect.json`; sha256: of the flight's files, as that has it; at: UTC, ISO 8601."""
+
+    inspection: str
+    sha256: str | None
+    by: str = Field(min_length=1, max_length=200)
+    at: str
+
+
+def read_decisions(inspected: Path) -> dict[str, Decision]:
+    """Read what was decided on an inspection: folder -> the last decision; empty where nobody decided.
+
+    Args:
+        inspected: path of `inspect.json`.
+    Raises:
+        InputError: a line is damaged or cannot be used, or was decided on another inspection.
+    """
+    path, digest = inspected.with_name(REVIEW), sha256_file(inspected)
+    journal, found = Journal(path), dict[str, Decision]()
+    for decision in journal.read_as(Decision.model_validate):
+        if decision.inspection != digest:
+            raise InputError(
+                "a decision on another inspection", where=f"{path}:{journal.line_num}",
+                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}", expected=f"decisions on {inspected}",
+                fix=f"move {REVIEW} away and decide again with cosfly inspect review, or put that inspection back",
+            )  # fmt: skip
+        found[decision.folder] = decision
+    if journal.num_damaged:
+        raise InputError(
+            "a decision that was changed or cut short", where=path, got=f"{journal.num_damaged} damaged lines",
+            fix="put the file back, or move it away and decide again with cosfly inspect review",
+        )  # fmt: skip
+    return found
+
+
+def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[Decision]:
+    """Put choices on record; all of them, or none.
+
+    Raises:
+        InputError: one names no flight of the inspection, or accepts what a rule rejected.
+    """
+    read_decisions(inspected)  # what stands there must be of this inspection
+    digest, at = sha256_file(inspected), datetime.now(UTC).isoformat(timespec="seconds")
+    flights = {flight.folder: flight for flight in read_inspection(inspected).flights}
+    decisions = []
+    for choice in choices:
+        flight = flights.get(choice.folder)
+        if flight is None:
+            known = ", ".join([folder for folder, one in flights.items() if one.result == "review"][:3])
+            raise InputError("no such flight", where=inspected, got=choice.folder, expected=f"the folder of a flight, as {known}")  # fmt: skip
+        if flight.result == "rejected" and choice.verdict == "accepted":
+            raise InputError(
+                "a flight that breaks a rule cannot be accepted", where=choice.folder, got=flight.reason or "rejected",
+                expected="a flight in review", fix="mend the flight, or change the threshold and inspect again",
+            )  # fmt: skip
+        about = {"inspection": digest, "sha256": flight.sha256, "by": by, "at": at}
+        decisions.append(Decision(**choice.model_dump(), **about))
+    with Journal(inspected.with_name(REVIEW)) as journal:
+        for decision in decisions:
+            journal.append(decision.model_dump())
+    return decisions
+
+
+def read_settled(inspected: Path) -> Inspection:
+    """Read `inspect.json` with what people decided in it: results and the funnel of trajectories are those after review.
+
+    Raises:
+        InputError: as `read_inspection` and `read_decisions`.
+    """
+    inspection, decisions = read_inspection(inspected), read_decisions(inspected)
+    if not decisions:
+        return inspection
+    flights = [_settled(flight, decisions.get(flight.folder)) for flight in inspection.flights]
+    is_planned = any(flight.trace_id is not None for flight in flights) or not inspection.funnel.trajectories.rendered
+    counts = count_trajectories(flights, planned=is_planned)
+    trajectories = inspection.funnel.trajectories.model_copy(update=counts)
+    trajectories.check()
+    funnel = inspection.funnel.model_copy(update={"trajectories": trajectories})
+    return inspection.model_copy(update={"flights": flights, "funnel": funnel})
+
+
+def _settled(flight: FlightInspection, decision: Decision | None) -> FlightInspection:
+    if decision is None:
+        return flight
+    return flight.model_copy(update={"result": decision.verdict, "decided": decision.verdict})
