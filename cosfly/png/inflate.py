@@ -1,0 +1,319 @@
+"""Unpacking deflate streams into a place that they must fill (RFC 1951): several literals at a look, repetitions eight bytes at a time.
+
+Everywhere below, `hold` has the next `held` bits of the source, lowest first, and `position` is the byte behind them; words[k] are the
+eight bytes from the k-th on. A function that finds the stream broken gives a negative place.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cosfly.compiled import int64, njit
+from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY
+
+LOOK_BITS = 11
+LOOK = np.uint64((1 << LOOK_BITS) - 1)
+LOOKS = 56 // LOOK_BITS  # in the bits that one fetch has at least
+SPARE = 32  # bytes behind what a stream fills, which looks and copies may write
+STORED, FIXED, OWN = 0, 1, 2  # forms of a block
+END = 256
+MOST_LITERALS, MOST_WAYS = 286, 30
+BROKEN = np.int64(-1)
+
+
+class Code(NamedTuple):
+    """A Huffman code. table (2 ** LOOK_BITS,) uint16: symbol * 16 + length by the next bits, 0 for what is longer, which is found by
+    symbols, in the order of their codes, and counts, of each length."""
+
+    table: np.ndarray
+    symbols: np.ndarray
+    counts: np.ndarray
+
+
+def inflate(packed: bytes, start: int, size: int) -> tuple[np.ndarray, int]:
+    """Unpack the stream that begins at a byte.
+
+    Returns:
+        (size,) uint8, and where the stream ends, negative if it is broken or does not fill the size.
+    """
+    out = np.empty(size + SPARE, np.uint8)
+    source, room = np.frombuffer(packed, np.uint8), out[:size]
+    if len(source) < 8:
+        return room, -1
+    words, out_words = (np.ndarray(len(data) - 7, "<u8", data.data, strides=(1,)) for data in (source, out))
+    return room, int(_blocks(source, words, start, out, out_words))
+
+
+@njit(cache=True, nogil=True)
+def _blocks(source, words, position, out, out_words):  # type: ignore[no-untyped-def]
+    room, at, is_last = len(out) - SPARE, np.int64(0), False
+    hold, held = np.uint64(0), np.int64(0)
+    lengths = np.zeros(MOST_LITERALS + MOST_WAYS + 4, np.int64)
+    literal, way = _new_code(), _new_code()
+    runs = np.zeros(1 << LOOK_BITS, np.uint32)
+    while not is_last:
+        position, hold, held = _fetch(source, words, position, hold, held)
+        is_last = hold & np.uint64(1) != 0
+        form = np.int64(hold >> np.uint64(1) & np.uint64(3))
+        hold, held = hold >> np.uint64(3), held - 3
+        if held < 0:
+            return BROKEN
+        if form == STORED:
+            position, at = _copy_stored(source, position - (held >> 3), out, at, room)
+            hold, held = np.uint64(0), np.int64(0)
+        elif form == FIXED:
+            _fixed_codes(lengths, literal, way)
+        elif form == OWN:
+            position, hold, held = _own_codes(source, words, position, hold, held, lengths, literal, way)
+        if position < 0 or form > OWN:
+            return BROKEN
+        if form != STORED:
+            _find_runs(literal.table, runs)
+            position, hold, held, at = _symbols(source, words, position, hold, held, out, out_words, at, room, literal, runs, way)  # fmt: skip
+            if position < 0:
+                return BROKEN
+    return position - (held >> 3) if at == room and held >= 0 else BROKEN
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _fetch(source, words, position, hold, held):  # type: ignore[no-untyped-def]
+    """Fetch bits: 56 and more, or all that are left. Above `held` stand those that come next, or none: or-ing them again changes nothing."""
+    if position < len(words):
+        return position + (63 - held >> 3), hold | words[position] << np.uint64(held), held | 56
+    while held <= 48 and position < len(source):
+        hold |= np.uint64(source[position]) << np.uint64(held)
+        position += 1
+        held += 8
+    return position, hold, held
+
+
+# --- codes ------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def _new_code():  # type: ignore[no-untyped-def]
+    return Code(np.zeros(1 << LOOK_BITS, np.uint16), np.zeros(MOST_LITERALS + MOST_WAYS, np.int64), np.zeros(16, np.int64))  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fill(code, lengths):  # type: ignore[no-untyped-def]
+    """Fill the tables of a code of these lengths; False where they are none."""
+    table, symbols, counts = code
+    counts.fill(0)
+    for length in lengths:
+        counts[length] += length > 0
+    starts, codes = np.zeros(17, np.int64), np.zeros(17, np.int64)
+    left, word = np.int64(1), np.int64(0)
+    for n in range(1, 16):
+        left = left * 2 - counts[n]
+        if left < 0:
+            return False
+        starts[n + 1] = starts[n] + counts[n]
+        word = word + counts[n - 1] << 1
+        codes[n] = word
+    table.fill(0)
+    for s in range(len(lengths)):
+        n = lengths[s]
+        if n == 0:
+            continue
+        symbols[starts[n]] = s
+        starts[n] += 1
+        if n <= LOOK_BITS:
+            turned, word = np.int64(0), codes[n]
+            for _ in range(n):
+                turned = turned << 1 | word & 1
+                word >>= 1
+            for at in range(turned, len(table), 1 << n):
+                table[at] = s * 16 + n
+        codes[n] += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _find_runs(table, runs):  # type: ignore[no-untyped-def]
+    """Of the next bits, the one or two literals that they begin with: bits, how many (256s), first, second byte; 0 where there is none."""
+    for at in range(len(table)):
+        first = np.int64(table[at])
+        runs[at] = 0
+        if first == 0 or first >> 4 >= END:
+            continue
+        used = first & 15
+        second = np.int64(table[at >> used])
+        if second != 0 and second >> 4 < END and used + (second & 15) <= LOOK_BITS:
+            runs[at] = second >> 4 << 24 | first >> 4 << 16 | 2 << 8 | used + (second & 15)
+        else:
+            runs[at] = first >> 4 << 16 | 1 << 8 | used
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _next(hold, code):  # type: ignore[no-untyped-def]
+    """The next symbol * 16 + its length, -1 where the bits are no code."""
+    entry = np.int64(code.table[np.int64(hold & LOOK)])
+    return entry if entry != 0 else _next_long(hold, code.symbols, code.counts)
+
+
+@njit(cache=True, nogil=True)
+def _next_long(hold, symbols, counts):  # type: ignore[no-untyped-def]
+    """As `_next`, bit by bit."""
+    code, first, index = np.int64(0), np.int64(0), np.int64(0)
+    for n in range(1, 16):
+        code |= np.int64(hold & np.uint64(1))
+        hold >>= np.uint64(1)
+        if code - counts[n] < first:
+            return symbols[index + code - first] * 16 + n
+        index += counts[n]
+        first = first + counts[n] << 1
+        code <<= 1
+    return BROKEN
+
+
+@njit(cache=True, nogil=True)
+def _fixed_codes(lengths, literal, way):  # type: ignore[no-untyped-def]
+    for s in range(288):
+        lengths[s] = 8 if s < 144 else 9 if s < 256 else 7 if s < 280 else 8
+    _fill(literal, lengths[:288])
+    lengths.fill(5)
+    _fill(way, lengths[:MOST_WAYS])
+
+
+@njit(cache=True, nogil=True)
+def _own_codes(source, words, position, hold, held, lengths, literal, way):  # type: ignore[no-untyped-def]
+    """Read the codes of a block."""
+    position, hold, held = _fetch(source, words, position, hold, held)
+    num_literals = np.int64(hold & np.uint64(31)) + 257
+    num_ways = np.int64(hold >> np.uint64(5) & np.uint64(31)) + 1
+    num_lengths = np.int64(hold >> np.uint64(10) & np.uint64(15)) + 4
+    hold, held = hold >> np.uint64(14), held - 14
+    broken = BROKEN, hold, held
+    if held < 0 or num_literals > MOST_LITERALS or num_ways > MOST_WAYS:
+        return broken
+    lengths.fill(0)
+    for k in range(num_lengths):
+        position, hold, held = _fetch(source, words, position, hold, held)
+        lengths[LENGTH_ORDER[k]] = np.int64(hold & np.uint64(7))
+        hold, held = hold >> np.uint64(3), held - 3
+    if not _fill(literal, lengths[: len(LENGTH_ORDER)]):
+        return broken
+    at, total = np.int64(0), num_literals + num_ways
+    while at < total:
+        position, hold, held = _fetch(source, words, position, hold, held)
+        entry = _next(hold, literal)
+        if entry < 0 or (held < (entry & 15) + 7 and position < len(source)):
+            return broken
+        hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
+        value, times, used = _repeated(entry >> 4, hold, lengths[at - 1] if at > 0 else BROKEN)
+        hold, held = hold >> np.uint64(used), held - used
+        if value < 0 or held < 0 or at + times > total:
+            return broken
+        for _ in range(times):
+            lengths[at] = value
+            at += 1
+    if not _fill(literal, lengths[:num_literals]) or not _fill(way, lengths[num_literals:total]):
+        return broken
+    return position, hold, held
+
+
+@njit(cache=True, nogil=True)
+def _repeated(symbol, hold, before):  # type: ignore[no-untyped-def]
+    """What a symbol of the table of lengths stands for: a length, how often, bits that told it."""
+    if symbol < 16:
+        return symbol, int64(1), int64(0)
+    if symbol == 16:
+        return before, 3 + np.int64(hold & np.uint64(3)), int64(2)
+    if symbol == 17:
+        return int64(0), 3 + np.int64(hold & np.uint64(7)), int64(3)
+    return int64(0), 11 + np.int64(hold & np.uint64(127)), int64(7)
+
+
+# --- bytes ------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def _copy_stored(source, position, out, at, room):  # type: ignore[no-untyped-def]
+    """Copy a block that is not packed; gives where it ends in the source and in `out`."""
+    if position + 4 > len(source):
+        return BROKEN, at
+    n = np.int64(source[position]) | np.int64(source[position + 1]) << 8
+    check = np.int64(source[position + 2]) | np.int64(source[position + 3]) << 8
+    position += 4
+    if n != check ^ 0xFFFF or position + n > len(source) or at + n > room:
+        return BROKEN, at
+    for k in range(n):
+        out[at + k] = source[position + k]
+    return position + n, at + n
+
+
+@njit(cache=True, nogil=True)
+def _symbols(source, words, position, hold, held, out, out_words, at, room, literal, runs, way):  # type: ignore[no-untyped-def]
+    """Unpack a block's symbols up to its end."""
+    broken = BROKEN, hold, held, at
+    while True:
+        position, hold, held, at = _literals(words, position, hold, held, out, at, room, runs)
+        position, hold, held = _fetch(source, words, position, hold, held)
+        entry = _next(hold, literal)
+        s = entry >> 4
+        hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
+        if entry < 0 or held < 0 or s >= MOST_LITERALS:
+            return broken
+        if s == END:
+            return position, hold, held, at
+        if s < END:
+            out[at] = s
+            at += 1
+        else:
+            n, hold, held = _more(hold, held, BASE_LENGTH[s - 257], MORE_LENGTH[s - 257])
+            position, hold, held = _fetch(source, words, position, hold, held)
+            entry = _next(hold, way)
+            s = entry >> 4
+            if entry < 0 or s >= MOST_WAYS:
+                return broken
+            hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
+            back, hold, held = _more(hold, held, BASE_WAY[s], MORE_WAY[s])
+            if held < 0 or back > at or at + n > room:
+                return broken
+            _repeat(out, out_words, at, back, n)
+            at += n
+        if at > room:
+            return broken
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _literals(words, position, hold, held, out, at, room, runs):  # type: ignore[no-untyped-def]
+    """Unpack literals while their codes are short."""
+    while position < len(words) and at <= room:
+        hold |= words[position] << np.uint64(held)
+        position += 63 - held >> 3
+        held |= 56
+        for _ in range(LOOKS):
+            run = np.int64(runs[np.int64(hold & LOOK)])
+            if run == 0:
+                return position, hold, held, at
+            out[at] = run >> 16 & 255
+            out[at + 1] = run >> 24
+            at += run >> 8 & 255
+            hold >>= np.uint64(run & 255)
+            held -= run & 255
+    return position, hold, held, at
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _more(hold, held, base, num_bits):  # type: ignore[no-untyped-def]
+    """A number and the bits that are added to it."""
+    value = base + np.int64(hold & (np.uint64(1) << np.uint64(num_bits)) - np.uint64(1))
+    return value, hold >> np.uint64(num_bits), held - num_bits
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _repeat(out, out_words, at, back, n):  # type: ignore[no-untyped-def]
+    """Write again the `n` bytes that stand so far back; up to seven more are written behind them."""
+    begin = np.int64(0)
+    if back < 8:  # repeated until a word is
+        step = back * ((7 + back) // back)
+        begin = min(n, step)
+        for k in range(begin):
+            out[at + k] = out[at + k - back]
+        back = step
+    for k in range(begin, n, 8):
+        out_words[at + k] = out_words[at + k - back]
