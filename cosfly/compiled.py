@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
 import shutil
 import time
@@ -22,10 +23,13 @@ from typing import Any
 
 import numba
 from numba import boolean, int64
+from numba.core import event
 
 from cosfly.reading.files import read_bytes
 
 __all__ = ["boolean", "int64", "njit"]
+
+log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).parent
 UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
@@ -65,6 +69,26 @@ def cache_folder() -> Path | None:
     """Where numba keeps what it has compiled; None: beside the sources."""
     return Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else None  # type: ignore[attr-defined]
 
+
+class _TellsOnce(event.Listener):
+    """Says that something is compiled, which is not what usually takes time: it is loaded from the cache."""
+
+    def __init__(self) -> None:
+        self._is_told = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self._is_told:
+            self._is_told = True
+            log.info(
+                "compiling kernels, once on this machine (planning: about 30 s); kept in %s",
+                cache_folder() or "__pycache__",
+            )
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing to say."""
+
+
+event.register("numba:compile", _TellsOnce())
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

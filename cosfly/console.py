@@ -6,6 +6,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Protocol
 
 from rich.console import Console
@@ -13,6 +14,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
+from cosfly.errors import StorageError
 from cosfly.escaping import LONGEST_LOG, for_terminal
 
 
@@ -48,17 +50,36 @@ class _Lines(logging.Handler):
         console.print(self.format(record), soft_wrap=True)
 
 
-def set_up_logging(verbose: bool) -> None:
-    """Send log lines to the shared console; in a pipe or a file one record is one line. Called by the command line only."""
+LINE, WHEN = "%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z"
+
+
+def set_up_logging(level: int, file: Path | None = None) -> None:
+    """Send log lines of a level to the shared console, and all to a file. Called by the command line only.
+
+    In a pipe or a file one record is one line and has its time.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
     handler: logging.Handler
     if console.is_terminal:
         handler = RichHandler(console=console, show_path=False, show_time=False, markup=False, rich_tracebacks=False)
         handler.setFormatter(_Printable("%(message)s"))
     else:
         handler = _Lines()
-        handler.setFormatter(_Printable("%(levelname)-8s %(message)s"))
-    logging.basicConfig(handlers=[handler], force=True)
-    set_levels(logging.DEBUG if verbose else logging.INFO)
+        handler.setFormatter(_Printable(LINE, WHEN))
+    handler.setLevel(level)
+    handlers: list[logging.Handler] = [handler]
+    if file is not None:
+        try:
+            handlers.append(logging.FileHandler(file, encoding="utf-8"))
+        except OSError as error:
+            raise StorageError(
+                "cannot write the log", where=file, got=error.strerror, fix="choose another --log-file"
+            ) from None
+        handlers[1].setFormatter(_Printable(LINE, WHEN))
+    logging.basicConfig(handlers=handlers, force=True)
+    set_levels(logging.DEBUG if file is not None else level)
 
 
 def set_levels(level: int) -> None:

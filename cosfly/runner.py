@@ -85,6 +85,9 @@ def run_items(
             if isinstance(record, Failed):
                 named = "" if record.id in record.message else f"{record.id}: "
                 log.error("%s: %s%s", stage.stage, named, record.message)
+            else:
+                reason = f" ({record.reason})" if isinstance(record, Dropped) else ""
+                log.debug("%s: %s: %s%s, %.2f s", stage.stage, record.id, record.status, reason, record.seconds)
             progress.finish(record.id)
     ordered = [records[item_id] for item_id in ids]
     tally = _tally(stage, ordered)

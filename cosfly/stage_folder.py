@@ -204,6 +204,8 @@ class StageFolder:
             code_version=cosfly.__version__,
             package_files={name: _digest(p) for name, p in sorted(package_files.items())},
         )
+        for name, path in inputs.items():
+            log.debug("%s: reads %s: %s", stage, name, path)
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
         if (out / "manifest.json").exists() and (complete := cls._complete(out, stage, record, resume)):
@@ -228,6 +230,7 @@ class StageFolder:
         if _may_continue(out, record, resume) or manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
+        log.debug("%s: complete for the same settings and inputs: %s", stage, out)
         return cls(out, stage, True)
 
     def reopen(self) -> None:

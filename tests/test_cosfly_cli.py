@@ -1,12 +1,16 @@
 """The command line: what a person reads when something is wrong, and the exit codes."""
 
 import logging
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from cosfly import cli, doctor
 from cosfly.chat.wire import Connections, Response
@@ -74,6 +78,53 @@ def wait() -> None:
 sys.argv = ["cosfly", "wait"]
 cli.main()
 """
+
+
+@pytest.mark.parametrize(
+    ("words", "moved"),
+    [
+        (["run", "quickstart", "-v"], ["-v", "run", "quickstart"]),
+        (["run", "--log-file", "a.log", "quickstart"], ["--log-file", "a.log", "run", "quickstart"]),
+        (["-q", "run", "--log-file=a.log"], ["-q", "--log-file=a.log", "run"]),
+        (["run", "--", "-v"], ["run", "--", "-v"]),
+        (["run", "--log-file"], ["--log-file", "run"]),
+        (["run", "quickstart"], ["run", "quickstart"]),
+    ],
+)
+def test_options_of_all_commands_may_stand_anywhere(words, moved):
+    assert cli.options_first(words) == moved
+
+
+def test_no_command_has_an_option_of_all():
+    def options(command: Any) -> set[str]:
+        below = getattr(command, "commands", {}).values()
+        return {name for child in below for name in options(child) | {o for p in child.params for o in p.opts}}
+
+    assert not options(typer.main.get_command(cli.app)) & {*cli.FLAGS, "--log-file"}
+
+
+def told(*words: str) -> tuple[str, str]:
+    """What a command says on the error stream, which is a pipe, and in its log file."""
+    done = subprocess.run([sys.executable, "-m", "cosfly", *words], capture_output=True, text=True, check=True)
+    file = Path(words[words.index("--log-file") + 1]) if "--log-file" in words else None
+    return done.stderr, file.read_text() if file else ""
+
+
+def test_more_or_less_is_told_and_a_file_holds_all(tmp_path):
+    out, log = tmp_path / "maps", tmp_path / "log.txt"
+    shown, kept = told("maps", "--out", str(out), "-q", "--log-file", str(log))
+    assert shown == ""
+    line = r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (DEBUG|INFO) +\S"
+    assert re.search(line.replace("(DEBUG|INFO)", "INFO"), kept, re.MULTILINE)
+    assert re.search("DEBUG +cosfly [0-9.]+, Python", kept)
+    shown, _ = told("maps", "--out", str(out), "--verbose")
+    assert re.search(line, shown, re.MULTILINE)
+    assert "complete for the same settings" in shown
+
+
+def test_a_log_that_cannot_be_written_is_an_error(capfd, monkeypatch, tmp_path):
+    status, line = answer(capfd, monkeypatch, "config", "schema", "--log-file", str(tmp_path / "no/log.txt"))
+    assert (status, "cannot write the log" in line) == (1, True)
 
 
 def test_ctrl_c_is_one_line():

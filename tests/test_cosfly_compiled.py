@@ -41,6 +41,23 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2
 
 
+def test_compiling_is_told_once_and_loading_is_not(tmp_path):
+    """Two functions in a new cache: one line; the second process loads them and says nothing."""
+    (tmp_path / "two.py").write_text(
+        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\nfrom cosfly.compiled import njit\n\n\n"
+        "@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
+    )
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    said = [
+        subprocess.run(
+            [sys.executable, str(tmp_path / "two.py")], env=env, capture_output=True, text=True, check=True
+        ).stderr
+        for _ in range(2)
+    ]
+    assert said[0].count("compiling kernels, once") == 1
+    assert said[1] == ""
+
+
 def test_old_caches_go_and_the_present_one_stays(tmp_path, monkeypatch):
     monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", compiled.numba.config.CACHE_DIR)
     for name in ("old", "young", "own"):

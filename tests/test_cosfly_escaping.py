@@ -91,7 +91,7 @@ def test_log_records_are_printed_and_not_obeyed(monkeypatch, is_terminal):
     stream = printed(monkeypatch, is_terminal=is_terminal)
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
-    shared.set_up_logging(verbose=False)
+    shared.set_up_logging(logging.INFO)
     logging.getLogger("cosfly.x").error("the server says %s", HOSTILE)
     monkeypatch.undo()
     assert "\\x1b]0;owned" in stream.getvalue()

@@ -165,6 +165,7 @@ class ChatClient:
             if isinstance(answered, Reply):
                 self.throttle.succeeded()
                 self.troubles.answered()
+                log.debug("%s: answered at try %d", self.where, attempt + 1)
                 return answered
             found = answered
             is_last = attempt + 1 == self.cfg.max_tries

@@ -5,8 +5,11 @@ Nothing heavy is imported before a command runs, so that `cosfly --help` is inst
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +26,10 @@ from cosfly.errors import CosflyError
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
 
+FLAGS = ("-v", "--verbose", "-q", "--quiet")  # of all commands; no command has others of these names
+
+log = logging.getLogger(__name__)
+
 app = typer.Typer(
     help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
     no_args_is_help=True,
@@ -38,14 +45,35 @@ for name, named_group in (("caption", caption_app), ("distill", distill_app), ("
 @app.callback(invoke_without_command=True)
 def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell what is done, item by item.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell warnings and errors only.")] = False,
+    log_file: Annotated[
+        Path | None, typer.Option("--log-file", help="Also append all that -v tells to this file, with times.")
+    ] = None,
 ) -> None:
     if version:
         typer.echo(f"cosfly {__version__}")
         raise typer.Exit
     from cosfly.console import set_up_logging
 
-    set_up_logging(verbose)
+    set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
+    log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
+
+
+def options_first(words: Sequence[str]) -> list[str]:
+    """Move the options of all commands before the command, so that they may stand anywhere: `cosfly run quickstart -v`."""
+    ours, others = list[str](), list(words)
+    end = others.index("--") if "--" in others else len(others)
+    number = 0
+    while number < end:
+        word = others[number]
+        count = 2 if word == "--log-file" else 1 if word in FLAGS or word.startswith("--log-file=") else 0
+        count = min(count, end - number)
+        ours += others[number : number + count]
+        del others[number : number + count]
+        end -= count
+        number += count == 0
+    return ours + others
 
 
 def main() -> None:
@@ -54,7 +82,7 @@ def main() -> None:
         signal.SIGTERM, lambda number, frame: sys.exit(128 + number)
     )  # as Ctrl-C: workers end, locks are let go
     try:
-        app()
+        app(options_first(sys.argv[1:]))
     except CosflyError as error:
         _fail(str(error), 1)
     except SystemExit as end:

@@ -7,6 +7,7 @@ whatever becomes of the process that started it.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from collections.abc import Callable, Iterator
 
 from cosfly.compiled import cache_folder
 from cosfly.store import sha256_bytes
+
+log = logging.getLogger(__name__)
 
 WAIT_MAX_S = 120.0  # five times what it takes on a machine with nothing else to do; then the stage compiles for itself
 
@@ -38,6 +41,8 @@ def compiled_ahead(planner: str, *, needed: bool = True) -> Iterator[Callable[[]
         return
 
     def wait() -> None:
+        if process.poll() is None:
+            log.info("compiling the planner, once on this machine: about 30 s, begun with the run")
         try:
             process.wait(WAIT_MAX_S)
         except subprocess.TimeoutExpired:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from cosfly.topview import TopView, add_caption, draw_map, png_bytes
 
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.simplify_report", "1.0"
+
+log = logging.getLogger(__name__)
 
 
 def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
@@ -77,6 +80,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
     write_bytes(out / "simplify.png", _picture(raw, result.box_map, facts, cfg.picture_px))
+    log.info("%d boxes become %d", len(raw), len(result.box_map))
     tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product
