@@ -70,6 +70,23 @@ def hold_folder(folder: Path) -> FolderLock:
     return held
 
 
+def is_held(folder: Path) -> bool:
+    """Tell whether a process holds a folder now; where the file system has no locks, it does not."""
+    try:
+        file = os.open(folder / LOCK, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(file)
+    return False
+
+
 def _locked(path: Path) -> IO[str] | None:
     """Open and lock a file; None where the file system has no locks."""
     while True:

@@ -19,6 +19,7 @@ from cosfly.bench import measure
 from cosfly.cli import app
 from cosfly.config import load
 from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
+from cosfly.folder_lock import hold_folder
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.inspection import read_inspection
@@ -26,6 +27,7 @@ from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.walks import read_paths as read_walks
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
+from cosfly.runs import look
 from cosfly.settings import RunConfig
 from cosfly.stage_folder import read_failures
 from cosfly.store import read_checksums, write_checksums, write_json
@@ -101,6 +103,53 @@ def test_every_stage_is_complete_and_adds_up(base):
     assert read_json(base / "summary.json")["peak_memory_mb"] > 10
     for picture in ("contact_sheet.png", "preview.gif"):
         assert (base / picture).stat().st_size > 10_000
+
+
+def test_a_run_is_shown_and_listed(base):
+    shown = CliRunner().invoke(app, ["show", str(base)])
+    assert shown.exit_code == 0
+    assert "8 of 8 stages complete" in shown.output
+    assert "pedestrians.num_paths = 2" in shown.output
+    assert "continue" not in shown.output
+    listed = CliRunner().invoke(app, ["list", str(base.parent)])
+    assert re.search(r"run +synthetic +8 of 8 +4 +\d+ +[\d.]+ MB", listed.output)
+
+
+def test_a_run_that_stopped_is_shown_as_it_stands(base, tmp_path):
+    """Its render was cut off after one flight: what is done is told, and how to go on."""
+    run = begin(base, tmp_path / "run", "inspect")
+    shutil.copy(base / "run.yaml", run)
+    (run / "render/manifest.json").unlink()
+    lines = (run / "render/items.jsonl").read_text().splitlines(keepends=True)
+    (run / "render/items.jsonl").write_text(lines[0])
+    seen = look(run)
+    states = {stage.name: stage.state for stage in seen.stages}
+    assert states == dict.fromkeys(STAGES[:4], "complete") | {"render": "begun"} | dict.fromkeys(STAGES[5:], "to do")
+    render = seen.stages[4]
+    assert render.tally is not None
+    assert (render.tally.kept, seen.is_at_work) == (1, False)
+    with hold_folder(run):
+        assert (
+            subprocess.run(
+                [sys.executable, "-m", "cosfly", "show", str(run)], capture_output=True, check=True
+            ).stdout.count(b"at work now")
+            == 1
+        )
+    (run / "run.yaml").write_text("rendr: {}\n")
+    listed = CliRunner().invoke(app, ["list", str(tmp_path)])
+    assert "not readable" in listed.output
+    assert "did you mean 'render'" in " ".join(listed.output.split())
+
+
+@pytest.mark.parametrize("config", ["", "run.yaml"])
+def test_a_run_goes_on_by_its_folder_or_its_own_settings(base, tmp_path, monkeypatch, config):
+    run = begin(base, tmp_path / "elsewhere", "simplify")
+    shutil.copy(base / "run.yaml", run)
+    asked = []
+    monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append((cfg.pedestrians.num_paths, out)) or [])
+    assert CliRunner().invoke(app, ["run", str(run / config)]).exit_code == 0
+    assert CliRunner().invoke(app, ["run", str(run / config), "--out", str(tmp_path / "new")]).exit_code == 0
+    assert asked == [(2, run), (2, tmp_path / "new")]
 
 
 def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):

@@ -19,9 +19,14 @@ app = typer.Typer()
 @app.command()
 def run(
     config: Annotated[
-        Path, typer.Argument(help="YAML file, or the name of one that ships: quickstart, diverse, simworld, delft.")
+        Path,
+        typer.Argument(
+            help="YAML file, or the name of one that ships: quickstart, diverse, simworld, delft; or a run folder, to continue."
+        ),
     ],
-    out: Annotated[Path | None, typer.Option(help="Run folder; by default runs/<name>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder; by default runs/<name>, or that of the run.yaml.")
+    ] = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
@@ -29,9 +34,13 @@ def run(
     resume: options.Resume = "if-same",
     repair: options.Repair = False,
 ) -> None:
-    """Make a data set from a configuration: all stages in order. Run it again to continue."""
+    """Make a data set from a configuration: all stages in order. Run it again, or with the run's folder, to continue."""
     from cosfly import pipeline
 
+    if (config / "run.yaml").is_file():
+        config = config / "run.yaml"
+    if out is None and config.name == "run.yaml" and any(config.parent.glob("*/stage.json")):
+        out = config.parent  # the settings of that run: it goes on
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
     options.set_aside(out, repair)
@@ -49,7 +58,7 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
     from cosfly.console import console
 
     table = Table(title=f"What was made in {out}", title_justify="left")
-    for column in ("stage", "kept", "dropped", "failed", "seconds", "product"):
+    for column in ("stage", "kept", "dropped", "failed", "seconds"):
         table.add_column(column, justify="right" if column in ("kept", "seconds") else "left", overflow="fold")
     for result in results:
         counts = result.manifest.counts
@@ -57,12 +66,88 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
             ", ".join(f"{k} {v}" for k, v in reasons.items()) or "-" for reasons in (counts.dropped, counts.failed)
         )
         seconds = "before" if result.was_complete else f"{result.manifest.seconds:.1f}"
-        product = os.path.relpath(result.stage.product, out)
-        table.add_row(result.stage.name, f"{counts.kept} of {counts.input}", dropped, failed, seconds, product)
+        table.add_row(result.stage.name, f"{counts.kept} of {counts.input}", dropped, failed, seconds)
     console.print(table)
+    made = (os.path.relpath(result.stage.product, out) for result in results)
+    console.print(f"  made     {', '.join(made)}", soft_wrap=True)  # a path that a table folds cannot be copied
     for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
         if (out / name).exists():  # of several towns only the release is here
             console.print(f"  look at  {os.path.relpath(out / name)}", soft_wrap=True)
+
+
+@app.command()
+def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]) -> None:
+    """Show a run: its stages, what they kept and take on the disk, the settings that are not the defaults."""
+    from rich.table import Table
+
+    from cosfly.console import answer_console
+    from cosfly.runs import look
+    from cosfly.store import dump_json
+
+    seen = look(run)
+    at_work = ", at work now" if seen.is_at_work else ""
+    answer_console.print(
+        f"{run}: {seen.cfg.name}, {seen.num_complete} of {len(seen.stages)} stages complete, {_size(seen.size_bytes)}{at_work}"
+    )
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("stage", "state", "items", "seconds", "on disk"):
+        table.add_column(column, justify="right" if column in ("seconds", "on disk") else "left", overflow="fold")
+    for stage in seen.stages:
+        seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
+        size = _size(stage.size_bytes) if stage.size_bytes else ""
+        table.add_row(stage.name, stage.state, "" if stage.tally is None else str(stage.tally), seconds, size)
+    answer_console.print(table)
+    if seen.differing:
+        answer_console.print("settings that are not the defaults:")
+    for setting in seen.differing:
+        answer_console.print(f"  {setting.name} = {dump_json(setting.value)}", soft_wrap=True)
+    for path in seen.to_look_at:
+        answer_console.print(f"look at  {os.path.relpath(path)}", soft_wrap=True)
+    if seen.num_complete < len(seen.stages) and not seen.is_at_work:
+        answer_console.print(f"continue  cosfly run {os.path.relpath(run)}", soft_wrap=True)
+
+
+@app.command("list")
+def list_runs(root: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where runs are.")] = Path("runs")) -> None:
+    """List the runs in a folder: how far they are, flights, captions, size."""
+    from rich.table import Table
+
+    from cosfly.console import answer_console
+    from cosfly.errors import CosflyError
+    from cosfly.runs import looks
+
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("run", "map", "stages", "flights", "captions", "on disk", ""):
+        table.add_column(
+            column, justify="right" if column in ("flights", "captions", "on disk") else "left", overflow="fold"
+        )
+    errors = []
+    for seen in looks(root):
+        if isinstance(seen, CosflyError):
+            errors.append(seen)
+            continue
+        kept = {
+            name: sum(stage.tally.kept for stage in seen.stages if stage.name.endswith(name) and stage.tally)
+            for name in ("render", "caption")
+        }
+        source = f"{len(seen.cfg.towns)} towns" if seen.cfg.towns else seen.cfg.maps.source
+        stages = f"{seen.num_complete} of {len(seen.stages)}"
+        state = "at work" if seen.is_at_work else ""
+        table.add_row(
+            os.path.relpath(seen.path, root),
+            source,
+            stages,
+            *(str(count or "") for count in kept.values()),
+            _size(seen.size_bytes),
+            state,
+        )
+    answer_console.print(table if table.row_count else f"no runs in {root}")
+    for error in errors:
+        answer_console.print(f"not readable: {error}", soft_wrap=True)
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 1e9:.2f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.1f} MB"
 
 
 config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
