@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from cosfly.escaping import for_html
-from cosfly.products.coverage import AXES, NAMED, Axis, Coverage, default_coverage
+from cosfly.products.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
+from cosfly.products.weather import TIMES, WEATHERS
 
 WIDTH_PX, HEIGHT_PX = 300.0, 110.0
 INK, BESIDE = "#2b6cb0", "#c05621"
@@ -30,11 +31,32 @@ def coverage_html(coverage: Coverage) -> str:
             for name, count, share, beside in shares(coverage, kind)
         )
         if rows:
-            head = (
-                f'<tr><th>{kind}</th><th class="n">frames</th><th class="n">share</th><th class="n">plain run</th></tr>'
-            )
+            head = f'<tr><th>{kind.replace("_", " ")}</th><th class="n">frames</th><th class="n">share</th><th class="n">plain run</th></tr>'
             panels.append(f"<table>{head}{rows}</table>")
+    if coverage.skies:
+        panels.append(_skies(coverage.skies))
     return '<div class="coverage">' + "".join(f'<div class="panel">{panel}</div>' for panel in panels) + "</div>"
+
+
+def _skies(frames: dict[str, int]) -> str:
+    """Give a table of frames, weather by time of day: the 15 x 4 of the paper, and presets of somebody's own beside them."""
+    counts = {tuple(name.split(PAIR)): count for name, count in frames.items()}
+    weathers = [*WEATHERS, *sorted({weather for weather, _ in counts} - set(WEATHERS))]
+    times = [*TIMES, *sorted({time for _, time in counts} - set(TIMES))]
+    head = "".join(f'<th class="n">{for_html(time)}</th>' for time in times)
+    rows = "".join(
+        f"<tr><td>{for_html(weather.replace('_', ' '))}</td>"
+        + "".join(
+            f'<td class="n">{counts[weather, time]:,}</td>' if (weather, time) in counts else '<td class="n">-</td>'
+            for time in times
+        )
+        + "</tr>"
+        for weather in weathers
+    )
+    note = f"{len(counts)} of {len(weathers) * len(times)} pairs; drawn uniformly, each preset is expected in {1 / len(weathers):.1%} of the flights"
+    return (
+        f"<h3>frames by weather and time of day</h3><table><tr><th></th>{head}</tr>{rows}</table><small>{note}</small>"
+    )
 
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:

@@ -19,10 +19,12 @@ from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS, Language, SentenceState
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, Look
 from cosfly.products.playback import EVENTS, Flight, sample_id
+from cosfly.products.weather import WeatherParams
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
 LOOK = tuple(Look.model_fields)
+WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 CAPTION_FIELDS = tuple(f"caption_{language}_{field}" for language in LANGUAGES for field in FIELDS)
@@ -134,6 +136,12 @@ class Column:
         return bool(value) if self.type == "bool" else value
 
 
+def _knobs(flight: Flight) -> np.ndarray | None:
+    """The six knobs of weather, (6,), None where the file has none."""
+    record = flight.weather_record
+    return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
+
+
 def _said(name: str, kind: str = "string") -> Column:
     return Column(name, kind, lambda _, __, caption: caption and caption[name])
 
@@ -159,6 +167,8 @@ SCALARS = (  # everything but pictures and depth
     Column("pair", "string"),
     Column("weather", "string", lambda f, i, _: f.weather["weather"]),
     Column("time_of_day", "string", lambda f, i, _: f.weather["time_of_day"]),
+    Column("weather_mode", "string", lambda f, i, _: f.weather_record and f.weather_record.mode),
+    Column("weather_params", WEATHER_PARAMS, lambda f, i, _: _knobs(f)),
     Column("look", LOOK),
     Column("frame_index", "int32", lambda f, i, _: i),
     Column("time_s", "float64", lambda f, i, _: f.time_s[i]),

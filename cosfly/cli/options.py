@@ -37,6 +37,12 @@ Verify = Annotated[
 ]
 Out = Annotated[Path, typer.Option(help="Output folder.")]
 Map = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
+WeatherPool = Annotated[
+    Path | None, typer.Option(help="YAML file with weather presets of yours in the place of those that ship.")
+]
+TimePool = Annotated[
+    Path | None, typer.Option(help="YAML file with times of day of yours in the place of those that ship.")
+]
 Data = Annotated[
     Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
 ]

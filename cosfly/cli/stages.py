@@ -163,6 +163,14 @@ def render(
     others: Annotated[
         Path | None, typer.Option(help="Who else moves: others.json, beside the walks' path.json.")
     ] = None,
+    weather_mode: Annotated[str | None, typer.Option(help="Weather: off, fixed or random-per-path.")] = None,
+    weather_name: Annotated[str | None, typer.Option(help="Weather preset of mode fixed, as heavy_rain.")] = None,
+    tod_name: Annotated[str | None, typer.Option(help="Time-of-day preset of mode fixed, as night.")] = None,
+    weather_pool: options.WeatherPool = None,
+    tod_pool: options.TimePool = None,
+    weather_seed: Annotated[
+        int | None, typer.Option(help="Seed of random-per-path; a negative one draws another seed for every run.")
+    ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
@@ -178,12 +186,50 @@ def render(
 
     box_map, plain_map = _needed("--map", map_), _needed("--simplified", simplified)
     flights, folder = _needed("--traces", traces), _needed("--out", out)
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    weather = {
+        "weather_mode": weather_mode, "weather_name": weather_name, "tod_name": tod_name, "weather_pool": weather_pool,
+        "tod_pool": tod_pool, "weather_seed": weather_seed,
+    }  # fmt: skip
+    of_stage = {f"render.{name}": value for name, value in weather.items()}
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers, **of_stage})
     options.set_aside(folder, repair)
     options.verify_first(verify, box_map, plain_map, flights, others, folder)
     given = options.manner(cfg, resume) | {"seed": cfg.seed, "others": others}
     product = stage.run(cfg.render, box_map, plain_map, flights, folder, **given)
     options.tell_product(product, folder, cfg)
+
+
+@render_app.command("weather-gallery")
+def weather_gallery(
+    map_: options.Map,
+    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
+    trajectory: Annotated[int, typer.Option(help="Which flight of the traces, counted from 0.")] = 0,
+    frame: Annotated[
+        int | None, typer.Option(help="Which of its frames. [default: the one that looks down least]")
+    ] = None,
+    fov: Annotated[float, typer.Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
+    weather_pool: options.WeatherPool = None,
+    tod_pool: options.TimePool = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+) -> None:
+    """One view under every weather and time of day: nine pictures, and a sheet of all."""
+    from cosfly.console import progress_bar
+    from cosfly.render import weather_gallery
+    from cosfly.render.weather import read_pools
+
+    pools = {"render.weather_pool": weather_pool, "render.tod_pool": tod_pool}
+    mode = {"render.weather_mode": "random_per_path"} if any(pools.values()) else {}
+    cfg = options.resolve(config, overrides, {"seed": seed, **mode, **pools})
+    presets = read_pools(cfg.render)
+    with progress_bar("weather-gallery: pictures", len(presets.weathers) * len(presets.times)) as advance:
+        product = weather_gallery.run(
+            cfg.render, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=cfg.seed, advance=lambda: advance(1),
+        )  # fmt: skip
+    for path in product:
+        typer.echo(path)
 
 
 @app.command()

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.playback import Flight
 from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.products.weather import preset_token
 from cosfly.reading.documents import read_json, validation_errors
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
@@ -58,11 +59,15 @@ AXES = {
     "visibility": Axis("visible share of the person", "", 0.0, 0.05, 20),
 }
 
-NAMED = ("styles", "paces", "labels")
+NAMED = ("styles", "paces", "labels", "weathers", "times_of_day")
+PAIR = " | "  # between the two names of a pair
 
 
 class Coverage(BaseModel):
-    """Frames by bin of each axis, by style, by pace, and by label, which only captions tell."""
+    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and by weather and time of day, where there is any.
+
+    skies: frames by both, as "heavy_rain | night".
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -71,15 +76,28 @@ class Coverage(BaseModel):
     styles: dict[str, int] = {}
     paces: dict[str, int] = {}
     labels: dict[str, int] = {}
+    weathers: dict[str, int] = {}
+    times_of_day: dict[str, int] = {}
+    skies: dict[str, int] = {}
 
     @classmethod
     def of(
-        cls, values: Mapping[str, np.ndarray], styles: Iterable[str], paces: Iterable[str], labels: Iterable[str] = ()
+        cls,
+        values: Mapping[str, np.ndarray],
+        styles: Iterable[str],
+        paces: Iterable[str],
+        labels: Iterable[str] = (),
+        skies: Iterable[tuple[str | None, str | None]] = (),
     ) -> Coverage:
-        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have one."""
-        named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels)]
+        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have one; weather and
+        time of day of each, None where nobody says.
+        """
+        pairs = [(weather and preset_token(weather), time and preset_token(time)) for weather, time in skies]
+        weathers, times = ([pair[k] for pair in pairs if pair[k] is not None] for k in (0, 1))
+        both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
+        named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
         counted = {name: axis.counts(values[name]) for name, axis in AXES.items()}
-        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip(NAMED, named, strict=True)))
+        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip((*NAMED, "skies"), named, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
@@ -88,7 +106,7 @@ class Coverage(BaseModel):
         bins = {name: np.sum([part.bins[name] for part in parts], axis=0).tolist() for name in AXES if parts}
         named = {
             name: dict(sorted(sum((Counter(getattr(part, name)) for part in parts), Counter()).items()))
-            for name in NAMED
+            for name in (*NAMED, "skies")
         }
         return cls(frames=sum(part.frames for part in parts), bins=bins, **named)
 
@@ -130,7 +148,8 @@ def coverage_of(flight: Flight) -> Coverage:
     box = flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox
     offsets_m = flight.positions_m - flight.targets_m
     values = axis_values(offsets_m, flight.target_headings_deg, box[:, 3] - box[:, 1], flight.visibility)
-    return Coverage.of(values, flight.styles, [flight.pace] * len(flight))
+    sky = flight.weather["weather"], flight.weather["time_of_day"]
+    return Coverage.of(values, flight.styles, [flight.pace] * len(flight), skies=[sky] * len(flight))
 
 
 @cache

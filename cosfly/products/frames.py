@@ -19,6 +19,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.png.write import areas_png, colours_png
 from cosfly.products.places import tree_of_flight
+from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import parse_array_header, read_array, read_picture
 from cosfly.reading.documents import read_model
 from cosfly.reprojection import grid_rows
@@ -60,7 +61,7 @@ class Camera:
 
 
 class Look(Config):
-    """Sun and air, the same for every frame of a run."""
+    """Sun and air of a run without weather, the same for every frame."""
 
     sun_azimuth_deg: float = Field(
         235.0, ge=0, le=360, description="direction towards the sun, counter-clockwise from east"
@@ -208,8 +209,9 @@ class FrameMeta(_Group):
     drone_pose: TreePose
     target: TargetMeta
     perturbation: PerturbationMeta
-    look: Look | None = None  # null in trees of before it stood here
+    look: Look | None = None  # null with weather, and in trees of before it stood here
     others: OthersMeta | None = Field(None, exclude_if=lambda others: others is None)  # absent in runs without others
+    weather: WeatherRecord | None = Field(None, exclude_if=lambda weather: weather is None)  # in the place of `look`
 
     def to_bytes(self) -> bytes:
         """The content of the file."""

@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import mirror_positions, mirror_rotations
@@ -36,6 +37,7 @@ from cosfly.products.trajectory import (
     vectors_of,
 )
 from cosfly.products.walks import pace_of
+from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import read_json
 from cosfly.store import write_json
 
@@ -144,6 +146,14 @@ class Flight:
         named = {own: (told.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
         return {own: next((one for one in found if isinstance(one, str)), None) for own, found in named.items()}
 
+    @cached_property
+    def weather_record(self) -> WeatherRecord | None:
+        """The whole record of weather, knobs and all; None where the file has none in the paper's form."""
+        try:
+            return WeatherRecord.model_validate(self.raw.get("weather"))
+        except ValidationError:
+            return None
+
     @property
     def keeps_sight(self) -> np.ndarray:
         """Tell of each frame whether it is judged by how much it sees of the target, (n,) bool."""
@@ -249,6 +259,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
     segments, mission = reader.flown(raw, len(points))
+    reader.weather(raw)
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     drone, turn, walker = (
         offsets_of(points, name, axes, is_original)

@@ -12,7 +12,9 @@ from cosfly.geometry import step_s
 from cosfly.products.columns import LARGEST, is_in_range
 from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
+from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import check_pixels
+from cosfly.reading.documents import validation_errors
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
@@ -112,6 +114,19 @@ class FieldReader:
                 raise
             self.issues.append(str(error))
             return (), None
+
+    def weather(self, raw: dict) -> None:
+        """Check the record of weather, where there is one as the paper has it; public files may call something else by its name."""
+        told = raw.get("weather")
+        if not (isinstance(told, dict) and ("params" in told or "mode" in told)):
+            return
+        try:
+            with validation_errors(f"{self.path}: weather"):
+                WeatherRecord.model_validate(told)
+        except InputError as error:
+            if self.strict:
+                raise
+            self.issues.append(str(error))
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):

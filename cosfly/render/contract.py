@@ -21,6 +21,7 @@ import numpy as np
 from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.weather import WeatherParams
 
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU
 
@@ -115,8 +116,14 @@ class Renderer(Protocol):
 
     device: str
 
-    def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Get ready for a flight within these corners, (3,) each: shadows and the like."""
+    def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
+        """Get ready for a flight within these corners, (3,) each, in this weather or, without one, in the look: shadows and the like.
+
+        Weather changes colours alone, never depth, kinds and ids.
+
+        Raises:
+            RenderError: this renderer draws no weather.
+        """
 
     def render(
         self,

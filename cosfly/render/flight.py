@@ -18,6 +18,7 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.products.weather import WeatherRecord
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
@@ -45,11 +46,12 @@ class FlightScript:
     gait: Gait
     clothes: Clothes
     others: Cast
-    look: Look
+    look: Look | None
     is_original: bool
     source: dict
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
+    weather: WeatherRecord | None = None  # in the place of `look`
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,8 @@ def render_flight(
     script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # hidden targets are noted there
     poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
-    renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
+    knobs = None if script.weather is None else script.weather.params
+    renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, knobs)
     annotations: list[FrameMeta] = []
     visibility: list[float] = []
     pending: list[Future] = []
@@ -191,6 +194,7 @@ def _annotation(script: FlightScript, i: int, seen: Seen) -> FrameMeta:
         ),
         look=script.look,
         others=seen.others,
+        weather=script.weather,
     )
 
 
@@ -237,5 +241,8 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         segments=script.segments,
         mission=script.mission,
         is_original=script.is_original,
-        raw={"points": [{"perturbation": dict(state)} for state in perturbed.states]},
+        raw={
+            **({} if script.weather is None else {"weather": script.weather.model_dump()}),
+            "points": [{"perturbation": dict(state)} for state in perturbed.states],
+        },
     )

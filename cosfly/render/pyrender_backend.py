@@ -16,12 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing
+from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import rotation_matrices, rotation_matrix
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.products.weather import WeatherParams
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped
@@ -86,8 +87,16 @@ class PyrenderRenderer:
         self._scene = pyrender.Scene()
         self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others)))
 
-    def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Nothing holds for a flight alone: there are no shadows."""
+    def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
+        """Nothing holds for a flight alone: there are no shadows, and no weather.
+
+        Raises:
+            RenderError: weather is asked for.
+        """
+        if weather is not None:
+            raise RenderError(
+                "the renderer pyrender draws no weather", fix="take render.backend gl, or weather_mode off"
+            )
 
     def render(
         self,

@@ -12,10 +12,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from cosfly.chance import rng_for
-from cosfly.config import Config, MayDiffer
+from cosfly.config import MayDiffer
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import BoxMap, read_boxes
@@ -25,12 +25,14 @@ from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
+from cosfly.products.weather import WeatherRecord
 from cosfly.provenance import fingerprint
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.others import NOBODY, Cast, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
+from cosfly.render.weather import WeatherConfig, coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Kept, Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
@@ -45,8 +47,8 @@ FROM_ONE_RUN = "give the others.json that was written beside the walks' path.jso
 IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 
 
-class RenderConfig(Config):
-    """Camera, tracks and files of the frames."""
+class RenderConfig(WeatherConfig):
+    """Camera, tracks, weather and files of the frames."""
 
     backend: Literal["gl", "pyrender"] = Field(
         "gl",
@@ -73,7 +75,7 @@ class RenderConfig(Config):
         ("clean", "perturbed"), min_length=1, description="which tracks to draw: ORI and aug_001"
     )
     perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
-    look: Look = Field(Look(), description="sun and air")
+    look: Look = Field(Look(), description="sun and air of flights without weather")
     modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
     )
@@ -93,6 +95,16 @@ class RenderConfig(Config):
         if not all(1.0 <= fov < 170.0 for fov in fovs):
             raise ValueError("every field of view must lie in [1, 170) degrees")
         return fovs
+
+    @model_validator(mode="after")
+    def _weather_can_be_drawn(self) -> RenderConfig:
+        if self.weather_mode == "off":
+            return self
+        if self.backend != "gl":
+            raise ValueError(f"backend {self.backend} draws no weather: take gl, or weather_mode off")
+        if self.look != Look():
+            raise ValueError("look is for flights without weather: leave it out, or take weather_mode off")
+        return self
 
     @field_validator("tracks", "modalities")
     @classmethod
@@ -135,8 +147,9 @@ def script_flight(
     cfg: RenderConfig,
     seed: int,
     others: Cast = NOBODY,
+    weather: WeatherRecord | None = None,
 ) -> FlightScript:
-    """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view and clothes."""
+    """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view, clothes and weather."""
     assert cfg.first_timestamp is not None, "`run` settles it"
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
@@ -158,7 +171,8 @@ def script_flight(
         gait=gait_of(trace.targets_m, trace.time_s),
         clothes=clothes,
         others=others,
-        look=cfg.look,
+        look=cfg.look if weather is None else None,
+        weather=weather,
         is_original=track == "clean",
         segments=trace.segments,
         mission=trace.mission,
@@ -197,6 +211,8 @@ def run(
         InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no renderer here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
+    read_pools(cfg)  # presets that cannot be are told before anything is written
+    inputs |= cfg.pool_files()
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -211,7 +227,7 @@ def run(
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
-    cfg = cfg.model_copy(update={"first_timestamp": first_timestamp})
+    cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
         for number, trace in passed
@@ -233,8 +249,24 @@ def run(
         num_traces=len(all_traces),
         num_traces_not_rendered=len(all_traces) - len(passed),
         num_boxes_sharing_an_id=num_shared,
+        **_weather_drawn(cfg, made),
     )
     return out
+
+
+def _weather_drawn(cfg: RenderConfig, made: list[_Rendered]) -> dict:
+    """What the manifest says of the weather of the trajectories, nothing in runs without."""
+    if cfg.weather_mode == "off":
+        return {}
+    # Both tracks of a trajectory have the same.
+    drawn = {str(Path(one.folder).parent): (str(one.weather), str(one.time_of_day)) for one in made}
+    told = coverage_of(read_pools(cfg), drawn.values())
+    log.info("render: %s", told_coverage(told))
+    return {"weather": told}
+
+
+def _weather_told(weather: WeatherRecord, seed: int) -> dict:
+    return {"weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": seed}
 
 
 class _Rendered(BaseModel):
@@ -242,6 +274,9 @@ class _Rendered(BaseModel):
 
     folder: str
     num_frames: int
+    weather: str | None = None
+    time_of_day: str | None = None
+    weather_seed: int | None = None
 
 
 def _companies(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
@@ -295,6 +330,14 @@ def _names(
     return town, derived if cfg.first_timestamp is None else cfg.first_timestamp
 
 
+def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
+    """Give the seed of the weather; a drawn one stays what it was when the tree was begun."""
+    if cfg.weather_seed >= 0:
+        return cfg.weather_seed
+    begun = (result_of(record, _Rendered).weather_seed for record in stage.items() if isinstance(record, Kept))
+    return next((seed for seed in begun if seed is not None), None) or drawn_seed()
+
+
 def _check_ids(traces: list[DroneTrace], path: Path) -> None:
     if twice := sorted(i for i, n in Counter(trace.path_id for trace in traces).items() if n > 1):
         raise InputError("two flights have one id", where=path, got=twice[0], expected="unique ids")
@@ -334,6 +377,7 @@ def make_worker(
     companies = _companies(others, all_traces)
     num_others = num_others_of(companies)
     renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, num_others)
+    pools = read_pools(cfg)
     writing = Writing(tuple(cfg.modalities), cfg.visible_threshold)
 
     def work(item: Item) -> Outcome:
@@ -342,7 +386,9 @@ def make_worker(
         company = companies.get(trace.path_id)
         rng = rng_for(seed, "render", f"{trace.path_id}/others")
         cast = NOBODY if company is None else cast_of(company.others, trace.time_s, rng)
-        script = script_flight(trace, number, track, town, surroundings, cfg, seed, cast)
+        script = script_flight(
+            trace, number, track, town, surroundings, cfg, seed, cast, weather_of(cfg, pools, number)
+        )
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             flight = render_flight(renderer, script, unfinished, writing, cfg.encoder_threads)
@@ -354,6 +400,7 @@ def make_worker(
                 "num_visible": int(flight.target_visible.sum()),
                 "mean_visibility": round(float(flight.visibility.mean()), 6),
                 "num_perturbed": int(flight.is_perturbed.sum()),
+                **({} if script.weather is None else _weather_told(script.weather, cfg.weather_seed)),
             }
         )
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.errors import InputError
-from cosfly.products.coverage import AXES, NAMED, Coverage, axis_values
+from cosfly.products.coverage import AXES, Coverage, axis_values
 from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups
 from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
@@ -28,8 +28,9 @@ MILLION = 1_000_000
 LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "has_caption")
+COVERED = ("style", "pace", "label")
 COLUMNS = [
-    "sample_id", *PLACE, "track", "style", "pace", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "drone_offset", "target",
+    "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "drone_offset", "target",
     "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_FIELDS,
 ]  # fmt: skip
 NEVER_NULL = frozenset(
@@ -211,14 +212,20 @@ class Counted:
 
     def add(self, rows: list[dict[str, Any]]) -> None:
         """Count rows that follow those counted so far."""
-        seen, named = [], {name: list[str]() for name in NAMED}
+        seen, named = [], {name: list[str]() for name in COVERED}
         for row in rows:
             seen.append(self._add(row))
-            for kind, column in zip(NAMED, ("style", "pace", "label"), strict=True):
-                named[kind] += [row[column]] if row[column] is not None else []
+            for column, names in named.items():
+                names += [row[column]] if row[column] is not None else []
         if rows:
             values = np.array(seen, dtype=np.float64)
-            part = Coverage.of(axis_values(values[:, :3], *values[:, 3:].T), *(named[kind] for kind in NAMED))
+            part = Coverage.of(
+                axis_values(values[:, :3], *values[:, 3:].T),
+                named["style"],
+                named["pace"],
+                named["label"],
+                skies=[(row["weather"], row["time_of_day"]) for row in rows],
+            )
             self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
         self.rows += len(rows)
 

@@ -120,7 +120,7 @@ def finish(
 def _notes(units: Sequence[Unit], written: Sequence[Written]) -> Iterator[str]:
     yield (
         "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of the flight each was. "
-        "The layout has no captions: they stand in the release. meta.json, weather and the order of missions are not in it."
+        "The layout has no captions: they stand in the release. meta.json and the order of missions are not in it."
     )
     gaps = sum(one.facts["has_gaps"] for one in written)
     if gaps:
@@ -195,6 +195,9 @@ def _point(row: Row) -> dict[str, Any]:
 
 
 def _weather(row: Row) -> dict[str, Any]:
+    if row["weather_params"] is not None and row["weather_mode"] is not None:
+        names = {"weather_name": row["weather"], "tod_name": row["time_of_day"]}
+        return {"weather": {"mode": row["weather_mode"], **names, "params": row["weather_params"]}}
     told = {name: row[name] for name in ("weather", "time_of_day") if row[name] is not None}
     return {"weather": told} if told else {}
 

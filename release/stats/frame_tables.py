@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 
+from cosfly.products.weather import TIMES, WEATHERS, preset_token
 from release.stats.cells import SPREAD, percent, spread_row
 from release.stats.counting import Counts
 from release.stats.schema import Cell, Table
-
-# tab:weather_presets, tab:tod_presets
-WEATHER = {
-    "sky": ("clear", "fair", "partly_cloudy", "cloudy", "overcast"), "rain": ("drizzle", "light_rain", "medium_rain", "heavy_rain"),
-    "fog": ("thin_fog", "mist", "dense_fog"), "haze": ("smog", "dust_haze", "snow_haze"),
-}  # fmt: skip
-TIMES = ("morning", "noon", "dusk", "night")
 
 
 def weather(counts: Counts) -> list[Table]:
@@ -27,7 +21,7 @@ def weather(counts: Counts) -> list[Table]:
         }
     )
     if named:
-        presets = [preset for group in WEATHER.values() for preset in group]
+        presets = list(WEATHERS)
         presets += sorted({weather for weather, _ in named} - set(presets))
         times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
         rows: list[list[Cell]] = [[preset, *(named[preset, time] for time in times)] for preset in presets]
@@ -58,7 +52,7 @@ def weather(counts: Counts) -> list[Table]:
 
 
 def _token(text: str | None) -> str:
-    return "not told" if text is None else text.strip().lower().replace(" ", "_").replace("-", "_")
+    return "not told" if text is None else preset_token(text)
 
 
 def perturbation(counts: Counts) -> list[Table]:

@@ -11,17 +11,19 @@ import numpy as np
 
 from cosfly.products.captions import ACTIONS, LabelFrom, TeacherKind, Verdict, Writing
 from cosfly.products.playback import EVENTS, ORIGINAL
+from cosfly.products.weather import WeatherMode
 from release.columns import CAPTION_SHARES
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
 # What cannot change within a flight.
 CONSTANT = (
-    "run", "town", "trajectory", "variant", "track", "pace", "walk", "split", "pair", "weather", "time_of_day", "look",
-    "width_px", "height_px", "fov_deg", "intrinsics",
+    "run", "town", "trajectory", "variant", "track", "pace", "walk", "split", "pair", "weather", "time_of_day", "weather_mode",
+    "weather_params", "look", "width_px", "height_px", "fov_deg", "intrinsics",
 )  # fmt: skip
 CLOSED: dict[str, tuple[str, ...]] = {
     "track": ("clean", "perturbed"),
+    "weather_mode": get_args(WeatherMode),
     "decision": ACTIONS,
     "label": ACTIONS,
     "caption_en_flight_decision": ACTIONS,
@@ -41,6 +43,10 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "target_heading_deg": {"": (-360.0, 360.0)},
     "pose": {"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
     "look": {"sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6), "exposure": (0.0, 100.0)},
+    "weather_params": {
+        **dict.fromkeys(("cloudiness", "precipitation", "fog_density"), (0.0, 100.0)), "fog_distance": (1e-9, 1e6),
+        "sun_altitude_angle": (-90.0, 90.0), "sun_azimuth_angle": (0.0, 360.0),
+    },
     **{name: {"": (0.0, 1.0)} for name in CAPTION_SHARES},
 }  # fmt: skip
 NEVER_NULL = (

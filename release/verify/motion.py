@@ -120,7 +120,18 @@ def _check_perturbation(flight: FlightRows, settings: dict[str, Any], findings: 
 
 def _check_twin(flight: FlightRows, twin: FlightRows, findings: Findings) -> None:
     """A perturbed flight less its offsets is the clean flight of the trajectory, in every frame that both show."""
-    for name in ("intrinsics", "width_px", "height_px", "pace", "walk", "split", "weather", "time_of_day", "look"):
+    for name in (
+        "intrinsics",
+        "width_px",
+        "height_px",
+        "pace",
+        "walk",
+        "split",
+        "weather",
+        "time_of_day",
+        "weather_params",
+        "look",
+    ):
         if flight.rows[0].get(name) != twin.rows[0].get(name):
             findings.error("pair", flight.where(0, name), flight.rows[0].get(name), f"{twin.rows[0].get(name)}, as in its clean flight")  # fmt: skip
     at = {int(index): k for k, index in enumerate(twin.index)}

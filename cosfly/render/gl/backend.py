@@ -6,6 +6,7 @@ Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as floa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from cosfly.errors import EnvironmentMissing
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
+from cosfly.products.weather import WeatherParams
 from cosfly.reading.files import read_text
 from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
 from cosfly.render.gl import meshes
@@ -26,6 +28,7 @@ from cosfly.render.gl.parts import LOOSE_VERTEX, PART
 from cosfly.render.gl.scene import Scene, build_scene
 from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import View
+from cosfly.render.gl.weather_pass import FAIR, WEATHER_DEFINE, WEATHER_SCENE, WEATHER_SKY, WeatherPass
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
@@ -58,9 +61,23 @@ def open_context() -> Any:
         ) from None
 
 
-def _source(*names: str) -> str:
-    folder = Path(__file__).parent
-    return "#version 330 core\n" + "\n".join(read_text(folder / name) for name in names)
+def _sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
+    """Give the texts of a program of these files."""
+    folder, head = Path(__file__).parent, "#version 330 core\n" + define
+    texts = ["\n".join(read_text(folder / name) for name in names) for names in (vertex, fragment)]
+    return head + texts[0], head + texts[1]
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What fair weather, or any other, is drawn with: programs, and vertex arrays of loose triangles by material and program."""
+
+    materials: list[Any]
+    near_movers: list[Any]
+    sky_program: Any
+    sky: Any
+    loose: dict[int, dict[int, Any]]
+    weather: WeatherPass | None
 
 
 class GlRenderer:
@@ -70,29 +87,51 @@ class GlRenderer:
         self.context = open_context()
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
-        self.scene, self.look = build_scene(box_map, num_others), look
+        self.scene, self.look, self.num_others = build_scene(box_map, num_others), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
-            self._make_programs()
+            self._depth_program = self.context.program(
+                *_sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
+            )
             self._make_targets()
             self._make_meshes()
+            self._looks: dict[bool, _Look] = {}
+            self._use_look(has_weather=False)
         self.prepare(*_bounds(self.scene))
 
     # --- set-up ---
 
-    def _make_programs(self) -> None:
-        make = self.context.program
-        vertex, fragment = _source("part.glsl", "scene.vert.glsl"), _source("light.glsl", "scene.frag.glsl")
-        self._materials, self._near_movers = (
+    def _use_look(self, has_weather: bool) -> None:
+        """Draw from now on with the programs of fair weather, or with those of any other; each is made when first needed."""
+        if has_weather not in self._looks:
+            self._looks[has_weather] = self._make_look(has_weather)
+        look = self._looks[has_weather]
+        self._materials, self._near_movers, self._loose = look.materials, look.near_movers, look.loose
+        self._sky_program, self._sky, self._weather = look.sky_program, look.sky, look.weather
+
+    def _make_look(self, has_weather: bool) -> _Look:
+        make, define = self.context.program, WEATHER_DEFINE if has_weather else ""
+        of_sky = ("light.glsl", *(WEATHER_SKY if has_weather else FAIR), "sky.frag.glsl")
+        of_surfaces = ("light.glsl", *(WEATHER_SCENE if has_weather else FAIR), "scene.frag.glsl")
+        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, define)
+        materials, near_movers = (
             [
-                make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near_movers};"))
+                make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))
                 for material in range(part_tables.NUM_MATERIALS)
             ]
-            for near_movers in ("false", "true")
+            for near in ("false", "true")
         )
-        self._depth_program = make(_source("part.glsl", "depth.vert.glsl"), _source("depth.frag.glsl"))
-        self._sky_program = make(_source("screen.vert.glsl"), _source("light.glsl", "sky.frag.glsl"))
-        self._sky = self.context.vertex_array(self._sky_program, [])
+        sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define))
+        loose = {
+            material: self._loose_arrays((materials[material], near_movers[material]), rows)
+            for material, rows in self.scene.loose.items()
+        }
+        weather = None
+        if has_weather:
+            rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl"), define))
+            weather = WeatherPass(self.context, self.scene, self._color, self._depth, rain, self.num_others)
+        sky = self.context.vertex_array(sky_program, [])
+        return _Look(materials, near_movers, sky_program, sky, loose, weather)
 
     def _make_targets(self) -> None:
         size, context = (self.width_px, self.height_px), self.context
@@ -116,13 +155,12 @@ class GlRenderer:
         ]
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
         self._groups = _groups(self.scene.parts.records, self.scene.parts.mesh)
-        self._loose = {material: self._loose_arrays(material, rows) for material, rows in self.scene.loose.items()}
 
-    def _loose_arrays(self, material: int, vertices: np.ndarray) -> dict[int, Any]:
+    def _loose_arrays(self, programs: tuple[Any, Any], vertices: np.ndarray) -> dict[int, Any]:
         """Vertex arrays, one a program, of triangles that are no instances: every vertex brings its part along."""
         names = [f"in_{name}" for name in LOOSE_VERTEX.names or ()]
         buffer, arrays = self.context.buffer(vertices.tobytes()), {}
-        for program in (self._materials[material], self._near_movers[material]):
+        for program in programs:
             content = _attributes(program, buffer, "3f 3f 3f 3f 4f 4f 1u 1f", tuple(names))
             arrays[program.glo] = self.context.vertex_array(program, [content])
         return arrays
@@ -145,8 +183,8 @@ class GlRenderer:
 
     # --- what holds for a whole flight ---
 
-    def prepare(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Compute sun shadows and sky openness for an area of the world, (3,) corners; once for each flight."""
+    def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners; once for each flight. Takes its weather."""
         low, high = np.asarray(low_m) - self.scene.origin_m, np.asarray(high_m) - self.scene.origin_m
         middle = (low + high) / 2.0
         half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
@@ -154,11 +192,15 @@ class GlRenderer:
         near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
         casting = np.flatnonzero(near & (parts.max_px > 1e8))
         with self.context:
+            self._use_look(weather is not None)
+            if self._weather is not None and weather is not None:
+                self._weather.prepare(weather, middle, half)
+            self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
             self._prepare_shadow(casting, middle, half)
             self._prepare_openness(casting, middle, half)
 
     def _prepare_shadow(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
-        sun = self.look.sun_direction()
+        sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
@@ -172,6 +214,7 @@ class GlRenderer:
         to_texture[:3, 3] = 0.5
         for program in (*self._materials, *self._near_movers):
             _set(program, "shadow_from_world", to_texture @ clip_from_world)
+            _set(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
 
     def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
         """A height map from above, blurred: what stands higher than a point darkens it."""
@@ -231,9 +274,12 @@ class GlRenderer:
         moving = [] if body is None else [placed(body, self.scene.origin_m)]
         moving += draw_others(others, self.scene.origin_m, view)
         bones = self._bones(body)
-        shades = shades_of(bones, capsules_of(others, self.scene.origin_m, view), self.look.sun_direction(), view)
+        capsules = capsules_of(others, self.scene.origin_m, view)
+        has_headlights = self._weather is not None and self._weather.has_lights
+        shades = shades_of(bones, capsules, self._sun, view, has_headlights)
+        frame_values = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
         with self.context:
-            self._set_camera(self._materials, camera_pose[:3, :3], view.eye, intrinsic)
+            self._set_camera(self._materials, view, frame_values)
             rows = view.rows(self.scene.parts)
             self._image.use()
             self._image.clear(depth=1.0)
@@ -242,36 +288,45 @@ class GlRenderer:
             self.context.depth_func = "<="
             self._shadow.use(0)
             self._height.use(1)
+            if self._weather is not None:
+                self._weather.use()
             self._draw_scene(self._materials, rows, moving)
             if shades:
-                self._set_camera(self._near_movers, camera_pose[:3, :3], view.eye, intrinsic)
+                self._set_camera(self._near_movers, view, frame_values)
                 self._set_person(body)
             for shade in shades:
                 self._draw_shaded(shade, bones, rows, moving)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
+            if self._weather is not None:
+                self._weather.draw_rain(_set, self._lens(view) | frame_values)
             return self._read()
 
-    def _set_camera(
-        self, programs: list[Any], world_from_camera: np.ndarray, eye: np.ndarray, intrinsic: np.ndarray
-    ) -> None:
-        common = {
-            "lens": np.array([*np.diag(intrinsic)[:2], *intrinsic[:2, 2]]),
+    def _lens(self, view: View) -> dict[str, Any]:
+        return {
+            "lens": np.array([*np.diag(view.intrinsic)[:2], *view.intrinsic[:2, 2]]),
             "image_size": np.array([self.width_px, self.height_px]),
-            "sun_direction": self.look.sun_direction(),
+            "world_from_camera": view.world_from_camera,
+        }
+
+    def _set_camera(self, programs: list[Any], view: View, frame_values: dict[str, Any]) -> None:
+        """Set what holds for a frame; frame_values: of the weather, in the place of the look's."""
+        common = {
+            **self._lens(view),
+            "sun_direction": self._sun,
             "haze_m": self.look.haze_m,
             "exposure": self.look.exposure,
             "clip_m": np.array([NEAR_M, FAR_M]),
-            "camera_from_world": world_from_camera.T,
-            "world_from_camera": world_from_camera,
-            "camera_position": eye,
+            "camera_from_world": view.world_from_camera.T,
+            "camera_position": view.eye,
             "world_offset": np.mod(self.scene.origin_m[:2], PATTERN_M),
             "ground_z": self.scene.plane_z_m - self.scene.origin_m[2],
             "shadow_map": 0,
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,
             "sky_tag": KINDS["Sky"],
+            **frame_values,
         }
         for program in (*programs, self._sky_program):
             for name, value in common.items():
@@ -338,6 +393,7 @@ class GlRenderer:
         self._image.read_into(depth, components=1, attachment=1, dtype="f4")
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")
         rgb = smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB))
+        rgb = rgb if self._weather is None else self._weather.glowing(rgb)
         return Frame(rgb, depth, (tag & 0xFF).astype(np.uint8), (tag >> 16).astype(np.uint16))
 
     def close(self) -> None:

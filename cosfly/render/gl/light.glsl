@@ -1,4 +1,4 @@
-// Noise, sky, haze and the final tone: shared by the sky and the scene.
+// Noise and the final tone: shared by the sky and the scene. look.glsl or weather.glsl follows.
 uniform vec3 sun_direction;       // towards the sun
 uniform float haze_m;             // distance at which haze hides about two thirds
 uniform float exposure;
@@ -23,13 +23,6 @@ float noise3(vec3 p) {
     return mix(noise2(p.xy + 37.0 * z), noise2(p.xy + 37.0 * (z + 1.0)), f * f * (3.0 - 2.0 * f));
 }
 
-vec3 horizon_color() { return vec3(0.66, 0.75, 0.84); }
-vec3 sky_gradient(vec3 d) {
-    float up = clamp(d.z, 0.0, 1.0);
-    vec3 sky = mix(horizon_color(), vec3(0.16, 0.34, 0.66), 1.0 - exp(-3.2 * up));
-    float near_sun = max(dot(d, sun_direction), 0.0);
-    return sky + vec3(1.0, 0.85, 0.6) * (0.18 * pow(near_sun, 24.0) + 0.06 * pow(near_sun, 4.0));
-}
 vec3 toned(vec3 linear_color) {
     vec3 x = linear_color * exposure;
     x = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);   // Narkowicz's fit of the ACES curve

@@ -156,6 +156,9 @@ void wall(inout Surface s, vec3 p, vec3 n, vec3 h, float seed, vec3 footprint) {
         pane_color = mix(pane_color, frame_color, clamp(mullion, 0.0, 1.0));
         s.albedo = mix(s.albedo, mix(jamb, pane_color, pane), opening);
         s.mirror = is_door ? 0.0 : 0.9 * glassy * opening;
+#ifdef WEATHER
+        if (!is_door) s.glow += lit_room(id, is_shop) * glassy * opening * (0.75 + 0.25 * smoothstep(o.z, o.w, inner.y));
+#endif
         s.shade *= 1.0 - 0.5 * opening * (1.0 - pane);
         // Panes do not stand in one plane: mirrored edges shift from window to window.
         s.normal = normalize(s.normal + 0.02 * opening * vec3(id - 0.5, fract(id * 7.0) - 0.5, fract(id * 29.0) - 0.5));
@@ -224,6 +227,9 @@ float leaf_cover(vec3 p, float w, out vec3 bump) {
 }
 
 float sun_reaches(vec3 p, vec3 n) {
+#ifdef WEATHER
+    return soft_shadow(shadow_map, shadow_from_world, p, n);
+#endif
     float lift = material == LEAVES ? 0.3 : 0.09;
     vec4 c = shadow_from_world * vec4(p + lift * n + 0.03 * sun_direction, 1.0);
     if (any(lessThan(c.xyz, vec3(0.0))) || any(greaterThan(c.xyz, vec3(1.0)))) return 1.0;
@@ -251,7 +257,8 @@ float person_lets_sun(vec3 p) {
     return light;
 }
 
-// What the others leave of the sun and of the sky, for everybody but themselves.
+// What the others leave of the sun and of the sky, for everybody but themselves; by night their headlights.
+vec3 from_headlights = vec3(0.0);
 vec2 others_let(vec3 p) {
     vec2 light = vec2(1.0);
     float own = float(f_tag >> 16);
@@ -259,6 +266,9 @@ vec2 others_let(vec3 p) {
         vec4 a = other_bones[2 * i], b = other_bones[2 * i + 1];
         if (b.w == own) continue;
         light.x = min(light.x, capsule_lets_sun(p, a.xyz, b.xyz, a.w));
+#ifdef WEATHER
+        from_headlights += headlights(p, a.xyz, b.xyz, a.w);
+#endif
         vec2 u = b.xy - a.xy, w = p.xy - a.xy;
         vec2 d = w - clamp(dot(u, w) / max(dot(u, u), 1e-6), 0.0, 1.0) * u;
         light.y = min(light.y, 1.0 - 0.45 * exp(-0.36 * dot(d, d) / (a.w * a.w)) * step(p.z, max(a.z, b.z)));
@@ -351,9 +361,29 @@ void main() {
         s.mirror = 0.08;
     }
 
-    // Light: a warm sun, a blue sky, some light from the ground; darker near the ground between tall things.
     vec3 geometric = normalize(v_normal);
     vec3 to_eye = normalize(camera_position - v_world);
+#ifdef WEATHER
+    float wet = wetness * (is_top ? 1.0 : 0.0);
+    if (wetness > 0.0) {
+        bool is_ground = material == ROAD || material == SIDEWALK || material == ROAD_LINE || material == GRAVEL || material == FACADE || material == CONCRETE || material == PLAIN;
+        if (material == GRASS || material == LEAVES || material == CLOTH || material == BARK) s.albedo *= 1.0 - 0.28 * wetness;
+        else if (is_ground || material == BRICK || material == FENCE) s.albedo *= 1.0 - (is_top ? 0.5 : 0.22) * wetness;
+        wet *= is_ground ? 1.0 : 0.0;
+        if (wet > 0.0) {
+            float pool = puddles * smoothstep(0.50, 0.62, 0.65 * noise2(p * 0.19 + 5.0) + 0.35 * noise2(p * 0.8));
+            s.albedo *= 1.0 - 0.45 * pool;
+            wet *= 0.42 + 0.58 * pool;
+            s.normal = normalize(s.normal + vec3(ripples(p, w) * (0.4 + 0.6 * pool), 0.0));
+        }
+    }
+    if (material == LAMP && f_color.r > 0.5) s.glow += lights_on * vec3(2.6, 2.1, 1.35) * (v_normal.z < 0.35 ? 1.0 : 0.35);
+    if (material == CAR_PAINT && (f_tag >> 16) >= lowest_other && (f_tag >> 16) <= highest_other) {
+        vec3 r = v_local / f_half;
+        if (abs(r.x) > 0.93 && abs(r.y) > 0.5 && r.z > -0.1 && r.z < 0.55) s.glow += lights_on * (r.x > 0.0 ? vec3(2.2, 2.05, 1.8) : vec3(1.2, 0.05, 0.03));
+    }
+#endif
+    // Light: a warm sun, a blue sky, some light from the ground; darker near the ground between tall things.
     float facing = dot(s.normal, sun_direction);
     float sun = mix(max(facing, 0.0), 0.5 + 0.5 * facing, translucent);
     if (sun > 0.001 && (dot(geometric, sun_direction) > 0.0 || translucent > 0.0)) {
@@ -371,21 +401,47 @@ void main() {
         sun *= light.x;
         open_sky *= light.y;
     }
-    vec3 ambient = mix(vec3(0.27, 0.25, 0.22), vec3(0.48, 0.56, 0.68), 0.5 + 0.5 * s.normal.z) * open_sky * s.shade;
-    vec3 light = vec3(2.35, 2.12, 1.75) * sun * mix(1.0, s.shade, 0.5) + ambient;
+    vec3 ambient = mix(ground_light, sky_light, 0.5 + 0.5 * s.normal.z) * open_sky * s.shade;
+    vec3 light = sun_light * sun * mix(1.0, s.shade, 0.5) + ambient;
+#ifdef WEATHER
+    vec3 lamp = lamp_reach(v_world, geometric) + from_headlights * (0.5 + 0.5 * abs(geometric.z));
+    light += lamp * mix(1.0, s.shade, 0.7);
+#endif
     vec3 color = s.albedo * light + s.glow;
     if (s.mirror > 0.0) {
+#ifdef WEATHER
+        vec3 below = 0.3 * (sky_light + ground_light), beside = 0.33 * (sky_light + ground_light);
+#else
+        const vec3 below = vec3(0.17, 0.17, 0.155), beside = vec3(0.20, 0.19, 0.18);
+#endif
         float grazing = pow(1.0 - max(dot(s.normal, to_eye), 0.0), 5.0);
         float share = s.mirror * (material == CAR_PAINT || material == METAL || material == LAMP ? 0.5 * grazing + 0.35 : 0.07 + 0.93 * grazing);
         vec3 r = reflect(-to_eye, s.normal);
-        vec3 seen = r.z > 0.0 ? sky_gradient(r) * (0.75 + 0.4 * noise2(r.xy / (r.z + 0.25) * 2.5)) : vec3(0.17, 0.17, 0.155);
-        seen = mix(vec3(0.20, 0.19, 0.18), seen, smoothstep(-0.05, 0.22, r.z));
+        vec3 seen = r.z > 0.0 ? sky_gradient(r) * (0.75 + 0.4 * noise2(r.xy / (r.z + 0.25) * 2.5)) : below;
+        seen = mix(beside, seen, smoothstep(-0.05, 0.22, r.z));
         color = mix(color, seen * (0.4 + 0.6 * open_sky), clamp(share, 0.0, 0.95));
+#ifdef WEATHER
+        color += sun_light * s.mirror * sun * pow(max(dot(r, sun_direction), 0.0), 90.0);
+#else
         color += vec3(2.2, 2.0, 1.6) * s.mirror * sun * pow(max(dot(r, sun_direction), 0.0), 90.0);
+#endif
     }
     float distance_m = length(camera_position - v_world);
+#ifdef WEATHER
+    if (wet > 0.0) {
+        float share = wet * (0.05 + 0.95 * pow(1.0 - max(dot(s.normal, to_eye), 0.0), 3.6));
+        vec3 r = reflect(-to_eye, s.normal);
+        r.z = max(r.z, 0.02);
+        float hidden = mirrored_block(height_map, height_area, v_world, r);
+        vec3 walls = 0.30 * (sky_light + ground_light) + lights_on * vec3(0.10, 0.06, 0.03) + 0.25 * lamp;
+        color = mix(color, mix(sky_gradient(normalize(r)), walls, hidden), clamp(share, 0.0, 0.9));
+        color += wet * lights_on * lamp_light * mirrored_lamps(v_world, r, 160.0);
+    }
+    color = mix(fog_color + 0.35 * lamp, color, seen_through(distance_m));
+#else
     float far = distance_m / haze_m, haze = 1.0 - exp(-far * sqrt(far));
     color = mix(color, horizon_color(), haze);
+#endif
 
     out_color = vec4(toned(color), 1.0);
     out_depth = v_depth;

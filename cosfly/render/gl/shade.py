@@ -14,6 +14,7 @@ from cosfly.geometry import box_corners
 from cosfly.render.gl.view import View
 
 PERSON_REACH_M = 30.0**0.5  # the shader follows the person's shadow so far from the hip
+SHORTEST_CAR_M, HEADLIGHT_M, HEADLIGHT_ASIDE_M = 0.5, 26.0, 9.0  # as the shader has them: who is shorter walks
 EDGE = 1.25  # radii of a capsule where its shadow ends
 SKY_RADII, PERSON_SKY_M = 4.5, 1.0  # how far aside a capsule, in its radii, and the person take light of the sky
 BELOW_M, LONGEST_M = 1.5, 60.0  # a shadow is followed down to here under the feet, and no farther than this
@@ -38,12 +39,14 @@ class Shade:
         return center, float(np.linalg.norm(self.points - center, axis=1).max())
 
 
-def shades_of(bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: View) -> list[Shade]:
+def shades_of(
+    bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: View, has_headlights: bool = False
+) -> list[Shade]:
     """Give the rectangles of a frame; no two of them overlap.
 
     Args:
         bones: (b, 2, 4) capsules of the person, as of others, none without a person; capsules: (c, 2, 4) of others.
-        sun: (3,) unit vector towards it.
+        sun: (3,) unit vector towards it. has_headlights: cars among the others light what lies before them.
     """
     shades: list[Shade] = []
     found = (
@@ -54,6 +57,8 @@ def shades_of(bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: Vi
         if len(capsules)
         else []
     )
+    if has_headlights:
+        found = [(own, np.concatenate([points, _lit(own)]), who) for own, points, who in found]
     if len(bones):
         found.append((capsules[:0], _darkened(bones, sun, PERSON_SKY_M, PERSON_REACH_M), True))
     for own, points, is_person in found:
@@ -71,6 +76,17 @@ def _darkened(capsules: np.ndarray, sun: np.ndarray, aside_m: float, longest_m: 
     body = _corners(low, high)
     wide_low, wide_high = low - np.array([aside_m, aside_m, BELOW_M]), high + np.array([aside_m, aside_m, 0.0])
     return np.concatenate([body, body - length_m * sun, _corners(wide_low, wide_high)])
+
+
+def _lit(car: np.ndarray) -> np.ndarray:
+    """Corners of what the headlights of a car may light, (8, 3), none of a person; car: (1, 2, 4), back and front end."""
+    back, front = car[0, :, :3]
+    along = front - back
+    if np.linalg.norm(along) < SHORTEST_CAR_M:
+        return np.zeros((0, 3))
+    end = front + along / np.linalg.norm(along) * HEADLIGHT_M
+    aside = np.array([HEADLIGHT_ASIDE_M, HEADLIGHT_ASIDE_M, 3.0])
+    return _corners(np.minimum(front, end) - aside, np.maximum(front, end) + aside)
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:

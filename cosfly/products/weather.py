@@ -1,0 +1,92 @@
+"""Weather and time of day: the presets of the paper, their six knobs, and the record that a flight's files have of them (app:weather).
+
+How a preset is chosen for a flight stands in `cosfly/render/weather.py`, what it looks like with the renderer that draws it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.config import Config
+
+WeatherMode = Literal["fixed", "random_per_path"]
+Percent = Annotated[float, Field(strict=True, ge=0, le=100)]
+Metres = Annotated[float, Field(strict=True, gt=0)]
+Altitude = Annotated[float, Field(strict=True, ge=-90, le=90)]
+Azimuth = Annotated[float, Field(strict=True, ge=0, lt=360)]
+
+
+class WeatherPreset(Config):
+    """The four knobs of the air."""
+
+    cloudiness: Percent = Field(description="share of the sky that clouds cover, percent")
+    precipitation: Percent = Field(description="strength of the rain, percent")
+    fog_density: Percent = Field(description="thickness of the fog, percent")
+    fog_distance: Metres = Field(description="distance at which fog begins, m")
+
+
+class TimePreset(Config):
+    """The two knobs of the sun."""
+
+    sun_altitude_angle: Altitude = Field(description="height of the sun over the horizon, degrees; negative is night")
+    sun_azimuth_angle: Azimuth = Field(description="compass direction of the sun, degrees clockwise from north")
+
+
+class WeatherParams(TimePreset, WeatherPreset):  # in this order, so that the air comes first
+    """The six resolved knobs (tab:weather_params_fields)."""
+
+
+class WeatherRecord(BaseModel):
+    """`weather` of `trajectory.json` and `meta.json` (tab:weather_meta); flights without weather have none."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mode: WeatherMode
+    weather_name: str = Field(min_length=1)
+    tod_name: str = Field(min_length=1)
+    params: WeatherParams
+
+
+def _presets(*rows: tuple[str, float, float, float, float]) -> dict[str, WeatherPreset]:
+    return {
+        name: WeatherPreset(cloudiness=cloud, precipitation=rain, fog_density=fog, fog_distance=begins)
+        for name, cloud, rain, fog, begins in rows
+    }
+
+
+# tab:weather_presets: group -> name -> knobs
+WEATHER_GROUPS = {
+    "sky": _presets(
+        ("clear", 5, 0, 0, 60),
+        ("fair", 20, 0, 0, 60),
+        ("partly_cloudy", 40, 0, 0, 60),
+        ("cloudy", 70, 0, 0, 60),
+        ("overcast", 95, 0, 0, 60),
+    ),
+    "rain": _presets(
+        ("drizzle", 50, 15, 10, 50),
+        ("light_rain", 60, 30, 5, 50),
+        ("medium_rain", 80, 60, 15, 30),
+        ("heavy_rain", 95, 90, 25, 20),
+    ),
+    "fog": _presets(("thin_fog", 30, 0, 30, 30), ("mist", 50, 0, 50, 20), ("dense_fog", 70, 0, 80, 10)),
+    "haze": _presets(("smog", 60, 0, 60, 15), ("dust_haze", 70, 0, 70, 12), ("snow_haze", 90, 0, 40, 20)),
+}
+WEATHERS = {name: preset for group in WEATHER_GROUPS.values() for name, preset in group.items()}
+# tab:tod_presets
+TIMES = {
+    name: TimePreset(sun_altitude_angle=altitude, sun_azimuth_angle=azimuth)
+    for name, altitude, azimuth in (("morning", 15, 90), ("noon", 75, 180), ("dusk", 0, 270), ("night", -30, 0))
+}
+
+
+def preset_token(text: str) -> str:
+    """Give the name of a preset as the tables here spell it: `Heavy rain` is `heavy_rain`."""
+    return text.strip().lower().replace(" ", "_").replace("-", "_")
+
+
+def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
+    """Put the knobs of the air and of the sun together."""
+    return WeatherParams(**weather.model_dump(), **time.model_dump())

@@ -1,0 +1,208 @@
+"""Which weather and time of day a flight has: preset pools, the three modes, the seed formula (app:weather). Settings of `render`."""
+
+from __future__ import annotations
+
+import random
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from cosfly.config import Config, MayDiffer, build, read_yaml
+from cosfly.errors import ConfigError, nearest
+from cosfly.products.weather import (
+    TIMES,
+    WEATHERS,
+    TimePreset,
+    WeatherPreset,
+    WeatherRecord,
+    preset_token,
+    resolved,
+)
+
+DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
+MOST_SEED = 2**31  # of a seed that is drawn
+
+
+class WeatherConfig(Config):
+    """The six settings of weather. Off by default, as in the paper: pictures are those of `look`, and no record is written."""
+
+    weather_mode: Literal["off", "fixed", "random_per_path"] = Field(
+        "off",
+        description="off: sun and air as `look` says; fixed: weather_name and tod_name for every flight; random_per_path: each "
+        "trajectory draws both by weather_seed and its index, its two tracks alike",
+    )
+    weather_name: str | None = Field(None, description="preset of the weather in mode fixed, for instance heavy_rain")
+    tod_name: str | None = Field(None, description="preset of the time of day in mode fixed, for instance night")
+    weather_pool: MayDiffer[Path | None] = Field(
+        None, description="YAML file with weather presets of yours in the place of the 15 that ship"
+    )
+    tod_pool: MayDiffer[Path | None] = Field(
+        None, description="YAML file with times of day of yours in the place of the 4 that ship"
+    )
+    weather_seed: int = Field(
+        DEFAULT_SEED,
+        description="seed of random_per_path; a negative one draws a seed, another for every run, which the records tell",
+    )
+
+    @field_validator("weather_mode", mode="before")
+    @classmethod
+    def _mode_as_written(cls, mode: Any) -> Any:
+        """YAML reads `off` as false; flags may have hyphens."""
+        if mode is False:
+            return "off"
+        return mode.replace("-", "_") if isinstance(mode, str) else mode
+
+    @model_validator(mode="after")
+    def _settings_agree(self) -> WeatherConfig:
+        problems = []
+        for field, pool_field, presets in (
+            ("weather_name", "weather_pool", WEATHERS),
+            ("tod_name", "tod_pool", TIMES),
+        ):
+            name, pool = getattr(self, field), getattr(self, pool_field)
+            if name is None and self.weather_mode == "fixed":
+                problems.append(f"{field} is needed in weather_mode fixed")
+            if name is not None and self.weather_mode != "fixed":
+                problems.append(f"{field} is for weather_mode fixed, and the mode is {self.weather_mode}")
+            if name is not None and pool is None:
+                problems += _unknown(name, presets, field)
+            if pool is not None and self.weather_mode == "off":
+                problems.append(f"{pool_field} is given, and weather_mode is off")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def recorded(self) -> dict[str, Any]:
+        """Give the settings that decide what is made. Without weather none of them does: runs of before go on, under their names."""
+        settings, own = super().recorded(), WeatherConfig.model_fields
+        return {name: value for name, value in settings.items() if name not in own or self.weather_mode != "off"}
+
+    def pool_files(self) -> dict[str, Path]:
+        """The files of presets, which are inputs of the stage."""
+        files = {"weather_pool": self.weather_pool, "tod_pool": self.tod_pool}
+        return {name: path for name, path in files.items() if path is not None}
+
+
+class WeatherPool(Config):
+    """A file of weather presets: each has all four knobs."""
+
+    presets: dict[str, WeatherPreset] = Field(
+        min_length=1, description="name -> cloudiness, precipitation, fog_density, fog_distance"
+    )
+
+
+class TimePool(Config):
+    """A file of times of day: each has both knobs."""
+
+    presets: dict[str, TimePreset] = Field(min_length=1, description="name -> sun_altitude_angle, sun_azimuth_angle")
+
+
+@dataclass(frozen=True)
+class Pools:
+    """The presets to choose from, in the order that seeds count in."""
+
+    weathers: Mapping[str, WeatherPreset]
+    times: Mapping[str, TimePreset]
+
+
+def read_pools(cfg: WeatherConfig) -> Pools:
+    """Read the files of presets that the settings name, or take the paper's.
+
+    Raises:
+        ConfigError: a file is missing or malformed, or the named presets are not in it; tells all problems of both at once.
+    """
+    errors: list[ConfigError] = []
+    pools: list[Mapping[str, Any]] = []
+    model: Any
+    chosen: tuple[tuple[Path | None, Any, Mapping[str, Any], str], ...]
+    chosen = ((cfg.weather_pool, WeatherPool, WEATHERS, "weather_name"), (cfg.tod_pool, TimePool, TIMES, "tod_name"))
+    for path, model, shipped, field in chosen:
+        pools.append(shipped)
+        if path is None:
+            continue
+        try:
+            found = build(model, read_yaml(path), path).presets
+            presets = {preset_token(name): knobs for name, knobs in found.items()}
+            if len(presets) < len(found):
+                raise ConfigError("two presets have one name", where=path, got=", ".join(found))
+            pools[-1] = presets
+            name = getattr(cfg, field)
+            if name is not None and (problems := _unknown(name, presets, field)):
+                raise ConfigError("; ".join(problems), where=path)
+        except ConfigError as error:
+            errors.append(error)
+    if len(errors) > 1:
+        raise ConfigError("; ".join(map(str, errors)), where="weather presets")
+    if errors:
+        raise errors[0]
+    return Pools(*pools)
+
+
+def _unknown(name: str, presets: Mapping[str, Any], field: str) -> list[str]:
+    """Say what is wrong with the name of a preset, nothing where there is such a one."""
+    if preset_token(name) in presets:
+        return []
+    return [f"{field}: unknown preset {name!r}{nearest(preset_token(name), presets)}; there are {', '.join(presets)}"]
+
+
+def path_seed(weather_seed: int, path_index: int) -> int:
+    """Give the seed of one trajectory (eq:weather_seed)."""
+    return weather_seed * 1_000_003 + path_index * 7_919 + 11
+
+
+def drawn_seed() -> int:
+    """Draw a seed that nothing repeats: what a negative `weather_seed` asks for."""
+    return secrets.randbelow(MOST_SEED)
+
+
+def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherRecord | None:
+    """Give the weather of a trajectory, None where the mode is off. `weather_seed` must not be negative: the stage settles it."""
+    if cfg.weather_mode == "off":
+        return None
+    if cfg.weather_mode == "fixed":
+        names = preset_token(str(cfg.weather_name)), preset_token(str(cfg.tod_name))
+    else:
+        assert cfg.weather_seed >= 0, "`run` settles it"
+        # Of Python's generators only `random()` has a sequence that is promised to stay for a seed.
+        rng = random.Random(path_seed(cfg.weather_seed, path_index))
+        names = _drawn(pools.weathers, rng), _drawn(pools.times, rng)
+    params = resolved(pools.weathers[names[0]], pools.times[names[1]])
+    return WeatherRecord(mode=cfg.weather_mode, weather_name=names[0], tod_name=names[1], params=params)
+
+
+def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:
+    return list(presets)[int(rng.random() * len(presets))]
+
+
+# --- coverage ---------------------------------------------------------------------------------------------------------
+
+
+def coverage_of(pools: Pools, drawn: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Count trajectories by weather, by time of day and by both, beside what uniform draws give on average (app:weather:coverage)."""
+    pairs = Counter(drawn)
+    num = pairs.total()
+    by = {name: dict.fromkeys(presets, 0) for name, presets in vars(pools).items()}
+    for (weather, time), count in pairs.items():
+        by["weathers"][weather] += count
+        by["times"][time] += count
+    return {
+        "trajectories": num,
+        **by,
+        "pairs": [[weather, time, count] for (weather, time), count in sorted(pairs.items())],
+        "expected": {name: round(num / len(presets), 2) for name, presets in vars(pools).items()},
+    }
+
+
+def told_coverage(told: Mapping[str, Any]) -> str:
+    """Say in a line how much of the presets the trajectories of a run have."""
+    seen = {name: sum(count > 0 for count in told[name].values()) for name in ("weathers", "times")}
+    of = {name: len(told[name]) for name in seen}
+    return (
+        f"{told['trajectories']} trajectories in {seen['weathers']} of {of['weathers']} weathers, {seen['times']} of {of['times']} times of "
+        f"day, {len(told['pairs'])} of {of['weathers'] * of['times']} pairs"
+    )

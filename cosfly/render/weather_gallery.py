@@ -1,0 +1,124 @@
+"""One view under every weather and time of day: the nine pictures of the paper's figure, and the sheet of all presets (app:weather)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cosfly.chance import rng_for
+from cosfly.errors import InputError
+from cosfly.frame_views import encode_picture
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.products.boxes import read_boxes
+from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.products.weather import resolved
+from cosfly.render.contract import PosedPerson, Renderer
+from cosfly.render.flight import MARGIN_M
+from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.stage import RenderConfig, open_renderer
+from cosfly.render.weather import Pools, read_pools
+from cosfly.store import write_bytes
+from cosfly.topview import PAPER, draw_text
+
+FIGURE = (  # fig:weather_gallery
+    ("clear", "morning"), ("clear", "noon"), ("clear", "dusk"),
+    ("heavy_rain", "noon"), ("dense_fog", "morning"), ("smog", "dusk"),
+    ("overcast", "night"), ("snow_haze", "noon"), ("dust_haze", "morning"),
+)  # fmt: skip
+FIGURE_COLUMNS, FIGURE_TILE_PX, SHEET_TILE_PX = 3, (640, 360), (320, 180)
+STRIP_PX, JPEG_QUALITY = 26, 88
+FIGURE_NAME, SHEET_NAME = "weather_gallery.jpg", "weather_sheet.jpg"
+FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5
+
+
+def run(
+    cfg: RenderConfig,
+    boxes: Path,
+    traces: Path,
+    out: Path,
+    *,
+    trajectory: int = 0,
+    frame: int | None = None,
+    fov_deg: float = FOV_DEG,
+    seed: int = 0,
+    advance: Callable[[], object] = lambda: None,
+) -> tuple[Path, Path]:
+    """Reads `boxes_3d.json`, `drone_trace.json`; writes the figure and the sheet; gives their paths.
+
+    Args:
+        trajectory: index of a flight of the traces; frame: of its clean track, None for the one that looks down least.
+        advance: called for each picture that is drawn.
+    Raises:
+        InputError: no such flight or frame, or an input is malformed. ConfigError: presets are malformed. EnvironmentMissing: no renderer.
+    """
+    pools, flights = read_pools(cfg), read_traces(traces)
+    if not 0 <= trajectory < len(flights):
+        raise InputError("there is no such flight", where=traces, got=trajectory, expected=f"0 to {len(flights) - 1}")
+    trace = flights[trajectory]
+    index = int(np.argmax(trace.rotations_deg[:, 0])) if frame is None else frame
+    if not 0 <= index < len(trace.time_s):
+        raise InputError(
+            "the flight has no such frame",
+            where=f"{traces}: {trace.path_id}",
+            got=index,
+            expected=f"0 to {len(trace.time_s) - 1}",
+        )
+    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look)
+    try:
+        pictures = _drawn(
+            renderer, pools, trace, index, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg), seed, advance
+        )
+    finally:
+        renderer.close()
+    pairs = list(pictures)
+    shown = [pair for pair in FIGURE if pair in pictures]
+    if len(shown) < len(FIGURE):  # presets of somebody's own
+        shown = [pairs[int(k)] for k in np.unique(np.linspace(0, len(pairs) - 1, len(FIGURE)).round())]
+    figure = _grid([_tile(pictures[pair], pair, FIGURE_TILE_PX) for pair in shown], FIGURE_COLUMNS)
+    sheet = _grid([_tile(picture, pair, SHEET_TILE_PX) for pair, picture in pictures.items()], len(pools.times))
+    for name, picture in ((FIGURE_NAME, figure), (SHEET_NAME, sheet)):
+        write_bytes(out / name, encode_picture(picture, "jpeg", JPEG_QUALITY))
+    return out / FIGURE_NAME, out / SHEET_NAME
+
+
+def _drawn(
+    renderer: Renderer,
+    pools: Pools,
+    trace: DroneTrace,
+    index: int,
+    intrinsic: np.ndarray,
+    seed: int,
+    advance: Callable[[], object],
+) -> dict[tuple[str, str], np.ndarray]:
+    """Draw one frame of a flight under each pair of presets, in their order; pictures are kept at the figure's size."""
+    pose, person = world_from_camera(trace.positions_m[index], trace.rotations_deg[index]), _walker(trace, index, seed)
+    places = np.concatenate([trace.positions_m, trace.targets_m])
+    corners = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    pictures = {}
+    for pair in product(pools.weathers, pools.times):
+        renderer.prepare(*corners, resolved(pools.weathers[pair[0]], pools.times[pair[1]]))
+        rgb = renderer.render(pose, intrinsic, person).rgb
+        pictures[pair] = cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
+        advance()
+    return pictures
+
+
+def _walker(trace: DroneTrace, index: int, seed: int) -> PosedPerson:
+    clothes = choose_clothes(rng_for(seed, "weather_gallery", trace.path_id))
+    return gait_of(trace.targets_m, trace.time_s).posed(index, trace.targets_m[index], clothes)
+
+
+def _tile(picture: np.ndarray, pair: tuple[str, str], size_px: tuple[int, int]) -> np.ndarray:
+    """A picture of the grid with its presets under it."""
+    strip = np.full((STRIP_PX, size_px[0], 3), PAPER, np.uint8)
+    draw_text(strip, ", ".join(pair).replace("_", " "), size_px[0] / 2.0, 18, 0.5, align=0.5)
+    return np.vstack([cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), strip])
+
+
+def _grid(tiles: list[np.ndarray], num_columns: int) -> np.ndarray:
+    tiles = tiles + [np.full_like(tiles[0], PAPER[0])] * (-len(tiles) % num_columns)
+    return np.vstack([np.hstack(tiles[k : k + num_columns]) for k in range(0, len(tiles), num_columns)])
