@@ -309,6 +309,10 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
 
 
 def _records(root: Path) -> None:
+    (root / "sky.yaml").write_text(
+        "presets:\n  sleet: {cloudiness: 90, precipitation: 40.5, fog_density: 20, fog_distance: 25}\n"
+        "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 1.2e1}\n"
+    )
     (root / "run.yaml").write_text(
         "name: a\nseed: 3\npedestrians: {num_paths: 3}\ncaption:\n  teacher: http://host/v1\n  window: {num_frames: 5}\nrelease: {licence: cc-by-4.0}\n"
     )
@@ -624,6 +628,7 @@ READERS: dict[str, Reader] = {
     "events": _one("events.jsonl", lambda path: read_events(path.parent)),
     "summary": _one("summary.json", read_json),
     "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
+    "presets of weather": _one("sky.yaml", lambda path: read_pools(build(RenderConfig, {"weather_mode": "random_per_path", "weather_pool": str(path)}, "x"))),
     "settings": _one("run.yaml", lambda path: resolve(path, None)),
     "--set": Reader(("set.txt",), lambda root, _: _setting(root, "set.txt")),
     "--set, a URL": Reader(("set_url.txt",), lambda root, _: _setting(root, "set_url.txt")),
