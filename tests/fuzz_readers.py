@@ -66,6 +66,8 @@ from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.render import older_trees
+from cosfly.render.stage import RenderConfig
+from cosfly.render.weather import read_pools
 from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify
 from cosfly.simplify.passes import SimplifyConfig

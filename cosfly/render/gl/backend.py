@@ -28,7 +28,7 @@ from cosfly.render.gl.parts import LOOSE_VERTEX, PART
 from cosfly.render.gl.scene import Scene, build_scene
 from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import View
-from cosfly.render.gl.weather_pass import FAIR, WEATHER_DEFINE, WEATHER_SCENE, WEATHER_SKY, WeatherPass
+from cosfly.render.gl.weather_pass import FAIR, WEATHER_SCENE, WEATHER_SKY, WeatherPass, defines
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
@@ -95,25 +95,25 @@ class GlRenderer:
             )
             self._make_targets()
             self._make_meshes()
-            self._looks: dict[bool, _Look] = {}
-            self._use_look(has_weather=False)
+            self._looks: dict[str | None, _Look] = {}
+            self._use_look(None)
         self.prepare(*_bounds(self.scene))
 
     # --- set-up ---
 
-    def _use_look(self, has_weather: bool) -> None:
-        """Draw from now on with the programs of fair weather, or with those of any other; each is made when first needed."""
-        if has_weather not in self._looks:
-            self._looks[has_weather] = self._make_look(has_weather)
-        look = self._looks[has_weather]
+    def _use_look(self, define: str | None) -> None:
+        """Draw from now on with the programs of fair weather (None), or of one with such defines; each is made when first needed."""
+        if define not in self._looks:
+            self._looks[define] = self._make_look(define)
+        look = self._looks[define]
         self._materials, self._near_movers, self._loose = look.materials, look.near_movers, look.loose
         self._sky_program, self._sky, self._weather = look.sky_program, look.sky, look.weather
 
-    def _make_look(self, has_weather: bool) -> _Look:
-        make, define = self.context.program, WEATHER_DEFINE if has_weather else ""
-        of_sky = ("light.glsl", *(WEATHER_SKY if has_weather else FAIR), "sky.frag.glsl")
-        of_surfaces = ("light.glsl", *(WEATHER_SCENE if has_weather else FAIR), "scene.frag.glsl")
-        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, define)
+    def _make_look(self, define: str | None) -> _Look:
+        make = self.context.program
+        of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
+        of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
+        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, define or "")
         materials, near_movers = (
             [
                 make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))
@@ -121,14 +121,14 @@ class GlRenderer:
             ]
             for near in ("false", "true")
         )
-        sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define))
+        sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define or ""))
         loose = {
             material: self._loose_arrays((materials[material], near_movers[material]), rows)
             for material, rows in self.scene.loose.items()
         }
         weather = None
-        if has_weather:
-            rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl"), define))
+        if define is not None:
+            rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl")))
             weather = WeatherPass(self.context, self.scene, self._color, self._depth, rain, self.num_others)
         sky = self.context.vertex_array(sky_program, [])
         return _Look(materials, near_movers, sky_program, sky, loose, weather)
@@ -192,7 +192,7 @@ class GlRenderer:
         near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
         casting = np.flatnonzero(near & (parts.max_px > 1e8))
         with self.context:
-            self._use_look(weather is not None)
+            self._use_look(None if weather is None else defines(weather))
             if self._weather is not None and weather is not None:
                 self._weather.prepare(weather, middle, half)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction

@@ -156,7 +156,7 @@ void wall(inout Surface s, vec3 p, vec3 n, vec3 h, float seed, vec3 footprint) {
         pane_color = mix(pane_color, frame_color, clamp(mullion, 0.0, 1.0));
         s.albedo = mix(s.albedo, mix(jamb, pane_color, pane), opening);
         s.mirror = is_door ? 0.0 : 0.9 * glassy * opening;
-#ifdef WEATHER
+#ifdef LIT
         if (!is_door) s.glow += lit_room(id, is_shop) * glassy * opening * (0.75 + 0.25 * smoothstep(o.z, o.w, inner.y));
 #endif
         s.shade *= 1.0 - 0.5 * opening * (1.0 - pane);
@@ -227,8 +227,10 @@ float leaf_cover(vec3 p, float w, out vec3 bump) {
 }
 
 float sun_reaches(vec3 p, vec3 n) {
-#ifdef WEATHER
+#ifdef SHADOWS
     return soft_shadow(shadow_map, shadow_from_world, p, n);
+#elif defined(WEATHER)
+    return 0.0;                                                                  // no sun through these clouds
 #endif
     float lift = material == LEAVES ? 0.3 : 0.09;
     vec4 c = shadow_from_world * vec4(p + lift * n + 0.03 * sun_direction, 1.0);
@@ -266,7 +268,7 @@ vec2 others_let(vec3 p) {
         vec4 a = other_bones[2 * i], b = other_bones[2 * i + 1];
         if (b.w == own) continue;
         light.x = min(light.x, capsule_lets_sun(p, a.xyz, b.xyz, a.w));
-#ifdef WEATHER
+#ifdef LIT
         from_headlights += headlights(p, a.xyz, b.xyz, a.w);
 #endif
         vec2 u = b.xy - a.xy, w = p.xy - a.xy;
@@ -363,20 +365,20 @@ void main() {
 
     vec3 geometric = normalize(v_normal);
     vec3 to_eye = normalize(camera_position - v_world);
-#ifdef WEATHER
-    float wet = wetness * (is_top ? 1.0 : 0.0);
-    if (wetness > 0.0) {
-        bool is_ground = material == ROAD || material == SIDEWALK || material == ROAD_LINE || material == GRAVEL || material == FACADE || material == CONCRETE || material == PLAIN;
-        if (material == GRASS || material == LEAVES || material == CLOTH || material == BARK) s.albedo *= 1.0 - 0.28 * wetness;
-        else if (is_ground || material == BRICK || material == FENCE) s.albedo *= 1.0 - (is_top ? 0.5 : 0.22) * wetness;
-        wet *= is_ground ? 1.0 : 0.0;
-        if (wet > 0.0) {
-            float pool = puddles * smoothstep(0.50, 0.62, 0.65 * noise2(p * 0.19 + 5.0) + 0.35 * noise2(p * 0.8));
-            s.albedo *= 1.0 - 0.45 * pool;
-            wet *= 0.42 + 0.58 * pool;
-            s.normal = normalize(s.normal + vec3(ripples(p, w) * (0.4 + 0.6 * pool), 0.0));
-        }
+#ifdef WET
+    const bool mirrors = material == ROAD || material == SIDEWALK || material == ROAD_LINE || material == GRAVEL;   // flat and hard
+    const bool is_soft = material == GRASS || material == LEAVES || material == CLOTH || material == BARK;
+    const bool is_tight = material == LAMP || material == METAL || material == CAR_PAINT || material == CABIN || material == RUBBER || material == WATER;
+    float wet = wetness;
+    if (!is_tight) s.albedo *= 1.0 - (is_soft ? 0.28 : is_top ? 0.5 : 0.22) * wetness;
+    if (mirrors) {
+        float pool = puddles * smoothstep(0.50, 0.62, 0.65 * noise2(p * 0.19 + 5.0) + 0.35 * noise2(p * 0.8));
+        s.albedo *= 1.0 - 0.45 * pool;
+        wet *= is_top ? 0.42 + 0.58 * pool : 0.0;
+        s.normal = normalize(s.normal + vec3(ripples(p, w) * (0.4 + 0.6 * pool), 0.0));
     }
+#endif
+#ifdef LIT
     if (material == LAMP && f_color.r > 0.5) s.glow += lights_on * vec3(2.6, 2.1, 1.35) * (v_normal.z < 0.35 ? 1.0 : 0.35);
     if (material == CAR_PAINT && (f_tag >> 16) >= lowest_other && (f_tag >> 16) <= highest_other) {
         vec3 r = v_local / f_half;
@@ -403,8 +405,9 @@ void main() {
     }
     vec3 ambient = mix(ground_light, sky_light, 0.5 + 0.5 * s.normal.z) * open_sky * s.shade;
     vec3 light = sun_light * sun * mix(1.0, s.shade, 0.5) + ambient;
-#ifdef WEATHER
-    vec3 lamp = lamp_reach(v_world, geometric) + from_headlights * (0.5 + 0.5 * abs(geometric.z));
+    vec3 lamp = vec3(0.0);
+#ifdef LIT
+    lamp = lamp_reach(v_world, geometric) + from_headlights * (0.5 + 0.5 * abs(geometric.z));
     light += lamp * mix(1.0, s.shade, 0.7);
 #endif
     vec3 color = s.albedo * light + s.glow;
@@ -427,16 +430,20 @@ void main() {
 #endif
     }
     float distance_m = length(camera_position - v_world);
-#ifdef WEATHER
-    if (wet > 0.0) {
+#ifdef WET
+    if (mirrors) {
         float share = wet * (0.05 + 0.95 * pow(1.0 - max(dot(s.normal, to_eye), 0.0), 3.6));
         vec3 r = reflect(-to_eye, s.normal);
         r.z = max(r.z, 0.02);
         float hidden = mirrored_block(height_map, height_area, v_world, r);
         vec3 walls = 0.30 * (sky_light + ground_light) + lights_on * vec3(0.10, 0.06, 0.03) + 0.25 * lamp;
         color = mix(color, mix(sky_gradient(normalize(r)), walls, hidden), clamp(share, 0.0, 0.9));
+#ifdef LIT
         color += wet * lights_on * lamp_light * mirrored_lamps(v_world, r, 160.0);
+#endif
     }
+#endif
+#ifdef WEATHER
     color = mix(fog_color + 0.35 * lamp, color, seen_through(distance_m));
 #else
     float far = distance_m / haze_m, haze = 1.0 - exp(-far * sqrt(far));

@@ -1,7 +1,7 @@
 """What weather adds to the default renderer: its uniforms, the map of street lamps, rain over the picture, the glow of lights.
 
-Programs are made twice, for fair weather (look.glsl) and for every other (weather.glsl, weather_scene.glsl): who asks for no weather pays
-nothing for it. Nothing here writes depth, kinds or ids.
+Programs are made for fair weather (look.glsl) and for others (weather.glsl, weather_scene.glsl), these with what the weather needs: who asks
+for no weather pays nothing for it. Nothing here writes depth, kinds or ids.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cosfly.render.gl.scene import Scene
 
 # Files of shaders that follow light.glsl.
 FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")
-WEATHER_DEFINE = "#define WEATHER\n"
+SOFT_M, FAINT = 0.25, 0.02  # from such a border on a shadow is drawn soft; a sun of less light throws none
 LAMP_UNIT, DEPTH_UNIT = 2, 3
 WIND = (0.07, 0.03)  # m to the side for each m that a drop falls
 GLOW_FROM, GLOW_SHRINK = (
@@ -29,6 +29,17 @@ GLOW_FROM, GLOW_SHRINK = (
     4,
 )  # levels that shine beyond their place; the glow is computed in a picture so many times smaller
 GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, share
+
+
+def defines(params: WeatherParams) -> str:
+    """Say what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so what is not needed is left out."""
+    values = uniforms(params)
+    casts = float(values["sun_light"].max()) > FAINT
+    needs = {
+        "WEATHER": True, "WET": values["wetness"] > 0.0, "LIT": values["lights_on"] > 0.0, "SHADOWS": casts,
+        "SOFT": casts and values["penumbra_m"] > SOFT_M,
+    }  # fmt: skip
+    return "".join(f"#define {name}\n" for name, is_needed in needs.items() if is_needed)
 
 
 class WeatherPass:

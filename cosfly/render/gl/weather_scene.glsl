@@ -14,12 +14,16 @@ float soft_shadow(sampler2DShadow map, mat4 map_from_world, vec3 p, vec3 n) {
     vec4 c = map_from_world * vec4(p + (0.06 + 1.2 * shadow_texel_m) * n + 0.03 * sun_direction, 1.0);
     if (any(lessThan(c.xyz, vec3(0.0))) || any(greaterThan(c.xyz, vec3(1.0)))) return 1.0;
     vec2 reach = penumbra_m * vec2(length(map_from_world[0].xy), length(map_from_world[0].xy)) + 0.5 / vec2(textureSize(map, 0));
-    float sum = 2.0 * texture(map, c.xyz);
-    const vec2 ring[6] = vec2[](vec2(1.0, 0.0), vec2(0.5, 0.87), vec2(-0.5, 0.87), vec2(-1.0, 0.0), vec2(-0.5, -0.87), vec2(0.5, -0.87));
-    for (int i = 0; i < 6; i++) sum += texture(map, c.xyz + vec3(ring[i] * reach, 0.0));
-    return sum / 8.0;
+    float sum = texture(map, c.xyz);
+#ifdef SOFT
+    const vec2 ring[5] = vec2[](vec2(1.0, 0.0), vec2(0.31, 0.95), vec2(-0.81, 0.59), vec2(-0.81, -0.59), vec2(0.31, -0.95));
+    for (int i = 0; i < 5; i++) sum += texture(map, c.xyz + vec3(ring[i] * reach, 0.0));
+    sum /= 6.0;
+#endif
+    return sum;
 }
 
+#ifdef LIT
 // Light of the street lamps on a surface: what looks down gets none, what stands over the lamps less and less.
 vec3 lamp_reach(vec3 p, vec3 n) {
     vec2 found = texture(lamp_map, (p.xy + 0.8 * n.xy - lamp_area.xy) * lamp_area.zw).rg;
@@ -46,6 +50,9 @@ vec3 lit_room(float id, bool is_shop) {
     return lights_on * is_lit * shade * (is_shop ? 0.75 : 0.5) * warm;
 }
 
+#endif
+
+#ifdef WET
 // Rings of drops and the shimmer of running water, as a slant of the surface.
 vec2 ripples(vec2 p, float w) {
     float fade = clamp(1.3 - 9.0 * w, 0.0, 1.0);
@@ -68,6 +75,7 @@ float mirrored_block(sampler2D heights, vec4 area, vec3 p, vec3 r) {
     return hidden;
 }
 
+#ifdef LIT
 // Lamps in a wet surface: long streaks towards the eye.
 vec3 mirrored_lamps(vec3 p, vec3 r, float roughness) {
     vec3 sum = vec3(0.0);
@@ -79,3 +87,5 @@ vec3 mirrored_lamps(vec3 p, vec3 r, float roughness) {
     }
     return sum;
 }
+#endif
+#endif
