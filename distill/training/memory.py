@@ -57,18 +57,18 @@ def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
     student.model.train()
     own = {p.untyped_storage().data_ptr() for p in student.model.parameters()}
     for length in PROBES:
-        storages: dict[int, int] = {}
+        storages: dict[int, Any] = {}  # held: of one that is let go on the way the next would take the place
 
-        def count(tensor: Any, storages: dict[int, int] = storages) -> Any:
+        def count(tensor: Any, storages: dict[int, Any] = storages) -> Any:
             if (place := tensor.untyped_storage().data_ptr()) not in own:
-                storages[place] = tensor.untyped_storage().nbytes()
+                storages.setdefault(place, tensor.untyped_storage())
             return tensor
 
         half = np.full(length // 2, student.end_token_id, np.int64)
         row = Encoded("probe", half, half, None, np.zeros((0, 3), np.int64), 1.0)
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
             answer_loss(student, [row], torch.zeros((0, 1)), cfg.logit_chunk)
-        found.append(sum(storages.values()))
+        found.append(sum(storage.nbytes() for storage in storages.values()))
     return (found[1] - found[0]) / (PROBES[1] - PROBES[0])
 
 
