@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ from PIL import Image
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+from torch.utils._pytree import tree_leaves  # noqa: E402
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
-from distill.student import decoding  # noqa: E402
+from distill.student import decoding, recording  # noqa: E402
 from distill.student.decoding import Decoded, decode  # noqa: E402
 from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
@@ -209,6 +212,107 @@ def test_a_constraint_decides_what_may_come(student, rows):
     even = LogitsProcessorList([Even(end, num_prompt)])
     found = decode(own, rows, max_tokens=MOST, constraint=EvenTokens(end, len(rows)))
     assert found == generated(own, rows, logits_processor=even) != decode(own, rows, max_tokens=MOST)
+
+
+class Recording(TorchDispatchMode):
+    """Every operation of a step as it runs, with the tensors that it read and wrote: played again, it does the same to the same places.
+
+    What an accelerator's graph is, on a CPU: no Python of the step runs again, sizes and places are those of the recording.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.played: list[tuple[Any, tuple, dict, Any]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        found = func(*args, **(kwargs or {}))
+        assert func is not torch.ops.aten._local_scalar_dense.default, "the step asks for a value"
+        self.played.append((func, args, kwargs or {}, found))
+        return found
+
+    def play(self) -> None:
+        for func, args, kwargs, places in self.played:
+            found = func(*args, **kwargs)
+            if func._schema.is_mutable:
+                continue
+            for place, value in zip(tree_leaves(places), tree_leaves(found), strict=True):
+                if isinstance(place, torch.Tensor) and place.data_ptr() != value.data_ptr():  # no view
+                    place.copy_(value)
+
+
+class Recorder:
+    """Records steps as an accelerator does; counts recordings and what was played of them."""
+
+    def __init__(self) -> None:
+        self.recordings = self.played = 0
+
+    def __call__(self, step):
+        self.recordings += 1
+        recording, is_new = Recording(), True
+        # A graph is recorded without being computed; here the first play was the recording itself.
+        with recording:
+            step()
+
+        def play() -> None:
+            nonlocal is_new
+            self.played += 1
+            if not is_new:
+                recording.play()
+            is_new = False
+
+        return play
+
+
+@pytest.fixture
+def recorder(monkeypatch) -> Recorder:
+    found = Recorder()
+    monkeypatch.setattr(decoding, "recorder_for", lambda student: found)
+    return found
+
+
+def test_a_recorded_step_gives_the_same_tokens(student, rows, recorder):
+    found = decode(student, rows, max_tokens=MOST)
+    assert (recorder.recordings, recorder.played) == (1, MOST - 2)  # the first step is computed plainly
+    assert found == decode(student, rows, max_tokens=MOST, is_recorded=False) == generated(student, rows)
+    assert recorder.played == MOST - 2
+
+
+def test_rows_that_leave_have_the_step_recorded_anew(student, rows, recorder, monkeypatch):
+    monkeypatch.setattr(decoding, "LEAVING_SHARE_RECORDED", 1e-9)  # each at once
+    ending = ending_at(student, rows)
+    expected = generated(ending, rows)
+    assert decode(ending, rows, max_tokens=MOST) == expected
+    assert recorder.recordings >= 2
+    own = EvenTokens(ending.end_token_id, len(rows))
+    assert decode(ending, rows, max_tokens=MOST, constraint=own) == decode(
+        ending, rows, max_tokens=MOST, is_recorded=False, constraint=EvenTokens(ending.end_token_id, len(rows))
+    )
+
+
+def test_a_step_that_cannot_be_recorded_is_computed(student, rows, monkeypatch):
+    asked = []
+    monkeypatch.setattr(decoding, "recorder_for", lambda student: asked.append)  # gives None, as record_graph does
+    assert decode(student, rows, max_tokens=MOST) == generated(student, rows)
+    assert len(asked) == 1
+    assert recording.recorder_for(student) is None  # nothing records on a CPU
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an accelerator")
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_an_accelerator_plays_what_it_computes(tmp_path, rows, dtype, monkeypatch):
+    folder = make_tiny_student(tmp_path / "tiny", seed=3)
+    own = ending_at(load_student(folder, device="cuda", dtype=dtype, max_pixels=64 * 64), rows)
+    plain = decode(own, rows, max_tokens=MOST, is_recorded=False)
+    played = []
+    monkeypatch.setattr(
+        decoding, "recorder_for", lambda s: lambda step: played.append(recording.record_graph(step)) or played[-1]
+    )
+    assert decode(own, rows, max_tokens=MOST) == plain
+    assert played
+    assert all(played)
+    if dtype == "float32":
+        assert plain == generated(own, rows)
 
 
 def test_a_step_can_be_recorded(student, rows):

@@ -1,7 +1,8 @@
 """Greedy decoding of a batch of prompts over state of a fixed size: what `generate` gives, without what it spends on the way.
 
-All tensors of a step stand at fixed places, sizes change only when rows leave: a step can be compiled or recorded. The positions,
-the mask and the caches are handed to the language model as they are, so it derives nothing of its own.
+All tensors of a step stand at fixed places, sizes change only when rows leave. The positions, the mask and the caches are handed to
+the language model as they are, so it derives nothing of its own. On an accelerator a step is recorded once for a size and played again
+(distill/student/recording.py): most of what a small batch's step takes is the host's telling it what to do.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ import numpy as np
 
 from distill.student.encoding import Encoded, prompt_batch
 from distill.student.model import Student
+from distill.student.recording import Play, Record, recorder_for
 
-# Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that stay.
+# Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that stay, and has a
+# recorded step recorded anew, which takes as long as some ten steps that are played.
 LEAVING_SHARE = 0.25
+LEAVING_SHARE_RECORDED = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,19 +50,21 @@ def decode(
     max_tokens: int,
     constraint: Constraint | None = None,
     features: Any = None,
+    is_recorded: bool = True,
 ) -> list[Decoded]:
     """Answer a batch of prompts greedily; their answers in `rows` are not looked at.
 
     Args:
         max_tokens: longest answer, the end token included.
         features: (image tokens of all rows, width), where the vision tower has seen the pictures before; else it looks now.
+        is_recorded: on an accelerator, play steps from a recording; the same kernels on the same numbers, so the same tokens.
     Returns:
         One for each row, in their order.
     """
     import torch
 
     with _evaluating(student), torch.inference_mode():
-        batch = _Batch(student, rows, max_tokens, features)
+        batch = _Batch(student, rows, max_tokens, features, recorder_for(student) if is_recorded else None)
         ended: dict[int, list[int]] = {}
         for count in range(1, max_tokens + 1):
             chosen = _choose(batch, constraint)
@@ -117,9 +123,14 @@ class _Batch:
     no row leaves: tokens (b, 1), positions (3, b, 1), mask (b, 1, 1, n + max_tokens) bool, caches.
     """
 
-    def __init__(self, student: Student, rows: Sequence[Encoded], max_tokens: int, features: Any) -> None:
+    def __init__(
+        self, student: Student, rows: Sequence[Encoded], max_tokens: int, features: Any, record: Record | None = None
+    ) -> None:
         import torch
         from transformers import StaticCache
+
+        self._record, self._is_warm = record, False
+        self._play: Play | None = None
 
         self._head, self._core, self._dtype = student.core.lm_head, student.core.model, student.dtype
         self.rows = list(range(len(rows)))
@@ -169,7 +180,8 @@ class _Batch:
         """Take ended rows out, once there are enough of them."""
         import torch
 
-        if len(self.rows) - self.num_live < LEAVING_SHARE * len(self.rows):
+        share = LEAVING_SHARE if self._record is None else LEAVING_SHARE_RECORDED
+        if len(self.rows) - self.num_live < share * len(self.rows):
             return
         stay = [place for place in range(len(self.rows)) if self._is_live[place]]
         index = torch.tensor(stay, device=self._tokens.device)
@@ -177,6 +189,7 @@ class _Batch:
         self._positions = self._positions[:, index]
         self._cache.reorder_cache(index)  # type: ignore[arg-type]  # the library says LongTensor of any tensor of int64
         self.rows, self._is_live = [self.rows[place] for place in stay], [True] * len(stay)
+        self._play, self._is_warm = None, False  # what was recorded moves the state that was left behind
 
     # --- computing ---
 
@@ -187,7 +200,19 @@ class _Batch:
         return chosen.tolist()
 
     def step(self) -> None:
-        """Read the tokens taken last and compute the logits of the next."""
+        """Read the tokens taken last and compute the logits of the next.
+
+        The first step of a size is computed plainly, so that libraries choose and compile their kernels; then one is recorded.
+        """
+        if self._record is not None and self._play is None and self._is_warm:
+            self._play = self._record(self._advance)
+            if self._play is None:
+                self._record = None
+        (self._play or self._advance)()
+        self._is_warm = True
+
+    def _advance(self) -> None:
+        """Take one step; nothing in it asks the host, and all that stays is written in place, but `logits`."""
         self._mask.index_fill_(3, self._place, True)
         embedded = self._core.get_input_embeddings()(self._tokens).to(self._dtype)
         self.logits = self._logits(self._run(embedded, self._positions, self._mask, None))

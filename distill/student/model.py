@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
+import sys
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -183,6 +184,19 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
     return getattr(torch, wanted)
 
 
+def use_kernels_for(dtype: Any, device: str) -> None:
+    """Have float32 on an accelerator computed by PyTorch's own functions, as exactly as it is asked for: the fast kernels of linear
+    attention round it to fewer digits or refuse it.
+
+    transformers chooses once a process, when it first loads the model's code; call this before.
+    """
+    import torch
+
+    if device == "cuda" and dtype == torch.float32:
+        for package in ("fla", "causal_conv1d"):
+            sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails
+
+
 def load_student(
     folder: Path,
     *,
@@ -212,6 +226,7 @@ def load_student(
 
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
+    use_kernels_for(computed, device_name)
     tokenizer, image_processor = load_processor(folder, max_pixels)
     model: Any
     try:

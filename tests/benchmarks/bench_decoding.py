@@ -3,9 +3,11 @@
     python tests/benchmarks/bench_decoding.py --shape 2b --batch 16 64 128       on an accelerator
     python tests/benchmarks/bench_decoding.py                                    on a CPU: a tiny shape, to see that it runs
     python tests/benchmarks/bench_decoding.py --check                            tokens against `generate`, in float32
+    python tests/benchmarks/bench_decoding.py --check --dtype bfloat16           recorded steps against plain ones
 
 Pictures are noise in memory; what it takes to read them, and what frames that several samples share save, tells `cosfly distill infer` on a
-playback tree (`speed` in its manifest). Ways: generate (the library's), decode (ours), features (ours, the pictures looked at before).
+playback tree (`speed` in its manifest). Ways: generate (the library's), decode (ours), features (ours, the pictures looked at before), plain (the same, no step
+recorded; on a CPU none is). flash-linear-attention does not compute in float32: `--check` has PyTorch's own functions do it.
 """
 
 from __future__ import annotations
@@ -16,14 +18,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import scenes
 import torch
 from bench_training import END, PAD, SHAPES, Words, make_rows, make_student, noise_of
 
 from distill.student.decoding import decode
 from distill.student.encoding import Encoded, prompt_batch
-from distill.student.model import Student
+from distill.student.model import Student, compute_dtype
 
 
 class Numbers(Words):
@@ -82,6 +83,7 @@ def measure(student: Student, shape: dict[str, Any], count: int, options: argpar
         "generate": lambda tokens: generate(student, rows, tokens),
         "decode": lambda tokens: decode(student, rows, max_tokens=tokens),
         "features": lambda tokens: decode(student, rows, max_tokens=tokens, features=features),
+        "plain": lambda tokens: decode(student, rows, max_tokens=tokens, features=features, is_recorded=False),
     }
     table = []
     for name in options.ways:
@@ -97,11 +99,21 @@ def measure(student: Student, shape: dict[str, Any], count: int, options: argpar
 
 def check(student: Student, shape: dict[str, Any], count: int, num_tokens: int) -> None:
     rows, features = make_batch(student, shape, count)
-    expected = generate(student, rows, num_tokens)
-    for given in (None, features):
-        found = [answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=given)]
-        assert found == expected, f"{np.sum([a != b for a, b in zip(found, expected, strict=True)])} answers differ"
-    print(f"{count} answers of {num_tokens} tokens: those of generate")
+    plain = [
+        answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=features, is_recorded=False)
+    ]
+    expected, whose = plain, "plain steps"
+    if student.dtype == torch.float32:
+        expected, whose = generate(student, rows, num_tokens), "generate"
+    ways = {"plain": plain}
+    for name, given in (("decode", None), ("features", features)):
+        ways[name] = [answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=given)]
+    for name, found in ways.items():
+        num_equal = sum(a == b for a, b in zip(found, expected, strict=True))
+        print(f"{name}: {num_equal} of {count} answers of {num_tokens} tokens are those of {whose}", flush=True)
+    # Pictures looked at one after the other, not together, are others in the last bit: of bfloat16 that may be seen.
+    assert ways["features"] == expected
+    assert student.dtype != torch.float32 or ways["decode"] == ways["plain"] == expected
 
 
 def main() -> None:
@@ -110,12 +122,13 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 8])
     parser.add_argument("--tokens", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--ways", nargs="+", default=["generate", "decode", "features"])
-    parser.add_argument("--check", action="store_true", help="compare tokens in float32 instead of measuring")
+    parser.add_argument("--ways", nargs="+", default=["generate", "decode", "features", "plain"])
+    parser.add_argument("--check", action="store_true", help="compare tokens instead of measuring")
+    parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
     options = parser.parse_args()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     scenes.one_thread_and_machine()
-    dtype = torch.float32 if options.check or device == "cpu" else torch.bfloat16
+    dtype = compute_dtype("float32" if options.check and options.dtype == "auto" else options.dtype, device)
     student = make_student(SHAPES[options.shape], device, dtype)
     student.tokenizer = Numbers()
     student.model.eval()

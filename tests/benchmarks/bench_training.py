@@ -20,12 +20,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from distill.student.encoding import Encoded, padded
 from distill.student.features import Loaded, Picture, VisionFeatures
-from distill.student.model import Student, compute_dtype
+from distill.student.model import Student, compute_dtype, use_kernels_for
 from distill.training.fit import make_optimizer
 from distill.training.loss import answer_loss
 from distill.training.memory import used_gb
@@ -57,6 +56,9 @@ class Words:
 
 
 def make_student(shape: dict[str, Any], device: str, dtype: Any, seed: int = 0) -> Student:
+    use_kernels_for(dtype, device)
+    from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
+
     width, depth, inner = shape["tower"]
     head = shape["head_dim"]
     section = head // 32  # as Qwen3.5: a quarter of a head turns, 11 + 11 + 10 of 32 pairs in the real one
