@@ -19,13 +19,15 @@ from cosfly.products.captions import Language
 from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 
-View = Literal["rgb", "depth", "segmentation"]
+View = Literal["rgb", "depth", "segmentation", "middle"]
 Layout = Literal["separate", "tiled"]
 VIEW_FILES: dict[View, str] = {
     "rgb": FILE_NAMES["rgb"],
     "depth": FILE_NAMES["depth"],
     "segmentation": FILE_NAMES["instance"],
+    "middle": FILE_NAMES["rgb"],
 }
+MIDDLE = 3  # one part in so many of the width and of the height of a frame: what `middle` enlarges
 DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; flights keep their target within a third of it
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
@@ -83,11 +85,13 @@ _DESCRIPTIONS: dict[Language, dict[View, str]] = {
         "rgb": "RGB",
         "depth": "depth in pseudo-colour (bright is near, black is {range:g} m and beyond)",
         "segmentation": "segmentation with the pedestrian in red",
+        "middle": "the middle of the frame in colour, 1/{middle:d} of its width and height, enlarged",
     },
     "zh": {
         "rgb": "RGB 图像",
         "depth": "深度伪彩色图（亮为近，黑为 {range:g} 米及更远）",
         "segmentation": "分割图（行人标为红色）",
+        "middle": "画面中央（宽、高各 1/{middle:d}）的彩色放大图",
     },
 }
 # none; one picture of a frame; several; several in one
@@ -105,9 +109,17 @@ _SENTENCES: dict[Language, tuple[str, str, str, str]] = {
         "每帧给出一张图像，由 {count} 部分从左到右拼成：{views}。",
     ),
 }
-_SCALE: dict[Language, tuple[str, str]] = {
-    "en": (" Pixel values refer to pictures of {} x {} px.", " Pixel values refer to parts of {} x {} px."),
-    "zh": ("像素值以 {} × {} 像素的图像为准。", "像素值以 {} × {} 像素的各部分为准。"),
+_SCALE: dict[Language, tuple[str, str, str]] = {
+    "en": (
+        " Pixel values refer to pictures of {} x {} px.",
+        " Pixel values refer to parts of {} x {} px.",
+        " Pixel values refer to a picture of the whole frame of {} x {} px.",
+    ),
+    "zh": (
+        "像素值以 {} × {} 像素的图像为准。",
+        "像素值以 {} × {} 像素的各部分为准。",
+        "像素值以 {} × {} 像素的整帧图像为准。",
+    ),
 }
 
 
@@ -115,9 +127,11 @@ _SCALE: dict[Language, tuple[str, str]] = {
 def _sentence(pictures: Pictures, language: Language) -> str:
     count, is_tiled = len(pictures.views), pictures.layout == "tiled" and len(pictures.views) > 1
     form = _SENTENCES[language][3 if is_tiled else min(count, 2)]
-    words = [_DESCRIPTIONS[language][view].format(range=pictures.depth_range_m) for view in pictures.views]
+    numbers = {"range": pictures.depth_range_m, "middle": MIDDLE}
+    words = [_DESCRIPTIONS[language][view].format(**numbers) for view in pictures.views]
     listed = {"en": ", ", "zh": "、"}[language].join(words)
-    return form.format(count=count, views=listed) + _SCALE[language][is_tiled].format(*pictures.size_px)
+    scale = 2 if "middle" in pictures.views else int(is_tiled)
+    return form.format(count=count, views=listed) + _SCALE[language][scale].format(*pictures.size_px)
 
 
 def frame_label(number: int) -> str:
@@ -145,11 +159,26 @@ def read_view(
     """
     if view == "rgb":
         return _bounded(read_rgb(frame), max_side_px)
+    if view == "middle":
+        return _middle(read_rgb(frame), max_side_px)
     if view == "depth":
         return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
     kinds, ids = read_instance(frame)
     kinds = np.where(np.isin(ids, _ids_of_others(frame)) & (kinds == KINDS["Pedestrians"]), KINDS["Rider"], kinds)
     return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
+
+
+def _middle(rgb: np.ndarray, max_side_px: int | None) -> np.ndarray:
+    """Cut the middle out of a picture, (h, w, 3), and give it the size that the whole would have.
+
+    Where the person is makes no difference: the camera follows, and the middle is all that is taken for granted.
+    """
+    height_px, width_px = rgb.shape[:2]
+    part = max(1, round(width_px / MIDDLE)), max(1, round(height_px / MIDDLE))
+    x_px, y_px = (width_px - part[0]) // 2, (height_px - part[1]) // 2
+    middle = rgb[y_px : y_px + part[1], x_px : x_px + part[0]]
+    size = scaled_size(width_px, height_px, max_side_px)
+    return cv2.resize(middle, size, interpolation=cv2.INTER_AREA if size[0] < part[0] else cv2.INTER_CUBIC)
 
 
 def _ids_of_others(frame: Path) -> list[int]:

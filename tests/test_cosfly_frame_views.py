@@ -18,7 +18,7 @@ from caption.teachers.teacher import RuleTeacher
 from caption.window_loop import caption_window
 from caption.windows import cut_windows
 from cosfly.errors import InputError
-from cosfly.frame_views import PEDESTRIAN_RGB, VIEW_FILES, Pictures, depth_colors, segmentation_colors, thumbnail
+from cosfly.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import find_flights, read_flight
@@ -53,6 +53,23 @@ def test_only_the_pedestrian_is_vivid():
     assert max(spread[0], spread[2]) < 80
 
 
+def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
+    """A third of the width and of the height, in the size that the whole picture has in the prompt; where its size is that, to the bit."""
+    rgb = np.random.default_rng(0).integers(0, 255, (90, 150, 3), dtype=np.uint8)
+    Image.fromarray(rgb).save(tmp_path / "rgb.png")
+    middle = Pictures(("middle",), (50, 30))
+    (shown,) = middle.read(tmp_path)
+    assert np.array_equal(shown, rgb[30:60, 50:100])
+    whole, larger = Pictures(("rgb", "middle"), (150, 90)).read(tmp_path)
+    assert np.array_equal(whole, rgb)
+    assert np.array_equal(larger[1::3, 1::3], shown)  # of each nine pixels the middle one is as it was
+    assert "1/3 of its width and height" in middle.sentence("en")
+    assert "a picture of the whole frame of 50 x 30 px" in middle.sentence("en")
+    assert "各 1/3" in middle.sentence("zh")
+    with pytest.raises(InputError, match="another size"):
+        Pictures(("middle",), (50, 20)).read(tmp_path)
+
+
 def test_depth_colors_mark_sky_and_invalid():
     colors = depth_colors(np.array([[1000.0, 0.0, 3.0, 90.0]], np.float32))
     dark = depth_colors(np.array([[100.0]], np.float32))[0, 0]
@@ -63,11 +80,11 @@ def test_depth_colors_mark_sky_and_invalid():
 # --- what is told and what is shown ---
 
 ORDERS = [
-    order for count in (1, 2, 3) for order in itertools.permutations(VIEW_FILES, count)
+    order for count in (1, 2, 3) for order in itertools.permutations(("rgb", "depth", "segmentation"), count)
 ]  # 15: all 7 sets, in any order
 NAMES = {
-    "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation"},
-    "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation"},
+    "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation", "enlarged": "middle"},
+    "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation", "放大": "middle"},
 }
 
 
@@ -116,7 +133,7 @@ def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.
 
 @pytest.mark.parametrize("max_side_px", [640, 40])
 @pytest.mark.parametrize("layout", ["separate", "tiled"])
-@pytest.mark.parametrize("views", ORDERS)
+@pytest.mark.parametrize("views", [*ORDERS, ("middle",), ("rgb", "middle", "depth")])
 def test_a_teacher_is_told_what_it_is_shown(window, views, layout, max_side_px):
     cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px, encoding="png")
     told, pictures = ask(window, cfg)
@@ -140,7 +157,7 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
     _, shown = ask(window, cfg.image)
     if layout == "tiled":
         shown = [part for picture in shown for part in np.split(picture, 3, axis=1)]
-    teachers = [dict(zip(VIEW_FILES, shown[3 * i : 3 * i + 3], strict=True)) for i in range(5)]
+    teachers = [dict(zip(cfg.image.modalities, shown[3 * i : 3 * i + 3], strict=True)) for i in range(5)]
     assert caption.status == "accepted"
     for language in ("en", "zh"):
         sample = make_sample(caption, language, PrepareConfig(modalities=views))

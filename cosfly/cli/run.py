@@ -21,7 +21,7 @@ def run(
     config: Annotated[
         Path,
         typer.Argument(
-            help="YAML file, or the name of one that ships: quickstart, diverse, simworld, delft; or a run folder, to continue."
+            help="YAML file, or the name of one that ships: quickstart, diverse, learning, simworld, delft; or a run folder, to continue."
         ),
     ],
     out: Annotated[

@@ -23,7 +23,9 @@ class PrepareConfig(SplitConfig):
         ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
     )
     modalities: tuple[View, ...] = Field(
-        ("rgb",), description="pictures of each window frame, in this order: rgb, depth, segmentation; none: text alone"
+        ("rgb",),
+        description="pictures of each window frame, in this order: rgb, depth, segmentation, middle (the middle third of rgb, enlarged, "
+        "wherever the person is); none: text alone",
     )
     text_state: bool = Field(
         True, description="the prompt holds what was measured on the frames, and the mission; false: pictures alone"
