@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
-import sys
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +19,7 @@ from typing import Any, Literal
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.reading.documents import read_json
 from cosfly.student_chat import TAUGHT
+from distill.student.kernels import fuse_norms, use_kernels_for
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"
@@ -184,19 +184,6 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
     return getattr(torch, wanted)
 
 
-def use_kernels_for(dtype: Any, device: str) -> None:
-    """Have float32 on an accelerator computed by PyTorch's own functions, as exactly as it is asked for: the fast kernels of linear
-    attention round it to fewer digits or refuse it.
-
-    transformers chooses once a process, when it first loads the model's code; call this before.
-    """
-    import torch
-
-    if device == "cuda" and dtype == torch.float32:
-        for package in ("fla", "causal_conv1d"):
-            sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails
-
-
 def load_student(
     folder: Path,
     *,
@@ -252,6 +239,8 @@ def load_student(
         raise EnvironmentMissing(
             "the weights do not fit into the accelerator's memory", where=folder, got=str(error)[:120]
         ) from error
+    if device_name == "cuda":
+        fuse_norms(student.core)
     return student
 
 

@@ -24,6 +24,7 @@ from bench_training import END, PAD, SHAPES, Words, make_rows, make_student, noi
 
 from distill.student.decoding import decode
 from distill.student.encoding import Encoded, prompt_batch
+from distill.student.kernels import fuse_norms
 from distill.student.model import Student, compute_dtype
 
 
@@ -130,6 +131,8 @@ def main() -> None:
     scenes.one_thread_and_machine()
     dtype = compute_dtype("float32" if options.check and options.dtype == "auto" else options.dtype, device)
     student = make_student(SHAPES[options.shape], device, dtype)
+    if device == "cuda" and not options.check:
+        fuse_norms(student.core)
     student.tokenizer = Numbers()
     student.model.eval()
     if options.check:

@@ -24,7 +24,8 @@ from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLIm
 
 from distill.student.encoding import Encoded, padded
 from distill.student.features import Loaded, Picture, VisionFeatures
-from distill.student.model import Student, compute_dtype, use_kernels_for
+from distill.student.kernels import fuse_norms, use_kernels_for
+from distill.student.model import Student, compute_dtype
 from distill.training.fit import make_optimizer
 from distill.training.loss import answer_loss
 from distill.training.memory import used_gb
@@ -159,6 +160,8 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
         gradient_checkpointing=arguments.checkpointing,
     )  # fmt: skip
     student = add_adapter(make_student(shape, ranks.device, dtype), cfg, 0)
+    if arguments.way == "ours" and arguments.norms == "fused":
+        fuse_norms(student.core)
     if cfg.gradient_checkpointing:
         student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     student.model.train()
@@ -200,6 +203,8 @@ def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
                 parameter.normal_(0, 0.02)
     rows, losses, gradients = make_rows(SHAPES[arguments.shape], 2, 0), [], []
     for way in ("plain", "ours"):
+        if way == "ours":
+            fuse_norms(student.core)
         losses.append(backward(student, way, rows, VisionFeatures(student), cfg))
         gradients.append(torch.cat([p.grad.reshape(-1) for p in student.model.parameters() if p.grad is not None]))
         student.model.zero_grad(set_to_none=True)
@@ -220,6 +225,7 @@ def main() -> None:
     parser.add_argument(
         "--same", action="store_true", help="the same samples in every step: all features are kept from the first on"
     )
+    parser.add_argument("--norms", choices=("fused", "library"), default="fused", help="of ours, who computes norms")
     parser.add_argument("--check", action="store_true")
     arguments = parser.parse_args()
     with joined("auto") as ranks:

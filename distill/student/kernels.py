@@ -1,0 +1,79 @@
+"""Which code computes a student: faster kernels where an accelerator has them, PyTorch's own where float32 is asked for."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+from functools import cache
+from importlib.machinery import ModuleSpec
+from typing import Any
+
+CONVOLUTION = "causal_conv1d"  # the package whose short convolution transformers calls where it is there
+LINEAR_ATTENTION = "fla"
+
+
+def use_kernels_for(dtype: Any, device: str) -> None:
+    """Decide what transformers will find when it first loads the model's code, which is when it chooses; call this before.
+
+    In float32 on an accelerator PyTorch's own functions compute, as exactly as is asked for: the fast kernels of linear attention round it
+    to fewer digits or refuse it. Else flash-linear-attention's short convolution stands in where causal-conv1d, which has to be compiled,
+    is not installed.
+    """
+    import torch
+
+    if device != "cuda":
+        return
+    if dtype == torch.float32:
+        for package in (LINEAR_ATTENTION, CONVOLUTION):
+            sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails
+    elif importlib.util.find_spec(CONVOLUTION) is None and importlib.util.find_spec(LINEAR_ATTENTION) is not None:
+        module = types.ModuleType(CONVOLUTION)
+        module.__spec__ = ModuleSpec(CONVOLUTION, None)
+        module.causal_conv1d_fn = _convolution  # type: ignore[attr-defined]
+        sys.modules[CONVOLUTION] = module
+
+
+def _convolution(x: Any, weight: Any, bias: Any = None, activation: str | None = None) -> Any:
+    """Convolve along time, as causal-conv1d's function: x (b, d, t), weight (d, width) -> (b, d, t)."""
+    from fla.modules.causal_conv1d import causal_conv1d
+
+    found, _ = causal_conv1d(x.transpose(1, 2).contiguous(), weight, bias, activation=activation)
+    return found.transpose(1, 2)
+
+
+# --- norms ------------------------------------------------------------------------------------------------------------
+
+
+def fuse_norms(model: Any) -> None:
+    """Have the norms of a language model computed by one kernel each, which keeps its input and a number a row for its gradient.
+
+    The library computes them step by step in float32 and keeps what each step read. In float32 the numbers are the same; in bfloat16
+    the normed values are rounded once more before they are scaled.
+    """
+    fused = _fused_norms()
+    for module in model.modules():
+        if type(module) in fused:
+            module.__class__ = fused[type(module)]
+
+
+@cache
+def _fused_norms() -> dict[type, type]:
+    """Give the library's classes of norms, and those that take their place."""
+    import torch
+    from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5RMSNorm, Qwen3_5RMSNormGated
+
+    def normed(x: Any, eps: float) -> Any:
+        with torch.autocast(x.device.type, enabled=False):  # which would have it in float32
+            return torch.nn.functional.rms_norm(x, x.shape[-1:], None, eps)
+
+    class FusedNorm(Qwen3_5RMSNorm):
+        def forward(self, x: Any) -> Any:
+            return (normed(x, self.eps) * (1.0 + self.weight.float())).type_as(x)
+
+    class FusedGatedNorm(Qwen3_5RMSNormGated):
+        def forward(self, hidden_states: Any, gate: Any) -> Any:
+            scaled = self.weight * normed(hidden_states, self.variance_epsilon)
+            return (scaled * torch.nn.functional.silu(gate.float())).type_as(hidden_states)
+
+    return {Qwen3_5RMSNorm: FusedNorm, Qwen3_5RMSNormGated: FusedGatedNorm}

@@ -1,0 +1,96 @@
+"""distill: faster code for parts of a student against the library's, and which code is chosen when."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra distill")
+pytest.importorskip("transformers", reason="needs the extra distill")
+
+from transformers.models.qwen3_5 import modeling_qwen3_5 as library  # noqa: E402
+
+from distill.student import kernels  # noqa: E402
+
+
+def norms(dtype) -> torch.nn.ModuleDict:
+    torch.manual_seed(0)
+    found = torch.nn.ModuleDict({"plain": library.Qwen3_5RMSNorm(48), "gated": library.Qwen3_5RMSNormGated(48)})
+    with torch.no_grad():
+        for parameter in found.parameters():
+            parameter.add_(0.3 * torch.randn(48))
+    return found.to(dtype)
+
+
+def computed(found: torch.nn.ModuleDict, dtype, autocast: bool) -> list[torch.Tensor]:
+    """Outputs, and gradients of inputs and weights."""
+    torch.manual_seed(1)
+    x, gate = (torch.randn(3, 7, 48, dtype=dtype).requires_grad_() for _ in range(2))
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        outputs = [found["plain"](5.0 * x), found["gated"](0.1 * x, gate)]
+    sum((output.float() ** 3).sum() for output in outputs).backward()
+    return [*outputs, x.grad, gate.grad, *(p.grad for p in found.parameters())]
+
+
+@pytest.mark.parametrize(("dtype", "autocast", "tolerance"), [
+    (torch.float32, False, 1e-5), (torch.float32, True, 1e-5), (torch.bfloat16, False, 0.03), (torch.bfloat16, True, 0.03),
+])  # fmt: skip
+def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tolerance):
+    plain, fused = norms(dtype), norms(dtype)
+    kernels.fuse_norms(fused)
+    assert {type(module).__name__ for module in fused.values()} == {"FusedNorm", "FusedGatedNorm"}
+    assert fused.state_dict().keys() == plain.state_dict().keys()
+    for found, wanted in zip(computed(fused, dtype, autocast), computed(plain, dtype, autocast), strict=True):
+        assert found.dtype == wanted.dtype
+        assert (found - wanted).float().norm() <= tolerance * wanted.float().norm()
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Say which packages are installed; what is put among the loaded ones goes with the test."""
+
+    def install(*packages: str) -> None:
+        for package in ("fla", "causal_conv1d"):
+            monkeypatch.delitem(sys.modules, package, raising=False)
+        real = importlib.util.find_spec
+        monkeypatch.setattr(
+            importlib.util, "find_spec",
+            lambda name, *more: (name in packages or None) if name in ("fla", "causal_conv1d") else real(name, *more),
+        )  # fmt: skip
+
+    monkeypatch.setattr(sys, "modules", dict(sys.modules))
+    return install
+
+
+def test_float32_has_no_fast_kernels_and_a_cpu_is_let_alone(installed):
+    installed("fla", "causal_conv1d")
+    kernels.use_kernels_for(torch.float32, "cpu")
+    kernels.use_kernels_for(torch.bfloat16, "cuda")
+    assert not {"fla", "causal_conv1d"} & sys.modules.keys()  # both are there: transformers takes them itself
+    kernels.use_kernels_for(torch.float32, "cuda")
+    assert sys.modules["fla"] is None is sys.modules["causal_conv1d"]
+
+
+def test_the_convolution_of_linear_attention_stands_in(installed):
+    """Held against the library's own function, through a stand-in written from what flash-linear-attention documents: x is (b, t, d)."""
+
+    def causal_conv1d(x, weight, bias=None, activation=None):
+        width = weight.shape[1]
+        padded = torch.nn.functional.pad(x, (0, 0, width - 1, 0))
+        found = sum(padded[:, i : i + x.shape[1]] * weight[:, i] for i in range(width))
+        return (found if activation is None else torch.nn.functional.silu(found)), None
+
+    installed("fla")
+    kernels.use_kernels_for(torch.bfloat16, "cuda")
+    stand_in = sys.modules["causal_conv1d"]
+    assert stand_in.__spec__ is not None  # whoever looks for the package finds it
+    sys.modules["fla.modules.causal_conv1d"] = types.SimpleNamespace(causal_conv1d=causal_conv1d)
+    x, weight = torch.randn(2, 6, 9), torch.randn(6, 4)
+    wanted = library.causal_conv1d_fn(x, weight, None, activation="silu")
+    assert torch.allclose(stand_in.causal_conv1d_fn(x, weight, None, activation="silu"), wanted, atol=1e-5)
+    installed()
+    kernels.use_kernels_for(torch.bfloat16, "cuda")
+    assert "causal_conv1d" not in sys.modules
