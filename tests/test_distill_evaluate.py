@@ -169,7 +169,7 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     none = np.full(count, -1, dtype=np.int8)
     return Scores(
         key=np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), walk=walk, language=np.full(count, "en", dtype=object),
-        reference=reference, answer=np.where(right, reference, 5).astype(np.int8), label=none, answered=known, unmended=known, verdict=none,
+        against=np.full(count, "the same", dtype=object), reference=reference, answer=np.where(right, reference, 5).astype(np.int8), label=none, answered=known, unmended=known, verdict=none,
         precision=empty, recall=empty, f1=empty, proved=empty, contradicted=empty, unread=empty, num_tokens=np.zeros(count, dtype=np.int64),
     )  # fmt: skip
 
@@ -439,6 +439,28 @@ def test_students_side_by_side(place):
     assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
     with pytest.raises(InputError, match="one name"):
         compare.run(compare.CompareConfig(), [folders[0], folders[0]], place / "x")
+
+
+def test_students_of_other_references_are_not_compared(place):
+    """Two sets of other captions call their samples alike. What was asked may differ: another prompt is an ablation."""
+    samples = list(open_split(place / "set", "test"))
+    predictions = [make_prediction(samples[0], "test", samples[0].answer, 5, True)]
+    coc = coc_of(samples[0])
+    other = dump_json(coc.model_copy(update={"reasoning_trace": coc.reasoning_trace + " So it is."}).model_dump())
+    kinds = {
+        "first": {},
+        "blind": {"prompt": samples[0].prompt.model_copy(update={"user": "Nothing is given."})},
+        "foreign": {"answer": other},
+    }
+    for name, changes in kinds.items():
+        changed = [sample.model_copy(update=changes if sample.key == samples[0].key else {}) for sample in samples]
+        write_set(place / f"set_{name}", {"train": changed, "test": changed})
+        write_predictions(place, predictions, f"{name}.jsonl")
+        run(CFG, place / f"{name}.jsonl", place / f"set_{name}", place / "strangers" / name)
+    folders = {name: place / "strangers" / name for name in kinds}
+    compare.run(compare.CompareConfig(), [folders["first"], folders["blind"]], place / "ablation")
+    with pytest.raises(InputError, match=r"first and foreign.*different references.*1 samples"):
+        compare.run(compare.CompareConfig(), [folders["first"], folders["foreign"]], place / "strange")
 
 
 # --- BERTScore --------------------------------------------------------------------------------------------------------

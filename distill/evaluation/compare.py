@@ -30,7 +30,7 @@ from distill.evaluation.pages import (
     shown,
     table,
 )
-from distill.evaluation.scores import SCORES, read_scores
+from distill.evaluation.scores import SCORES, Scores, read_scores
 
 STAGE = "distill.report"
 FLOORS = ("majority", "shuffled", "constant")
@@ -77,7 +77,7 @@ def run(
     Returns:
         The path of `comparison.md`.
     Raises:
-        InputError: two evaluations have one name, or are of other splits.
+        InputError: two evaluations have one name, are of other splits, or of other references.
     """
     names = [folder.absolute().name for folder in evaluations]
     if len(set(names)) < len(names):
@@ -108,12 +108,15 @@ def run(
 def compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> Comparison:
     """Put students side by side; of the floors those of the first."""
     scores = {name: read_scores(folder / SCORES) for name, folder in folders.items()}
-    pairings = []
+    pairings, strangers = [], []
     for first, second in combinations(reports, 2):
+        _check_references(first, scores[first], second, scores[second])
         rng = rng_for(seed, STAGE, f"{first}/{second}")
         count, found = differences_of(
             scores[first], scores[second], resamples=cfg.resamples, confidence=cfg.confidence, rng=rng
         )
+        if not count:
+            strangers.append(f"{first} and {second} were asked no sample in common")
         pairings.append(Pairing(first=first, second=second, samples=count, differences=found))
     someone = next(iter(reports.values())).all
     return Comparison(
@@ -121,10 +124,27 @@ def compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], see
         models={name: report.model for name, report in reports.items()},
         floors={name: someone.who[name] for name in FLOORS if name in someone.who},
         pairings=pairings,
-        not_comparable=_mismatches(reports),
+        not_comparable=[*_mismatches(reports), *strangers],
         confidence=cfg.confidence,
         resamples=cfg.resamples,
     )
+
+
+def _check_references(first: str, one: Scores, second: str, other: Scores) -> None:
+    """Check that the samples that two students share are held against the same answers.
+
+    Two training sets of other captions may call their samples alike; what was asked may differ, as pictures and state of an ablation do.
+    """
+    held = dict(zip(other.key, other.against, strict=True))
+    differ = [key for key, digest in zip(one.key, one.against, strict=True) if held.get(key, digest) != digest]
+    if differ:
+        raise InputError(
+            "two evaluations hold samples of one name against different references",
+            where=f"{first} and {second}",
+            got=f"{len(differ)} samples, the first {differ[0]}",
+            expected="training sets of the same captions",
+            fix="evaluate both students on one set's test split",
+        )
 
 
 def _mismatches(reports: Names) -> list[str]:

@@ -19,10 +19,11 @@ from cosfly.errors import InputError
 from cosfly.products.captions import ACTIONS, Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import row_groups
-from cosfly.store import atomic_file
+from cosfly.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
 
 SCORES = "scores.parquet"
+REFERENCE_DIGITS = 16  # of a digest of 64
 VERDICTS: tuple[Verdict, ...] = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 STATES: tuple[SentenceState, ...] = ("proved", "contradicted", "unread")
 UNPARSED = len(ACTIONS)  # the number of the decision that an answer without one makes
@@ -52,7 +53,7 @@ class Answer:
 class Scores:
     """Columns over n samples.
 
-    key, walk, language (n,) str; reference, answer, label (n,) int8 numbers of ACTIONS, UNPARSED, NONE; answered, unmended (n,) bool;
+    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer, label (n,) int8 numbers of ACTIONS, UNPARSED, NONE; answered, unmended (n,) bool;
     verdict (n,) int8 number of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed;
     proved, contradicted, unread (n,) numbers of sentences, NaN where nobody judged them; num_tokens (n,).
     """
@@ -60,6 +61,7 @@ class Scores:
     key: np.ndarray
     walk: np.ndarray
     language: np.ndarray
+    against: np.ndarray
     reference: np.ndarray
     answer: np.ndarray
     label: np.ndarray
@@ -80,6 +82,11 @@ class Scores:
     def at(self, where: np.ndarray) -> Scores:
         """Give the samples at some places."""
         return Scores(**{field.name: getattr(self, field.name)[where] for field in fields(self)})
+
+
+def digest_of_reference(sample: Sample) -> str:
+    """Name what answers to a sample are held against: the teacher's answer, the label, and what the future rules out."""
+    return sha256_bytes(dump_json([sample.answer, sample.label, sample.contradicted]).encode())[:REFERENCE_DIGITS]
 
 
 def score_answers(
@@ -112,6 +119,7 @@ def score_answers(
         key=np.array([sample.key for sample in samples], dtype=object),
         walk=np.array([sample.walk for sample in samples], dtype=object),
         language=np.array([sample.language for sample in samples], dtype=object),
+        against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
         reference=np.array([_NUMBER[sample.decision] for sample in samples], dtype=np.int8),
         answer=np.array([_NUMBER[a.coc.flight_decision] if a.coc else UNPARSED for a in answers], dtype=np.int8),
         label=np.array([_NUMBER[s.label] if s.label else NONE for s in samples], dtype=np.int8),
@@ -128,7 +136,7 @@ def score_answers(
 
 # --- on disk ----------------------------------------------------------------------------------------------------------
 
-_TEXT, _NAMES = ("key", "walk", "language"), [field.name for field in fields(Scores)]
+_TEXT, _NAMES = ("key", "walk", "language", "against"), [field.name for field in fields(Scores)]
 
 
 def _column(name: str, values: np.ndarray) -> pa.Array:
@@ -156,7 +164,8 @@ def read_scores(path: Path) -> Scores:
         wrong = [name for name in _NAMES if group.column_names.count(name) != 1]
         if wrong:
             got = f"{group.column_names.count(wrong[0])} columns {wrong[0]}"
-            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one")
+            fix = "run cosfly distill evaluate anew"
+            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one", fix=fix)
         for name in _NAMES:
             columns[name] += group.column(name).to_pylist()
     try:
