@@ -103,8 +103,9 @@ class Inputs:
 
     @property
     def name(self) -> str:
-        """The model's name where it runs in this process."""
-        name = Path(self.model).absolute().name
+        """The model's name where it runs in this process: what `train` and `merge` call `model` is called as the folder it stands in."""
+        folder = Path(self.model).absolute()
+        name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
 
 

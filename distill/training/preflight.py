@@ -82,15 +82,27 @@ def _about_data(cfg: TrainConfig, census: Census, validation: Census, steps: Ste
 
 
 def _about_decisions(cfg: TrainConfig, census: Census, validation: Census) -> list[Finding]:
+    """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
     missing = [action for action in ACTIONS if not census.decisions[action]]
-    asked = [action for action in missing if validation.decisions[action]]
-    found = []
-    if missing:
-        found.append(Finding("decisions", f"no sample of {', '.join(missing)}", "warning"))
-    if asked:
-        level: Any = "error" if cfg.empty_decision == "refuse" else "warning"
-        found.append(Finding("decisions", f"val asks for what train never shows: {', '.join(asked)}", level))
-    return found
+    asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
+    if not asked:
+        return [Finding("decisions", f"no sample of {', '.join(missing)}")] if missing else []
+    level: Any = "error" if cfg.empty_decision == "refuse" else "warning"
+    told = ", ".join(f"{action} {count}" for action, count in asked.items())
+    never = (
+        f"; nor does it show {', '.join(rest)}"
+        if (rest := [action for action in missing if action not in asked])
+        else ""
+    )
+    count = sum(asked.values())
+    return [
+        Finding(
+            "decisions",
+            f"val asks for what train never shows, and {count} of its {len(validation)} samples will be wrong: {told}{never}; "
+            "more walks or towns in train have them, another seed splits otherwise",
+            level,
+        )
+    ]
 
 
 def _about_chat(processor: Processor, sample: Sample) -> Finding:
