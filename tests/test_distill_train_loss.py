@@ -17,9 +17,10 @@ from specimens_students import FAST, TWELVE, load, losses_of, make_place, sample
 
 from cosfly.errors import ConfigError  # noqa: E402
 from distill.student.encoding import Encoded, encode, padded, prompt_batch  # noqa: E402
-from distill.student.features import PictureReader, VisionFeatures, content_key, pictures_of, tower_key  # noqa: E402
+from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, content_key, pictures_of, tower_key  # noqa: E402
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
+from distill.training.loading import Packed  # noqa: E402
 from distill.training.loss import answer_loss, chunked_loss, output_head  # noqa: E402
 from distill.training.settings import TARGET_MODULES, TrainConfig  # noqa: E402
 
@@ -199,6 +200,29 @@ def test_what_memory_has_no_room_for_stands_on_disk_bit_by_bit(place, tmp_path, 
     fed(second, PictureReader(own, trees_of(place), second.folder, own.dtype), pictures)
     assert (second.num_encoded, second.num_from_disk) == (4, 1)
     assert torch.equal(second.of(pictures), found)
+
+
+def test_pictures_go_from_process_to_process_as_two_tensors(place):
+    """However many they are: each tensor on its way holds a file open. What is found on disk comes with what is not."""
+    generator = torch.Generator().manual_seed(0)
+    loaded = []
+    for number in range(40):
+        picture, values = (
+            Picture("run", str(number), "rgb", (64, 64), 100.0),
+            torch.randn(number % 5, 6, generator=generator),
+        )
+        kind = {"features": values[:, :3]} if number % 3 == 0 else {"patches": values}
+        loaded.append(Loaded(picture, f"key{number}", **kind))
+    for chosen in (loaded, loaded[1:3], loaded[:1], []):
+        packed = Packed.of(chosen)
+        assert not any(isinstance(value, torch.Tensor) for facts in packed.pictures for value in facts)
+        for item, wanted in zip(packed.loaded(), chosen, strict=True):
+            assert (item.picture, item.key) == (wanted.picture, wanted.key)
+            assert (item.features is None) == (wanted.features is None)
+            assert torch.equal(
+                item.patches if item.features is None else item.features,
+                wanted.patches if wanted.features is None else wanted.features,
+            )
 
 
 def test_keys_tell_content_size_tower_and_processor_apart(place, tmp_path):

@@ -123,12 +123,49 @@ class Order:
 
 
 @dataclass(frozen=True)
+class Packed:
+    """Pictures that were read, their patches in one tensor and their features in another: a tensor on its way from one process to
+    another holds a file open, and a step may have hundreds of pictures.
+
+    pictures: each with its key, whether features were found, and how many rows are its own.
+    """
+
+    pictures: list[tuple[Picture, str, bool, int]]
+    patches: Any
+    features: Any
+
+    @classmethod
+    def of(cls, loaded: Sequence[Loaded]) -> Packed:
+        import torch
+
+        has_features = [item.features is not None for item in loaded]
+        arrays = [item.features if found else item.patches for item, found in zip(loaded, has_features, strict=True)]
+        joined = []
+        for kind in (False, True):
+            own = [array for array, found in zip(arrays, has_features, strict=True) if found is kind]
+            joined.append(torch.cat(own) if own else None)
+        facts = zip(loaded, has_features, arrays, strict=True)
+        return cls([(item.picture, item.key, found, len(array)) for item, found, array in facts], *joined)
+
+    def loaded(self) -> list[Loaded]:
+        found, begin = [], {False: 0, True: 0}
+        for picture, key, has_features, count in self.pictures:
+            rows = slice(begin[has_features], begin[has_features] + count)
+            begin[has_features] += count
+            if has_features:  # of its own, since it may be kept when the others are let go
+                found.append(Loaded(picture, key, features=self.features[rows].clone()))
+            else:
+                found.append(Loaded(picture, key, patches=self.patches[rows]))
+        return found
+
+
+@dataclass(frozen=True)
 class Made:
     """What a worker made. unreadable: picture -> why it cannot be read."""
 
     step: int
     rows: list[Row]
-    loaded: list[Loaded]
+    packed: Packed
     unreadable: dict[Picture, str]
 
 
@@ -148,7 +185,7 @@ class Maker:
                 loaded.append(self.reader.read(picture))
             except InputError as error:
                 unreadable[picture] = str(error)
-        return Made(order.step, rows, loaded, unreadable)
+        return Made(order.step, rows, Packed.of(loaded), unreadable)
 
 
 @dataclass(frozen=True)
@@ -193,7 +230,7 @@ class Supply:
             if made is None:
                 return
             self._unreadable |= made.unreadable
-            self.features.take(made.loaded)
+            self.features.take(made.packed.loaded())
             ready = Ready(made.step, [], {})
             for row in made.rows:
                 bad = next((picture for picture in row.pictures if picture in self._unreadable), None)
