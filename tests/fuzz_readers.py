@@ -40,8 +40,10 @@ from cosfly.chat.refusals import kind_of
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
 from cosfly.config import apply_overrides, build
+from cosfly.depth_study.study import run as study_depth
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.inspection import stage as inspection
+from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
 from cosfly.items import Item
 from cosfly.journal import Journal
@@ -51,6 +53,7 @@ from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
 from cosfly.planners.compare_tables import text_tables
 from cosfly.png.read import parse_png
+from cosfly.products import review
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
@@ -169,6 +172,13 @@ def make_specimens(root: Path) -> Path:
         (root / "gold.jsonl").write_text("".join(islice(gold, 4)), encoding="utf-8")
     inspection.run(InspectConfig(), None, None, tree, root / "inspect")
     flights = read_inspection(root / "inspect/inspect.json")
+    kept = next(flight.folder for flight in flights.flights if flight.result != "rejected")
+    choices = [{"folder": kept, "verdict": "rejected", "reason": "blurred"}]
+    review.add_decisions(
+        root / "inspect/inspect.json", [review.Choice.model_validate(choice) for choice in choices], "Ann"
+    )
+    about = {"schema": "cosfly.review", "schema_version": "1.0", "inspection": "0" * 64, "by": "Ann"}
+    (root / "decisions.json").write_text(json.dumps(about | {"choices": choices}))
     accepted = [flight.model_copy(update={"result": "accepted", "issues": []}) for flight in flights.flights]
     counts = {"accepted": len(accepted), "review": 0, "rejected": 0, "reasons": {}}
     funnel = flights.funnel.model_copy(update={"flights": flights.funnel.flights.model_copy(update=counts)})
@@ -607,6 +617,9 @@ READERS: dict[str, Reader] = {
     "student's teaching": _one(f"model/{TAUGHT}", lambda path: read_taught(path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),
+    "decisions": Reader(("inspect/review.jsonl",), lambda root, _: review.read_settled(root / "inspect/inspect.json")),
+    "decisions, filled in": _one("decisions.json", read_filled),
+    "depth study": Reader(PICTURES[:2], lambda root, scratch: study_depth(root / TREE / "ORI" / FRAME, scratch / "study"), share=0.2),
     "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
     "release record": _one("release/dataset/release.json", read_record),
     "release, verify": Reader(

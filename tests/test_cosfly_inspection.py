@@ -655,7 +655,7 @@ def test_the_page_stands_alone_and_shows_every_flight(workplace):
     found = inspect(workplace)
     page = (workplace / "out" / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"(?:src|href)=\"(?!data:)|<script|@import|url\(", page)
-    assert page.count("data:image/jpeg;base64,") == 3 * len(found.flights)
+    assert page.count("data:image/jpeg;base64,") == (3 + 1) * len(found.flights)  # frames, and the map
     assert "<b>&amp;" not in page
     assert "&lt;b&gt;&amp;" in page
     for record in found.flights:

@@ -82,7 +82,7 @@ ALIKE = ["roi_polygon.json", "step2_simplified.json", "test.parquet"]
 FOR_PEOPLE = [
     "bench.json", "caption_report.json", "comparison.json", "compare_overlay.png", "compare_radar.png", "compare_series.png", "compare_strategies.json",
     "contact_sheet.png", "instance_ids.json", "map.png", "paths.png", "pedestrians_report.json", "perturbation_report.json", "plan.png",
-    "preflight.json", "report.json", "simplify.png", "simplify_report.json",
+    "preflight.json", "report.json", "simplify.png", "simplify_report.json", "depth_study.json", "depth_study.png",
 ]  # fmt: skip
 
 

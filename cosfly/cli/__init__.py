@@ -21,6 +21,7 @@ from cosfly.cli.distill import app as distill_app
 from cosfly.cli.release import app as release_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.stages import app as stages_app
+from cosfly.cli.studies import app as studies_app
 from cosfly.errors import CosflyError
 
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
@@ -36,7 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, bench_app):
+for group in (run_app, stages_app, bench_app, studies_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (("caption", caption_app), ("distill", distill_app), ("release", release_app)):
     app.add_typer(named_group, name=name)

@@ -269,9 +269,14 @@ def convert_tree(
     options.tell_product(older_trees.run(data, out, **options.manner(cfg, resume)), out, cfg)
 
 
-@app.command()
+inspect_app = typer.Typer(invoke_without_command=True, help="Step 6: accept, route to review or reject every flight.")
+app.add_typer(inspect_app, name="inspect")
+
+
+@inspect_app.callback()
 def inspect(
-    out: options.Out,
+    context: typer.Context,
+    out: Annotated[Path | None, typer.Option(help="Output folder. [required]")] = None,
     map_: Annotated[
         Path | None,
         typer.Option("--map", help="Simplified map: step2_simplified.json; none for a tree of somebody else."),
@@ -288,10 +293,44 @@ def inspect(
     repair: options.Repair = False,
 ) -> None:
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
+    if context.invoked_subcommand is not None:
+        return
     from cosfly.inspection import stage
 
+    folder = _needed("--out", out)
     cfg, tree = options.resolve(config, overrides, {"workers": workers}), options.data_folder(data)
-    options.set_aside(out, repair)
-    options.verify_first(verify, map_, traces, tree, out)
-    product = stage.run(cfg.inspect, map_, traces, tree, out, **options.manner(cfg, resume))
-    options.tell_product(product, out, cfg)
+    options.set_aside(folder, repair)
+    options.verify_first(verify, map_, traces, tree, folder)
+    product = stage.run(cfg.inspect, map_, traces, tree, folder, **options.manner(cfg, resume))
+    options.tell_product(product, folder, cfg)
+
+
+@inspect_app.command("review")
+def inspect_review(
+    folder: Annotated[Path, typer.Option("--inspect", help="Folder of the inspection, or its inspect.json.")],
+    accept: Annotated[list[str] | None, typer.Option(metavar="FLIGHT", help="Accept a flight; repeat it.")] = None,
+    reject: Annotated[list[str] | None, typer.Option(metavar="FLIGHT", help="Reject a flight; repeat it.")] = None,
+    by: Annotated[str | None, typer.Option(help="Who decides.")] = None,
+    reason: Annotated[str | None, typer.Option(help="Why.")] = None,
+    decisions: Annotated[
+        Path | None, typer.Option(help="What review.html saved: take its decisions, by whom it says.")
+    ] = None,
+) -> None:
+    """Decide flights that the inspection left to a person: make review.html, or take what was decided, into review.jsonl."""
+    from cosfly.inspection import review
+    from cosfly.products.review import Verdict
+
+    product = folder / "inspect.json" if folder.is_dir() else folder
+    chosen: list[tuple[Verdict, str]] = [("accepted", name) for name in accept or []]
+    chosen += [("rejected", name) for name in reject or []]
+    if decisions is not None and chosen:
+        raise typer.BadParameter("a file of decisions, or flights, not both", param_hint="'--decisions'")
+    if chosen and not (by and reason):
+        raise typer.BadParameter("who decides and why must be given", param_hint="'--by', '--reason'")
+    if decisions is not None:
+        review.take(product, decisions)
+    elif chosen:
+        review.decide(product, chosen, by or "", reason or "")
+    else:
+        typer.echo(review.write_page(product))
+    typer.echo(review.summary(product))

@@ -25,8 +25,8 @@ from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.files import Checksums, check_files, check_recorded
 from cosfly.inspection.frames import FrameNumbers, check_frames, choose_frames, target_box
 from cosfly.inspection.others import check_others, others_told
-from cosfly.inspection.report import FlightView, draw_flight
 from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.view import FlightView, draw_flight
 from cosfly.issues import Report
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.inspection import FlightInspection
@@ -38,6 +38,7 @@ from cosfly.provenance import digest_of, folder_digests
 
 if TYPE_CHECKING:
     from cosfly.kernels import BoxIndex
+    from cosfly.products.boxes import BoxMap
 
 TIME_TOLERANCE_S = 1e-3
 
@@ -54,6 +55,7 @@ def inspect_flight(
     folder: Path,
     root: Path,
     traces: dict[str, DroneTrace] | None,
+    box_map: BoxMap | None,
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
     recorded: Mapping[str, str],
@@ -62,7 +64,7 @@ def inspect_flight(
 
     Args:
         traces: the plans by id; None where nobody here planned the flight.
-        obstacles: of the map; None where there is none.
+        box_map, obstacles: the map, and what of it is in the way; None where there is none.
         recorded: sha256 by path of what the tree's manifest lists; empty where it has none.
     Raises:
         InputError: `trajectory.json`, or that of the clean flight beside it, cannot be read at all; names the file and the field.
@@ -77,8 +79,7 @@ def inspect_flight(
     if trace is not None:
         check_plan(trace, cfg, report, metrics)
         check_poses(flight, trace, cfg, report)
-    if obstacles is not None:
-        check_surroundings(flight, obstacles, cfg, report, metrics)
+    clearance_m = None if obstacles is None else check_surroundings(flight, obstacles, cfg, report, metrics)
     check_shifts(flight, report, metrics)
     check_motion(flight, cfg, report)
     check_projection(flight, cfg, report)
@@ -99,7 +100,7 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    view = draw_flight(flight, _heights_m(flight), cfg.thumbnail_px)
+    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, cfg.thumbnail_px)
     return Inspected(record=record, view=view, coverage=coverage_of(flight))
 
 
@@ -146,8 +147,10 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: d
 
 def check_surroundings(
     flight: Flight, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
-) -> None:
-    """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an obstacle."""
+) -> np.ndarray:
+    """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an obstacle; gives the
+    first, (n,) m.
+    """
     from cosfly.kernels import signed_distances, visibility
 
     gaps_m, _ = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)
@@ -157,7 +160,7 @@ def check_surroundings(
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
     known = np.flatnonzero(~np.isnan(flight.targets_m).any(axis=1))
     if not len(known):
-        return
+        return gaps_m
     inside, _ = signed_distances(obstacles, flight.targets_m[known], 0.0)
     for i in known[inside < 0]:
         report.error(
@@ -170,6 +173,7 @@ def check_surroundings(
     if len(judged) and five_ray < cfg.five_ray_mean_min:
         expected = f"a mean of at least {cfg.five_ray_mean_min:g}"
         report.error("five_ray_visibility", "trajectory.json: points", f"{five_ray:.3f}", expected)
+    return gaps_m
 
 
 def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int | None]) -> None:

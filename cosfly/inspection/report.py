@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from cosfly.coverage_page import STYLE as COVERAGE_STYLE
 from cosfly.coverage_page import coverage_html
 from cosfly.escaping import for_html, html_page
-from cosfly.frame_views import thumbnail
+from cosfly.inspection.view import PLOTS, FlightView
 from cosfly.issues import Issue
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
-from cosfly.products.playback import Flight
 from cosfly.reading.files import read_text
 from cosfly.store import write_bytes
 
-CURVE_POINTS = 160
-
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
+MB = 1_000_000
 
 # column title, metric, format
 COLUMNS = (
@@ -35,53 +32,35 @@ COLUMNS = (
     ("visible", "visible_share", "{:.0%}"),
     ("IoU", "track_quality", "{:.2f}"),
 )
+LEGEND = """a, j: RMS acceleration and jerk of the plan; S: smoothness score; clear: least distance of the drawn poses to an obstacle; five-ray: their mean
+visibility on the map; rendered: mean visibility of the target in the frames; visible: frames that show it; IoU: projected box against mask. Maps: the drone's way blue,
+the person's orange, from dot to ring, north up. Plots: over the seconds of the flight; a gap where nothing is known."""
+PLOT_WIDTH, PLOT_HEIGHT = 250.0, 62.0
 
 
-class FlightView(BaseModel):
-    """What a row shows: two curves with gaps, and the first, middle and last frame as JPEGs in base64, None for one that cannot be read."""
-
-    height_m: list[float | None] = []
-    visibility: list[float | None] = []
-    pictures: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")] | None] = [None, None, None]
+def write_report(path: Path, inspection: Inspection, views: dict[str, FlightView], page_mb: float) -> None:
+    """Write the page; `views` holds pictures and curves by flight folder, of which as many are shown as the page may hold."""
+    write_bytes(path, report_html(inspection, views, page_mb).encode())
 
 
-def draw_flight(flight: Flight, heights_m: np.ndarray, width_px: int) -> FlightView:
-    """Give what a row shows.
-
-    Args:
-        heights_m: (n,) of the drone over the person. width_px: of the pictures.
-    """
-    rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
-    curves = {"height_m": heights_m[rows], "visibility": flight.visibility[rows]}
-    numbers = {
-        name: [None if np.isnan(v) else round(float(v), 3) for v in values.tolist()] for name, values in curves.items()
-    }
-    middle, last = len(flight) // 2, len(flight) - 1
-    return FlightView(**numbers, pictures=[thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)])
-
-
-def write_report(path: Path, inspection: Inspection, views: dict[str, FlightView]) -> None:
-    """Write the page; `views` holds pictures and curves by flight folder."""
-    write_bytes(path, report_html(inspection, views).encode())
-
-
-def report_html(inspection: Inspection, views: dict[str, FlightView]) -> str:
-    """Give the page's text. Flights that need a look come first."""
+def report_html(inspection: Inspection, views: dict[str, FlightView], page_mb: float) -> str:
+    """Give the page's text. Flights that need a look come first, and are the last to lose their pictures."""
     order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
     counts = inspection.funnel.flights
     summary = f"{counts.inspected} flights: {counts.accepted} accepted, {counts.review} to review, {counts.rejected} rejected."
-    heads = "".join(f'<th class="n">{for_html(title)}</th>' for title, _, _ in COLUMNS)
-    rows = "\n".join(_row(flight, views.get(flight.folder, FlightView())) for flight in order)
+    rows, left_out = cards(order, views, page_mb)
+    if left_out:
+        summary += (
+            f" {left_out} are without pictures, map and plots: the page is held to {page_mb:g} MB (inspect.page_mb)."
+        )
     body = f"""<h1>Inspection</h1>
-<p class="lead">{for_html(summary)} A rejected flight breaks a rule; one in review is for a person to decide.</p>
+<p class="lead">{for_html(summary)} A rejected flight breaks a rule; one in review is for a person to decide (cosfly inspect review).</p>
 <h2>Funnel</h2>
 <div class="funnel">{_funnel(inspection)}</div>
 {_covered(inspection)}<h2>Flights</h2>
-<p class="lead">a, j: RMS acceleration and jerk of the plan; S: smoothness score; clear: least distance of the
-drawn poses to an obstacle; five-ray: their mean visibility on the map; rendered: mean visibility of the target in the frames; visible: frames that show it; IoU: projected box against mask.</p>
-<div class="scroll"><table><thead><tr><th>flight</th><th>first, middle, last frame</th>{heads}<th>height over person, visibility</th></tr></thead><tbody>
+<p class="lead">{LEGEND}</p>
+{HEAD}
 {rows}
-</tbody></table></div>
 <h2>Settings</h2>
 <p class="lead">{for_html(", ".join(f"{name} {value}" for name, value in inspection.settings.items()))}</p>"""
     return html_page("cosfly: inspection", STYLE + COVERAGE_STYLE, body)
@@ -92,6 +71,9 @@ def _covered(inspection: Inspection) -> str:
         return ""
     lead = f"{inspection.coverage.frames:,} frames of accepted flights, and where 5 % to 95 % of them lie; the line is the plain run that ships (quickstart)."
     return f'<h2>What is covered</h2>\n<p class="lead">{lead}</p>\n{coverage_html(inspection.coverage)}\n'
+
+
+# --- the funnel -------------------------------------------------------------------------------------------------------
 
 
 def _funnel(inspection: Inspection) -> str:
@@ -122,25 +104,65 @@ def _bar(label: str, count: int, total: int, kind: str = "", *, sub: bool = Fals
     )
 
 
-def _row(flight: FlightInspection, view: FlightView) -> str:
+# --- flights ----------------------------------------------------------------------------------------------------------
+
+HEAD = (
+    '<div class="row head"><span>flight</span>'
+    + "".join(f"<span>{for_html(title)}</span>" for title, _, _ in COLUMNS)
+    + "</div>"
+)
+
+
+def cards(
+    flights: list[FlightInspection],
+    views: dict[str, FlightView],
+    page_mb: float,
+    more: Callable[[FlightInspection], str] = lambda flight: "",
+) -> tuple[str, int]:
+    """Give a row for each flight that opens, and how many of them have no pictures because the page would be too large.
+
+    Args:
+        more: what else stands in a flight's part of the page, as HTML.
+    """
+    parts, size, left_out = list[str](), 0, 0
+    for flight in flights:
+        card = _card(flight, views.get(flight.folder), more(flight))
+        if flight.folder in views and size + len(card) > page_mb * MB:
+            card, left_out = _card(flight, None, more(flight)), left_out + 1
+        size += len(card)
+        parts.append(card)
+    return "\n".join(parts), left_out
+
+
+def _card(flight: FlightInspection, view: FlightView | None, more: str) -> str:
     issues = "".join(_issue(issue) for issue in flight.issues if issue.severity != "note")
-    name = f"<b>{for_html(flight.trajectory)}</b><br>{for_html(flight.variant)} <small>{for_html(flight.town)}</small>"
-    label = f'{name}<br><span class="tag {flight.result}">{flight.result}</span>'
-    wide = (
-        f'<tr class="wide"><td colspan="{len(COLUMNS) + 3}"><ul class="issues">{issues}</ul></td></tr>'
-        if issues
-        else ""
+    name = f"<b>{for_html(flight.trajectory)}</b> {for_html(flight.variant)} <small>{for_html(flight.town)}</small>"
+    numbers = "".join(
+        f'<span class="n" title="{for_html(title)}"><i>{for_html(title)}</i>{_number(flight.metrics.get(key), form)}</span>'
+        for title, key, form in COLUMNS
     )
-    numbers = "".join(f'<td class="n">{_number(flight.metrics.get(key), form)}</td>' for _, key, form in COLUMNS)
+    shown = "" if view is None else _shown(view)
+    state = "" if flight.result == "accepted" else " open"
+    return (
+        f'<details class="flight"{state}><summary class="row"><span>{name} <span class="tag {flight.result}">{flight.result}</span></span>{numbers}</summary>'
+        f"{f'<ul class=issues>{issues}</ul>' if issues else ''}{more}{shown}</details>"
+    )
+
+
+def _shown(view: FlightView) -> str:
     pictures = "".join(
         f'<img alt="frame" src="data:image/jpeg;base64,{picture}">'
         if picture
         else '<span class="gone">no picture</span>'
         for picture in view.pictures
     )
-    curves = _curve(view.height_m, "#2b6cb0", "m", least_span=5.0) + _curve(view.visibility, "#2f855a", "", (0, 1))
-    first = '<tr class="open">' if issues else "<tr>"
-    return f'{first}<td>{label}</td><td class="pictures">{pictures}</td>{numbers}<td>{curves}</td></tr>{wide}'
+    plan = f'<img class="plan" alt="map" src="data:image/jpeg;base64,{view.plan}">' if view.plan else ""
+    plots = "".join(
+        _plot(title, unit, view.time_s, view.curves[name], span)
+        for name, (title, unit, span) in PLOTS.items()
+        if name in view.curves
+    )
+    return f'<div class="look"><div class="pictures">{pictures}</div>{plan}<div class="plots">{plots}</div></div>'
 
 
 def _issue(issue: Issue) -> str:
@@ -153,29 +175,27 @@ def _number(value: float | int | None, form: str) -> str:
     return "&ndash;" if value is None else form.format(value)
 
 
-def _curve(
-    values: list[float | None],
-    color: str,
-    unit: str,
-    span: tuple[float, float] | None = None,
-    least_span: float = 0.0,
+def _plot(
+    title: str, unit: str, time_s: list[float], values: list[float | None], span: tuple[float | None, float | None]
 ) -> str:
-    """Draw a small curve with its range; a gap where a value is unknown. `least_span` keeps noise from looking like flight."""
+    """Draw values over time, with their range; a gap where one is unknown. span: what the axis shows at least."""
     known = [value for value in values if value is not None]
     if not known:
         return ""
-    low, high = span or (min(known), max(known))
-    spare = max(0.0, least_span - (high - low)) / 2.0
-    low, high = low - spare, high + spare
-    width, height = 150.0, 34.0
-    step, scale = width / max(1, len(values) - 1), (height - 4.0) / ((high - low) or 1.0)
+    low = min([*known, *(edge for edge in span if edge is not None)])
+    high = max([*known, *(edge for edge in span if edge is not None)])
+    scale = (PLOT_HEIGHT - 4.0) / ((high - low) or 1.0)
+    step = PLOT_WIDTH / ((time_s[-1] - time_s[0]) or 1.0)
     parts, pen_is_down = [], False
-    for i, value in enumerate(values):
+    for at_s, value in zip(time_s, values, strict=True):
         if value is None:
             pen_is_down = False
             continue
-        parts.append(f"{'L' if pen_is_down else 'M'}{i * step:.1f} {height - 2.0 - (value - low) * scale:.1f}")
+        parts.append(f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} {PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}")  # fmt: skip
         pen_is_down = True
-    path = f'<path d="{"".join(parts)}" fill="none" stroke="{color}" stroke-width="1.5"/>'
-    label = f"<small>{min(known):.2f} to {max(known):.2f} {unit}</small>"
-    return f'<svg width="{width:.0f}" height="{height:.0f}">{path}</svg>{label}'
+    mean = float(np.mean(known))
+    return (
+        f"<figure><figcaption>{for_html(title)} <small>{min(known):.2f} to {max(known):.2f} {for_html(unit)}, mean {mean:.2f}</small></figcaption>"
+        f'<svg viewBox="0 0 {PLOT_WIDTH:.0f} {PLOT_HEIGHT:.0f}" preserveAspectRatio="none"><path d="{"".join(parts)}"/></svg>'
+        f"<small>{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s</small></figure>"
+    )

@@ -109,3 +109,9 @@ class InspectConfig(Config):
         "have 1.4 at most",
     )
     thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
+    page_mb: float = Field(
+        25.0,
+        gt=0,
+        description="size of report.html, and of review.html, beyond which flights are listed without pictures, map and plots, accepted ones first, "
+        "MB; a flight takes 0.06",
+    )

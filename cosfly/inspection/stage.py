@@ -11,8 +11,9 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
-from cosfly.inspection.report import FlightView, write_report
+from cosfly.inspection.report import write_report
 from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.view import FlightView
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
@@ -36,12 +37,13 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     """Worker factory: give the function that inspects one flight folder."""
     from cosfly.kernels import obstacle_index
 
-    obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
+    box_map = None if simplified is None else read_boxes(simplified)
+    obstacles = None if box_map is None else obstacle_index(box_map)
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
     recorded = recorded_digests(data)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_flight(data / item.payload, data, by_id, obstacles, cfg, recorded)
+        inspected = inspect_flight(data / item.payload, data, by_id, box_map, obstacles, cfg, recorded)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None
@@ -81,7 +83,7 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect")
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
-    write_report(out / "report.html", inspection, views)
+    write_report(out / "report.html", inspection, views, cfg.page_mb)
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     return product
 

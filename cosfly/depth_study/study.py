@@ -1,0 +1,234 @@
+"""Codes the depth of one frame in all the ways there are, decodes it, and compares: `depth_study.json`, `depth_study.md`, and a figure.
+
+Whole numbers of 8 to 16 bits share the frame's own range evenly, as the paper's table does. float16 and PNGs of millimetres are
+coded by the release's own coder. The truth is what the file holds: float32, whose rounding is then told as half the step between
+neighbouring numbers at the farthest pixel, or float64, against which float32 is measured.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydantic import BaseModel
+
+from cosfly.depth_study.picture import draw_study
+from cosfly.errors import InputError
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, read_rgb
+from cosfly.reading.arrays import parse_array, parse_array_header
+from cosfly.reading.files import read_bytes
+from cosfly.store import write_bytes, write_model
+from release.depth import depth_of
+from release.package.depth import MOST_PNG_M, depth_record, encoded
+from release.record import DepthCodingName
+
+SCHEMA, VERSION = "cosfly.depth_study", "1.0"
+BITS = (8, 10, 12, 16)
+ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: exact values of a float are nearly all unlike
+CM, KB = 100.0, 1000.0
+
+
+class CodingRow(BaseModel):
+    """Figures of one coding, of the pixels that are neither sky nor invalid; errors against the truth, cm.
+
+    psnr_db: of the frame's range; null: no error. edges: Pearson correlation of Sobel gradients. kilobytes: of the frame as it lies in
+    memory or, of a PNG, as a file; deflated: after zlib at its default level. rounding_cm: of a truth that is float32 itself, its own
+    greatest rounding.
+    """
+
+    coding: str
+    unique: int
+    max_cm: float
+    mean_cm: float
+    rmse_cm: float
+    psnr_db: float | None
+    entropy_bits: float
+    edges: float
+    kilobytes: float
+    deflated_kilobytes: float
+    rounding_cm: float | None = None
+
+
+class Study(BaseModel):
+    """`depth_study.json`. share_measured: of the pixels, neither sky nor invalid. left_out: codings that have no number for these depths."""
+
+    frame: str
+    width_px: int
+    height_px: int
+    truth: str
+    min_m: float
+    max_m: float
+    share_measured: float
+    rows: list[CodingRow]
+    left_out: dict[str, str]
+
+
+def run(frame: Path, out: Path) -> Study:
+    """Read a frame folder, or a `.npy` of depth; write the study into a folder, with a figure; give it.
+
+    Raises:
+        InputError: there is no depth image, or it holds fewer than two different depths.
+    """
+    file = frame / "depth.npy" if frame.is_dir() else frame
+    data = read_bytes(file, what="depth image")
+    truth = _truth(data, file)
+    measured = np.isfinite(truth) & (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
+    known = truth[measured]
+    if not known.size or known.min() == known.max() or known.min() < 0:
+        got = "no measured pixel" if not known.size else f"{known.min():g} to {known.max():g} m"
+        raise InputError(
+            "a depth image that has nothing to study", where=file, got=got, expected="two depths or more, above 0 m"
+        )
+    decoded, left_out = _decoded(truth, measured, file)
+    name = "/".join(file.absolute().parts[-2:])
+    rows = [_row(coding, values, size, blob, truth, measured) for coding, (values, size, blob) in decoded.items()]
+    if truth.dtype == np.float32:
+        rounding = float(np.spacing(known.max())) / 2.0 * CM
+        rows = [
+            row.model_copy(update={"rounding_cm": rounding}) if row.coding == "32-bit float" else row for row in rows
+        ]
+    study = Study(
+        frame=name, width_px=truth.shape[1], height_px=truth.shape[0], truth=str(truth.dtype), min_m=float(known.min()),
+        max_m=float(known.max()), share_measured=float(measured.mean()), rows=rows, left_out=left_out,
+    )  # fmt: skip
+    rgb = read_rgb(frame) if frame.is_dir() and (frame / "rgb.png").exists() else None
+    write_model(out / "depth_study.json", study, schema=SCHEMA, version=VERSION)
+    write_bytes(out / "depth_study.md", markdown(study).encode())
+    write_bytes(
+        out / "depth_study.png",
+        draw_study(rgb, truth, measured, {name: values for name, (values, _, _) in decoded.items()}),
+    )
+    return study
+
+
+def _truth(data: bytes, file: Path) -> np.ndarray:
+    kind = (
+        np.float64 if parse_array_header(memoryview(data), file, what="depth image").dtype == np.float64 else np.float32
+    )
+    return parse_array(data, file, dtype=kind, ndim=2, what="depth image")
+
+
+# --- codings ----------------------------------------------------------------------------------------------------------
+
+Decoded = tuple[np.ndarray, float, bytes]  # the depth that comes back, m; bytes as stored; what deflating starts from
+
+
+def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Give the codes of whole numbers that share the frame's range evenly, and the depth that they stand for.
+
+    Args:
+        truth: (h, w) m; measured: (h, w) bool. Pixels that are not measured get code 0, and their own depth back.
+    """
+    low, high = float(truth[measured].min()), float(truth[measured].max())
+    step_m = (high - low) / (2**bits - 1)
+    codes = np.where(measured, np.rint((truth.astype(np.float64) - low) / step_m), 0).astype(np.uint16)
+    return codes, np.where(measured, low + codes * step_m, truth.astype(np.float64))
+
+
+def _decoded(truth: np.ndarray, measured: np.ndarray, file: Path) -> tuple[dict[str, Decoded], dict[str, str]]:
+    """Code and decode in all ways, by their names; and those that cannot hold these depths, with why."""
+    found, left_out = dict[str, Decoded](), dict[str, str]()
+    for bits in BITS:
+        codes, values = quantised(truth, measured, bits)
+        blob = codes.astype(np.uint8).tobytes() if bits == 8 else codes.tobytes()
+        found[f"{bits}-bit"] = (values, truth.size * bits / 8.0, blob)
+    single = truth.astype(np.float32)
+    npy = depth_bytes(single)
+    codings: tuple[tuple[str, DepthCodingName], ...] = (
+        ("16-bit float", "float16"),
+        ("16-bit PNG of millimetres", "millimetre_png"),
+    )
+    for title, coding in codings:
+        try:
+            blob, errors = encoded(memoryview(npy), coding, file)
+        except InputError:
+            left_out[title] = f"depths beyond {MOST_PNG_M:g} m"
+            continue
+        values = depth_of(blob, depth_record(coding, [errors]), str(file)).astype(np.float64)
+        found[title] = (values, float(len(blob)), blob)
+    found["32-bit float"] = (single.astype(np.float64), float(single.nbytes), single.tobytes())
+    # The same numbers, their bytes sorted by significance: exponents stand beside exponents, which deflating likes.
+    planes = np.frombuffer(single.tobytes(), np.uint8).reshape(-1, 4).T.tobytes()
+    found["32-bit float, bytes by significance"] = (_from_planes(planes, single.shape), float(len(planes)), planes)
+    if truth.dtype == np.float64:
+        found["64-bit float"] = (truth, float(truth.nbytes), truth.tobytes())
+    return found, left_out
+
+
+def _from_planes(planes: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    values = np.ascontiguousarray(np.frombuffer(planes, np.uint8).reshape(4, -1).T).view(np.float32)
+    return values.reshape(shape).astype(np.float64)
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def _row(
+    coding: str, values: np.ndarray, size: float, blob: bytes, truth: np.ndarray, measured: np.ndarray
+) -> CodingRow:
+    known, came_back = truth[measured].astype(np.float64), values[measured]
+    errors = np.abs(came_back - known)
+    rmse = float(np.sqrt(np.mean(errors**2)))
+    low, high = float(known.min()), float(known.max())
+    return CodingRow(
+        coding=coding,
+        unique=len(np.unique(came_back)),
+        max_cm=float(errors.max()) * CM,
+        mean_cm=float(errors.mean()) * CM,
+        rmse_cm=rmse * CM,
+        psnr_db=20.0 * float(np.log10((high - low) / rmse)) if rmse else None,
+        entropy_bits=entropy_bits(came_back, low, high),
+        edges=edge_correlation(values, truth.astype(np.float64), measured),
+        kilobytes=size / KB,
+        deflated_kilobytes=len(zlib.compress(blob)) / KB,
+    )
+
+
+def entropy_bits(values: np.ndarray, low: float, high: float) -> float:
+    """Give Shannon's entropy of a histogram of ENTROPY_BINS equal bins from low to high, bits."""
+    counts = np.histogram(values, bins=ENTROPY_BINS, range=(low, high))[0]
+    shares = counts[counts > 0] / counts.sum()
+    return float(-(shares * np.log2(shares)).sum())
+
+
+def edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> float:
+    """Give Pearson's correlation of the lengths of Sobel gradients, where the nine pixels under the filter are all measured; 1 where none are."""
+    inner = (
+        cv2.erode(measured.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        > 0
+    )
+    lengths = [
+        np.hypot(cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1))[inner]
+        for image in (values, truth)
+    ]
+    if not inner.any() or min(length.std() for length in lengths) == 0:
+        return 1.0
+    return float(np.corrcoef(lengths)[0, 1])
+
+
+def markdown(study: Study) -> str:
+    """Give the table of the study, as the paper prints it, with sizes after deflating."""
+    buffer = io.StringIO()
+    buffer.write(
+        f"Depth of `{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to {study.max_m:.2f} m, {study.share_measured:.1%} of the pixels "
+        f"measured; errors against {study.truth}.\n\n"
+        "| coding | unique values | max error, cm | mean error, cm | RMSE, cm | PSNR, dB | entropy, bits | edge correlation | size, KB | deflated, KB |\n"
+        "|---|---|---|---|---|---|---|---|---|---|\n"
+    )
+    for row in study.rows:
+        psnr = "none wrong" if row.psnr_db is None else f"{row.psnr_db:.1f}"
+        buffer.write(
+            f"| {row.coding} | {row.unique:,} | {row.max_cm:.4g} | {row.mean_cm:.4g} | {row.rmse_cm:.4g} | {psnr} | {row.entropy_bits:.2f} | "
+            f"{row.edges:.6f} | {row.kilobytes:,.0f} | {row.deflated_kilobytes:,.0f} |\n"
+        )
+    for row in study.rows:
+        if row.rounding_cm is not None:
+            buffer.write(
+                f"\nThe truth is float32 itself, which rounds by at most {row.rounding_cm:.2g} cm at {study.max_m:.1f} m.\n"
+            )
+    for coding, reason in study.left_out.items():
+        buffer.write(f"\nNot stored as {coding}: {reason}.\n")
+    return buffer.getvalue()

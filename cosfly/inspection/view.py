@@ -1,0 +1,98 @@
+"""What the pages show of one flight: pictures, curves over its time, and its way on the map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from cosfly.flight_metrics import CLEARANCE_CAP_M
+from cosfly.frame_views import small_jpeg, thumbnail
+from cosfly.products.boxes import BoxMap
+from cosfly.products.playback import Flight
+from cosfly.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
+
+CURVE_POINTS = 160
+# Of a flight's curves: title, unit, what the axis shows at least.
+PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
+    "altitude_m": ("height over the person", "m", (0.0, None)),
+    "distance_m": ("distance to the person", "m", (0.0, None)),
+    "visibility": ("visibility in the frame", "", (0.0, 1.0)),
+    "clearance_m": (f"clearance, up to {CLEARANCE_CAP_M:g} m", "m", (0.0, None)),
+    "speed_mps": ("speed", "m/s", (0.0, None)),
+}
+PLAN_PX, MARGIN_M = 300, 12.0
+DRONE, PERSON = (35, 100, 220), (235, 120, 20)  # RGB
+JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
+
+
+class FlightView(BaseModel):
+    """Curves with gaps by their names in PLOTS, the first, middle and last frame, and the map, as JPEGs in base64; None of what there is not."""
+
+    time_s: list[float] = []
+    curves: dict[str, list[float | None]] = {}
+    pictures: list[JPEG | None] = [None, None, None]
+    plan: JPEG | None = None
+
+
+def draw_flight(
+    flight: Flight, heights_m: np.ndarray, clearance_m: np.ndarray | None, box_map: BoxMap | None, width_px: int
+) -> FlightView:
+    """Give what a page shows of a flight.
+
+    Args:
+        heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map. width_px: of the pictures.
+    """
+    rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
+    speeds_mps = np.full(len(flight), np.nan)
+    speeds_mps[1:] = np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1) / np.diff(flight.time_s)
+    curves = {
+        "altitude_m": heights_m,
+        "distance_m": np.linalg.norm(flight.positions_m - flight.targets_m, axis=1),
+        "visibility": flight.visibility,
+        "clearance_m": clearance_m,
+        "speed_mps": speeds_mps,
+    }
+    middle, last = len(flight) // 2, len(flight) - 1
+    return FlightView(
+        time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
+        curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
+        pictures=[thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)],
+        plan=draw_plan(flight, box_map),
+    )
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [round(float(value), 3) if np.isfinite(value) else None for value in values]
+
+
+def draw_plan(flight: Flight, box_map: BoxMap | None) -> str:
+    """Draw the ways of drone and person on the map from above, or on paper where there is none; a JPEG in base64."""
+    person_m = flight.targets_m[~np.isnan(flight.targets_m).any(axis=1)]
+    view = TopView.around(np.concatenate([flight.positions_m, person_m]), PLAN_PX, MARGIN_M)
+    if box_map is None:
+        picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
+    else:
+        width_m, height_m = view.size_px[0] / view.pixels_per_m, view.size_px[1] / view.pixels_per_m
+        low, high = np.array([view.west_m, view.north_m - height_m]), np.array([view.west_m + width_m, view.north_m])
+        is_near = ((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1)
+        picture = draw_map(box_map.select(np.flatnonzero(is_near)), view)
+    for points_m, color in ((person_m, PERSON), (flight.positions_m, DRONE)):
+        if len(points_m):
+            places = view.pixels(points_m)
+            draw_line(picture, places, color, 2, halo=4)
+            draw_dot(picture, places[0], 5, color)
+            draw_dot(picture, places[-1], 5, color, 2)
+    _draw_scale(picture, view)
+    return small_jpeg(picture, picture.shape[1])
+
+
+def _draw_scale(picture: np.ndarray, view: TopView) -> None:
+    """Draw a bar of a round number of metres, at most a third of the width."""
+    third_m = picture.shape[1] / 3.0 / view.pixels_per_m
+    power = 10.0 ** np.floor(np.log10(third_m))
+    metres = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= third_m)
+    y = picture.shape[0] - 8.0
+    draw_line(picture, np.array([[8.0, y], [8.0 + metres * view.pixels_per_m, y]]), INK, 2, halo=5)
+    draw_text(picture, f"{metres:g} m", 8.0, y - 6.0, 0.4, halo=(255.0, 255.0, 255.0))

@@ -1,0 +1,127 @@
+"""`cosfly depth-study`: the paper's table where it can be worked out by hand, codings that come back, frames that have nothing to study."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.depth_study.study import BITS, ENTROPY_BINS, Study, edge_correlation, entropy_bits, quantised, run
+from cosfly.errors import InputError
+from cosfly.products.frames import frame_name
+from cosfly.products.playback import find_flights
+from cosfly.reading.documents import read_json
+from specimens import make_playback_tree
+
+NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
+
+
+def ramp(dtype: type, shape: tuple[int, int] = (72, 128)) -> np.ndarray:
+    """Depths spread evenly over the paper's range, in an order that no row tells."""
+    values = np.linspace(NEAR_M, FAR_M, shape[0] * shape[1])
+    return np.random.default_rng(0).permutation(values).reshape(shape).astype(dtype)
+
+
+def rows_of(study: Study) -> dict:
+    return {row.coding: row for row in study.rows}
+
+
+@pytest.mark.parametrize(
+    ("coding", "max_cm", "mean_cm", "rmse_cm", "psnr_db"),
+    [
+        ("8-bit", 4.5019, 2.2494, 2.5979, 58.9),
+        ("10-bit", 1.1222, 0.5543, 0.6418, 71.1),
+        ("12-bit", 0.2803, 0.1436, 0.1646, 82.9),
+        ("16-bit", 0.0175, 0.0088, 0.0101, 107.1),
+    ],
+)
+def test_depths_spread_evenly_give_the_papers_errors(tmp_path, coding, max_cm, mean_cm, rmse_cm, psnr_db):
+    """Its scene is nearly so: half a step at most, a quarter of one on average; what it prints is within 3 % of that."""
+    np.save(tmp_path / "depth.npy", ramp(np.float64, (360, 640)))
+    row = rows_of(run(tmp_path / "depth.npy", tmp_path / "out"))[coding]
+    assert (row.max_cm, row.mean_cm, row.rmse_cm) == pytest.approx((max_cm, mean_cm, rmse_cm), rel=0.03)
+    assert row.psnr_db == pytest.approx(psnr_db, abs=0.3)
+
+
+def test_float32_against_float64(tmp_path):
+    np.save(tmp_path / "depth.npy", ramp(np.float64))
+    study = run(tmp_path / "depth.npy", tmp_path / "out")
+    single = rows_of(study)["32-bit float"]
+    assert study.truth == "float64"
+    assert 0 < single.max_cm <= np.spacing(np.float32(FAR_M)) / 2 * 100 * 1.001
+    assert single.psnr_db > 145
+    assert rows_of(study)["64-bit float"].max_cm == 0
+    assert single.rounding_cm is None
+
+
+def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 3, with_augmented=False)
+    frame = find_flights(tree)[0] / frame_name(1)
+    answer = CliRunner().invoke(app, ["depth-study", "--frame", str(frame), "--out", str(tmp_path / "out")])
+    assert answer.exit_code == 0, answer.output
+    study = Study.model_validate(
+        {k: v for k, v in read_json(tmp_path / "out/depth_study.json").items() if not k.startswith("schema")}
+    )
+    depth = np.load(frame / "depth.npy")
+    known = depth[(depth != 1000) & (depth != 0)]
+    assert study.share_measured == known.size / depth.size
+    rows = rows_of(study)
+    lossless = [row for name, row in rows.items() if name.startswith("32-bit float")]
+    assert [(row.max_cm, row.psnr_db, row.unique) for row in lossless] == [(0.0, None, len(np.unique(known)))] * 2
+    assert rows["32-bit float"].rounding_cm == pytest.approx(np.spacing(known.max()) / 2 * 100)
+    assert rows["16-bit PNG of millimetres"].max_cm == pytest.approx(0.05, abs=0.002)
+    assert rows["8-bit"].edges < rows["12-bit"].edges <= 1.0
+    table = (tmp_path / "out/depth_study.md").read_text()
+    assert table.count("\n| ") == 1 + len(study.rows)
+    assert str(tmp_path) not in table
+    picture = cv2.imread(str(tmp_path / "out/depth_study.png"))
+    assert picture.std() > 20
+
+
+def test_what_cannot_hold_the_depths_is_named(tmp_path):
+    np.save(tmp_path / "depth.npy", (ramp(np.float32) * 10).astype(np.float32))
+    study = run(tmp_path / "depth.npy", tmp_path / "out")
+    assert study.left_out == {"16-bit PNG of millimetres": "depths beyond 65.5 m"}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.full((4, 5), 7, np.float32), np.full((4, 5), 1000, np.float32), np.full((4, 5), np.nan, np.float32), np.ones((4, 5), np.int32),
+     np.linspace(-1, 1, 20, dtype=np.float32).reshape(4, 5)],
+    ids=["one_depth", "sky", "nan", "integers", "negative"],
+)  # fmt: skip
+def test_a_frame_without_anything_to_study_is_one_error(tmp_path, values):
+    np.save(tmp_path / "depth.npy", values)
+    with pytest.raises(InputError, match="depth"):
+        run(tmp_path / "depth.npy", tmp_path / "out")
+    with pytest.raises(InputError):
+        run(tmp_path / "no such frame", tmp_path / "out")
+
+
+@given(st.sampled_from(BITS), st.integers(0, 2**31))
+def test_codes_are_within_half_a_step(bits, seed):
+    truth = np.random.default_rng(seed).uniform(1, 90, (5, 7)).astype(np.float32)
+    measured = np.ones_like(truth, dtype=bool)
+    codes, values = quantised(truth, measured, bits)
+    step = (float(truth.max()) - float(truth.min())) / (2**bits - 1)
+    assert np.abs(values - truth).max() <= step / 2 * 1.0001 + 1e-6
+    assert (codes.min(), codes.max()) == (0, 2**bits - 1)
+
+
+def test_entropy_and_edges_of_known_images():
+    even = np.repeat((np.arange(ENTROPY_BINS) + 0.5) / ENTROPY_BINS, 2)
+    assert entropy_bits(even, 0, 1) == pytest.approx(13.0)
+    assert entropy_bits(np.full(9, 0.5), 0, 1) == 0.0
+    slope = np.add.outer(np.arange(20.0) ** 2, np.arange(30.0))
+    everywhere = np.ones(slope.shape, dtype=bool)
+    assert edge_correlation(3 * slope, slope, everywhere) == pytest.approx(1.0)
+    hole = everywhere.copy()
+    hole[5, 5] = False
+    broken = slope.copy()
+    broken[5, 5] = 1e6
+    assert edge_correlation(broken, slope, hole) == pytest.approx(1.0), "what is not measured has no edge"
+    assert edge_correlation(np.random.default_rng(0).normal(size=slope.shape), slope, everywhere) < 0.5

@@ -1,0 +1,202 @@
+"""The review queue: who decides, what is refused, what the release makes of it, and the pages."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import browser
+from test_cosfly_inspection import CFG, first_flight, plan_of, write_map
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import InputError
+from cosfly.inspection import review
+from cosfly.inspection.report import cards, report_html
+from cosfly.inspection.stage import run
+from cosfly.inspection.view import PLOTS, draw_plan
+from cosfly.products.inspection import read_inspection
+from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
+from cosfly.products.traces import write_traces
+from cosfly.reading.files import sha256_file
+from release.package.sources import Source, gather
+from specimens import make_playback_tree
+
+QUEUE = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that
+
+
+@pytest.fixture(scope="module")
+def inspected(tmp_path_factory) -> Path:
+    """A tree of two trajectories, and an inspection that left every flight to a person; nobody changes it."""
+    root = tmp_path_factory.mktemp("queue")
+    tree = make_playback_tree(root / "tree", 2, 6, width_px=96, height_px=54)
+    write_map(root)
+    write_traces(root / "drone_trace.json", [plan_of(f) for f in find_flights(tree) if f.name == "ORI"], {})
+    return run(QUEUE, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
+
+
+@pytest.fixture
+def product(inspected, tmp_path) -> Path:
+    """`inspect.json` and its folder, to be worked on."""
+    shutil.copytree(inspected.parent, tmp_path / "inspect")
+    return tmp_path / "inspect/inspect.json"
+
+
+def folders_of(product: Path) -> list[str]:
+    return [flight.folder for flight in read_inspection(product).flights]
+
+
+def decide(product: Path, verdict: str, *folders: str) -> None:
+    add_decisions(product, [Choice(folder=f, verdict=verdict, reason="looked at it") for f in folders], "Ann")
+
+
+def test_decisions_are_on_record_and_the_last_one_counts(product):
+    first, second, *_ = folders_of(product)
+    decide(product, "accepted", first, second)
+    decide(product, "rejected", first)
+    found = read_decisions(product)
+    assert {folder: decision.verdict for folder, decision in found.items()} == {first: "rejected", second: "accepted"}
+    one = found[second]
+    assert (one.by, one.reason, one.inspection) == ("Ann", "looked at it", sha256_file(product))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", one.at)
+    assert len(product.with_name(REVIEW).read_text().splitlines()) == 3, "nothing is taken away"
+    assert one.sha256 == read_inspection(product).flights[1].sha256
+
+
+def test_results_and_funnel_are_those_after_review(product):
+    """Both flights of one trajectory accepted, one of the other rejected: it is as good as its worst."""
+    before = product.read_bytes()
+    flights = folders_of(product)
+    decide(product, "accepted", *flights[:3])
+    decide(product, "rejected", flights[3])
+    settled = read_settled(product)
+    assert [flight.result for flight in settled.flights] == ["accepted"] * 3 + ["rejected"]
+    assert settled.flights[3].reason == "review"
+    counts = settled.funnel.trajectories
+    assert (counts.accepted, counts.review, counts.rejected) == (1, 0, 1)
+    assert product.read_bytes() == before
+    assert "decided" not in json.dumps(settled.model_dump(mode="json")["flights"])
+
+
+def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
+    tree = inspected.parent.parent / "tree"
+    source = Source("run", tree, product, product)  # captions are not read here
+    take = lambda: gather([source], include_review=False, accept_unbound=True)  # noqa: E731
+    assert {one.left_out for one in take().candidates} == {"review: smoothness"}
+    flights = folders_of(product)
+    decide(product, "accepted", *flights[:2])
+    decide(product, "rejected", flights[2])
+    assert [one.left_out for one in take().candidates] == [None, None, "rejected: review", "review: smoothness"]
+    assert source.files["review"] == product.with_name(REVIEW), (
+        "an input of the stage: a later decision is another input"
+    )
+
+
+def test_a_decision_on_another_inspection_is_refused(product):
+    decide(product, "accepted", folders_of(product)[0])
+    product.write_text(product.read_text().replace('"smoothness_min": 1.0', '"smoothness_min": 0.9'))
+    for use in (read_decisions, read_settled, lambda path: decide(path, "accepted", folders_of(path)[0])):
+        with pytest.raises(InputError, match="another inspection"):
+            use(product)
+
+
+@pytest.mark.parametrize("change", [lambda t: t.replace("accepted", "rejected"), lambda t: t[:-20], lambda t: "\n" + t])
+def test_a_changed_decision_is_refused(product, change):
+    decide(product, "accepted", folders_of(product)[0])
+    path = product.with_name(REVIEW)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match="changed or cut short"):
+        read_decisions(product)
+
+
+def test_what_cannot_be_decided(product):
+    with pytest.raises(InputError, match="no such flight"):
+        decide(product, "accepted", folders_of(product)[0], "Town01/nobody/ORI")
+    assert not product.with_name(REVIEW).exists(), "all or none"
+    value = json.loads(product.read_text())
+    value["flights"][0]["result"] = "rejected"
+    product.write_text(json.dumps(value))
+    with pytest.raises(InputError, match="breaks a rule"):
+        decide(product, "accepted", value["flights"][0]["folder"])
+
+
+def test_the_command_decides_and_says_what_is_open(product):
+    first, second, third, _ = folders_of(product)
+    ask = lambda *words: CliRunner().invoke(app, ["inspect", "review", "--inspect", str(product.parent), *words])  # noqa: E731
+    assert ask("--accept", first).exit_code == 2, "who, and why?"
+    done = ask("--accept", first, "--accept", second, "--reject", third, "--by", "Bo", "--reason", "steady")
+    assert done.exit_code == 0, done.output
+    assert "4 flights in review: 2 accepted, 1 rejected, 1 open" in done.output
+    page = ask()
+    assert page.exit_code == 0
+    assert product.with_name("review.html").is_file()
+    filled = product.with_name("filled.json")
+    about = {"schema": review.SCHEMA, "schema_version": review.VERSION, "inspection": sha256_file(product), "by": "Cy"}
+    filled.write_text(json.dumps(about | {"choices": [{"folder": third, "verdict": "accepted", "reason": "again"}]}))
+    assert "3 accepted" in ask("--decisions", str(filled)).output
+    filled.write_text(json.dumps(about | {"inspection": "0" * 64, "choices": []}))
+    assert isinstance(ask("--decisions", str(filled)).exception, InputError)
+
+
+@pytest.mark.slow
+def test_what_the_page_saves_is_what_the_command_takes(product):
+    """A person fills it in: one accepted, one rejected with markup in the reason, one without a reason, which stops it."""
+    page_path = review.write_page(product)
+    with browser(product.parent / "profile") as page:
+        page.open(page_path)
+        page.run("document.getElementById('by').value = 'Dee'")
+        page.run("const parts = [...document.querySelectorAll('.choice')]; parts.slice(0, 3).forEach((p, k) => "
+                 "{ p.querySelectorAll('input[type=radio]')[k % 2].click(); p.querySelector('.reason').value = ['fine', '<b>bad</b>', ''][k]; })")  # fmt: skip
+        page.run("document.getElementById('save').click()")
+        assert "without a reason" in page.run("document.getElementById('state').textContent")
+        page.run(
+            "[...document.querySelectorAll('.reason')][2].value = 'fine too'; document.getElementById('save').click()"
+        )
+        text = page.run("document.getElementById('text').value")
+        assert not page.said
+        assert all(address.startswith(("file:", "data:", "blob:")) for address in page.requests)
+    filled = product.with_name("decisions.json")
+    filled.write_text(text)
+    review.take(product, filled)
+    assert [d.verdict for d in read_decisions(product).values()] == ["accepted", "rejected", "accepted"]
+    again = review.page_html(product)
+    assert again.count(" checked") == 3
+    assert "<b>bad" not in again
+
+
+def test_the_page_shows_plots_and_a_map_of_every_flight(product):
+    page = product.with_name("report.html").read_text(encoding="utf-8")
+    flights = len(folders_of(product))
+    assert page.count('class="plan"') == flights
+    for title, _, _ in PLOTS.values():
+        assert page.count(f"<figcaption>{title} ") == flights
+
+
+def test_a_page_of_hundreds_of_flights_is_bounded(product):
+    """The worst keep their pictures; what is left out is said."""
+    inspection, views = read_inspection(product), review._views(product)
+    one = inspection.flights[0]
+    many = [
+        one.model_copy(update={"folder": f"Town/t{i}/ORI", "result": "review" if i < 5 else "accepted"})
+        for i in range(300)
+    ]
+    shown = {flight.folder: views[one.folder] for flight in many}
+    page = report_html(inspection.model_copy(update={"flights": many}), shown, page_mb=1.0)
+    assert len(page) < 1.6e6
+    kept = page.count('class="look"')
+    assert 5 <= kept < 300
+    assert f"{300 - kept} are without pictures" in page
+    assert cards(many, shown, 1000.0)[1] == 0
+
+
+def test_the_map_shows_both_ways(inspected):
+    """Of a flight whose person nobody knows, the drone's alone."""
+    flight = read_flight(first_flight(inspected.parent.parent))
+    both = draw_plan(flight, None)
+    flight.targets_m[:] = np.nan
+    assert draw_plan(flight, None) != both
