@@ -16,6 +16,7 @@ from cosfly.journal import Journal
 EVENTS = "events.jsonl"
 PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
 MEBIBYTE = 2**20
+LOSSES = ("heartbeat_lost", "timed_out", "worker_died")  # events of a worker that is of no use any more
 
 Kind = Literal[
     "began",  # workers: how many
@@ -100,6 +101,11 @@ def read_events(folder: Path) -> list[Event]:
         except ValidationError:
             continue
     return events
+
+
+def lost_steps(folder: Path) -> int:
+    """Count the steps, as frames, that workers had done of items which were lost with them: they are in no product."""
+    return sum(event.steps or 0 for event in read_events(folder) if event.event in LOSSES)
 
 
 # --- what the system says of a process --------------------------------------------------------------------------------

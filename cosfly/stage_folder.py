@@ -32,6 +32,7 @@ from cosfly.provenance import (
 )
 from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
 from cosfly.reading.files import sha256_file
+from cosfly.stage_events import EVENTS, lost_steps
 from cosfly.store import dump_json, inside, refuse_links, remove_partials, sha256_bytes, write_bytes, write_model
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ log = logging.getLogger(__name__)
 Resume = Literal["never", "if-same", "force"]
 
 # What stands in a folder before anything is finished.
-BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", "events.jsonl", "preflight.json")
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")
 
 
 # --- what became of the items -----------------------------------------------------------------------------------------
@@ -264,6 +265,8 @@ class StageFolder:
         tally.check()
         if not tally.kept:
             raise self.nothing_kept(tally)
+        if lost := lost_steps(self.path):
+            facts["lost_steps"] = lost
         manifest = Manifest(
             stage=self.stage,
             outputs=[
@@ -278,6 +281,8 @@ class StageFolder:
         if self._lock is not None:
             self._lock.release()
         log.info("%s: %s, %.1f s", self.stage, tally, manifest.seconds)
+        if lost:
+            log.info("%s: %d steps of lost workers were done again, or left out with their item", self.stage, lost)
 
     def nothing_kept(self, tally: Tally, *, expected: str | None = None) -> NothingKept:
         """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure."""

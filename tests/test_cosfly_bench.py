@@ -3,19 +3,20 @@
 import cv2
 import numpy as np
 import pytest
-from toy_workers import make_worker, stage_in
+from toy_workers import make_counting_worker, make_worker, stage_in
 from typer.testing import CliRunner
 
 from cosfly.bench.faults import Faults, planted
 from cosfly.bench.measure import row_of, run
-from cosfly.bench.picture import COLORS, draw_events
+from cosfly.bench.picture import COLORS, draw_events, draw_scaling
+from cosfly.bench.tables import Bench, markdown, stage_rows, tables
 from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.runner import Item, run_items
 from cosfly.settings import RunConfig
 from cosfly.stage_events import Event, read_events
-from cosfly.stage_folder import Manifest, Tally
-from cosfly.worker_pool import WORDS
+from cosfly.stage_folder import Manifest, Tally, read_manifest
+from cosfly.worker_pool import WORDS, Watch
 
 
 def event(at_s: float, kind: str, **fields) -> Event:
@@ -56,6 +57,40 @@ def test_the_picture_shows_a_worker_that_died():
     assert num_red(EVENTS) > 5000, "nine seconds of twenty"
     assert num_red([e for e in EVENTS if e.event not in WORDS]) == 0
     assert draw_events([], "nothing").startswith(b"\x89PNG")
+
+
+def bench_of(*rows) -> Bench:
+    about = {"seconds": 10.0, "cores_used": 1.5, "peak_memory_mib": 300.0, "noticed": 0, "recovered": 0, "retries": 0}
+    return Bench.model_validate({"stage": "render", "cores": 2, "rows": [about | row for row in rows]})
+
+
+def test_tables_are_those_of_the_paper():
+    """Two workers twice as fast; a run with a kill lost 30 frames and is the same in the end."""
+    bench = bench_of(
+        {"workers": 1, "attempted": 100, "successful": 100, "restarts": 0, "failed": 0},
+        {"workers": 2, "attempted": 200, "successful": 200, "restarts": 0, "failed": 0},
+        {"workers": 2, "attempted": 230, "successful": 200, "restarts": 1, "failed": 0, "fault": "kill", "planted": 1, "same_products": True},
+    )  # fmt: skip
+    scaling, faults, _ = tables(bench)
+    assert [dict(zip(scaling.head, row, strict=True))["speed-up"] for row in scaling.rows] == ["1.00x", "2.00x"]
+    last = dict(zip(faults.head, faults.rows[-1], strict=True))
+    assert (last["fault"], last["lost frames"], last["same"], last["restarts"]) == ("kill", "30", "yes", "1")
+    text = markdown(bench)
+    assert "| 2 | 10.0 | 200 | 200 | 20.00 | 2.00x |" in text
+    picture = cv2.imdecode(np.frombuffer(draw_scaling(bench), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert (picture == COLORS["worker_died"]).all(axis=2).sum() > 1000, "a bar of one restart"
+
+
+def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
+    """A worker dies after its third step: the item is done again, and the steps are told in the manifest and in the table of stages."""
+    items = [Item("a", "once-die", num_steps=3), Item("b", num_steps=3)]
+    folder = stage_in(tmp_path)
+    finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1, watch=Watch(heartbeat_s=0.2))
+    (tmp_path / "s/product").write_text("x")
+    folder.finish([tmp_path / "s/product"], finished.tally)
+    assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
+    (row,) = stage_rows(tmp_path, ["s", "t"])
+    assert (row.launches, row.restarts, row.modes) == (2, 1, {"worker_died": 1})
 
 
 def test_what_cannot_be_measured(tmp_path):

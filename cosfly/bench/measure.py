@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 
 from caption.teachers.teacher import EMBEDDED
 from cosfly.bench.faults import Faults, planted
-from cosfly.bench.picture import draw_events
+from cosfly.bench.picture import draw_events, draw_scaling
+from cosfly.bench.tables import Bench, Row, markdown, stage_rows
 from cosfly.errors import ConfigError, EnvironmentMissing, ResumeError
 from cosfly.pipeline import Stage, stages
 from cosfly.settings import RunConfig
@@ -30,46 +30,6 @@ SCHEMA, VERSION = "cosfly.bench", "1.0"
 STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that do items
 
 
-class Row(BaseModel):
-    """Figures of one run of the stage.
-
-    attempted: frames of render or items of another stage that were done, and those that were lost with a worker. recovered: items that were
-    lost and done in the end. attempts: how often the command had to be run. same_products: as without faults, byte for byte.
-    """
-
-    workers: int
-    fault: str = "none"
-    planted: int = 0
-    attempts: int = 1
-    seconds: float
-    attempted: int
-    successful: int
-    cores_used: float
-    peak_memory_mib: float
-    noticed: int
-    restarts: int
-    retries: int
-    recovered: int
-    failed: int
-    same_products: bool | None = None
-
-    @property
-    def per_s(self) -> float:
-        return self.successful / self.seconds
-
-
-class Bench(BaseModel):
-    """`bench.json`: one row for each count of workers, then one for each kind of fault."""
-
-    stage: str
-    cores: int
-    rows: list[Row]
-
-    @property
-    def counts_frames(self) -> bool:
-        return self.stage == "render"
-
-
 def run(
     cfg: RunConfig,
     run_folder: Path,
@@ -79,7 +39,8 @@ def run(
     faults: dict[str, int],
     seed: int = 0,
 ) -> Bench:
-    """Read a run up to `stage`, write `bench.json` and a picture of the events of each run; give what was measured.
+    """Read a run up to `stage`, write `bench.json`, its tables and figure, and a picture of the events of each run; give what was
+    measured.
 
     The stage's products are removed again. Faults are planted with the greatest number of workers.
 
@@ -111,6 +72,9 @@ def run(
             planned = Faults(kind, number, bench.rows[len(counts) - 1].seconds, seed)
             row, found = _measured(cfg, run_folder, out / kind, stage, counts[-1], planned)
             bench.rows.append(row.model_copy(update={"same_products": found == digests}))
+    bench.stages = stage_rows(run_folder, STAGES)
+    write_bytes(out / "bench.md", markdown(bench).encode())
+    write_bytes(out / "bench.png", draw_scaling(bench))
     write_model(out / "bench.json", bench, schema=SCHEMA, version=VERSION)
     return bench
 

@@ -1,14 +1,16 @@
-"""The events of a stage as a picture: what each worker did when, memory and cores below."""
+"""The events of a stage as a picture: what each worker did when, memory and cores below. And how it scales: speed, use, restarts."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from cosfly.bench.tables import Bench
 from cosfly.stage_events import Event
 from cosfly.topview import INK, PAPER, Color, draw_area, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.worker_pool import WORDS
 
 WIDTH_PX, LEFT_PX, RIGHT_PX, ROW_PX, TOP_PX, CURVE_PX = 1400, 110, 1370, 46, 84, 150
+PANEL_PX = (380, 230)  # width, height of each figure of `bench.png`
 FAINT: Color = (215, 215, 215)
 STARTING: Color = (225, 225, 225)
 COLORS: dict[str, Color] = {
@@ -99,6 +101,49 @@ def _draw_curve(picture, top: float, title: str, x: np.ndarray, values: np.ndarr
     draw_text(picture, "0", LEFT_PX - 8, bottom + 4, 0.45, align=1.0)
     if most:
         draw_line(picture, np.stack([x, bottom - CURVE_PX * values / most], axis=1), COLORS["kept"], 2)
+
+
+def draw_scaling(bench: Bench) -> bytes:
+    """Draw three panels: speed against that of one worker times their number, cores and memory, restarts of each run; PNG bytes."""
+    rows, (width, height) = bench.undisturbed, PANEL_PX
+    picture = np.full((height + 110, 3 * width + 160, 3), PAPER, dtype=np.uint8)
+    workers = np.array([row.workers for row in rows], dtype=np.float64)
+    speeds = np.array([row.per_s for row in rows])
+    ideal = speeds[0] / workers[0] * workers
+    unit = "frames/s" if bench.counts_frames else "items/s"
+    draw_text(picture, f"{bench.stage} on {bench.cores} cores", 20, 28, 0.65)
+    curves = (
+        (f"{unit}; faint: if it scaled", [(ideal, FAINT), (speeds, COLORS["kept"])]),
+        ("cores in use (blue), GiB (orange)", [(np.array([row.cores_used for row in rows]), COLORS["kept"]),
+                                               (np.array([row.peak_memory_mib / 1024 for row in rows]), COLORS["heartbeat_lost"])]),
+    )  # fmt: skip
+    for number, (title, lines) in enumerate(curves):
+        left, top = 60.0 + number * (width + 40), 64.0
+        draw_text(picture, title, left, top - 8, 0.5)
+        draw_line(picture, _box(left, top, left + width, top + height), INK, closed=True)
+        most = max(float(values.max(initial=0.0)) for values, _ in lines) or 1.0
+        draw_text(picture, f"{most:.3g}", left - 6, top + 10, 0.42, align=1.0)
+        x = left + 20 + (width - 40) * (workers - workers.min()) / max(float(np.ptp(workers)), 1.0)
+        for values, color in lines:
+            points = np.stack([x, top + height - (height - 12) * values / most], axis=1)
+            draw_line(picture, points, color, 2)
+            for point in points:
+                draw_dot(picture, point, 4, color)
+        for place, count in zip(x, workers, strict=True):
+            draw_text(picture, f"{count:.0f}", float(place), top + height + 18, 0.45, align=0.5)
+        draw_text(picture, "workers", left + width / 2, top + height + 36, 0.42, align=0.5)
+    left, top = 60.0 + 2 * (width + 40), 64.0
+    draw_text(picture, "restarts of each run", left, top - 8, 0.5)
+    draw_line(picture, _box(left, top, left + width, top + height), INK, closed=True)
+    most_restarts, step = max(1, *(row.restarts for row in bench.rows)), width / len(bench.rows)
+    for number, row in enumerate(bench.rows):
+        x, bar = left + number * step, (height - 40) * row.restarts / most_restarts
+        draw_area(picture, _box(x + 8, top + height - bar, x + step - 8, top + height), COLORS["worker_died"])
+        draw_text(picture, str(row.restarts), x + step / 2, top + height - bar - 6, 0.45, align=0.5)
+        name = f"{row.workers}" if row.fault == "none" else f"{row.workers}, {row.fault}"
+        draw_text(picture, name, x + step / 2, top + height + 18, 0.42, align=0.5)
+    draw_text(picture, "workers, planted faults", left + width / 2, top + height + 36, 0.42, align=0.5)
+    return png_bytes(picture)
 
 
 def _ticks(span_s: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from cosfly.cli import options
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from cosfly.bench.measure import Bench
+    from cosfly.bench.tables import Bench
 
 app = typer.Typer()
 
@@ -27,7 +27,7 @@ def bench(
     stalls: Annotated[int, typer.Option(min=0, help="Workers to stop, at random moments.")] = 1,
     overrides: options.Overrides = None,
 ) -> None:
-    """Measure a stage with one and more workers, and with planted faults: tables, bench.json, pictures of the events."""
+    """Measure a stage with one and more workers, and with planted faults: tables, bench.json, bench.md, bench.png, pictures of the events."""
     from cosfly.bench import measure
     from cosfly.console import console
 
@@ -40,40 +40,21 @@ def bench(
 
 
 def _tables(bench: Bench) -> list[Table]:
-    """Give the two tables: how the stage scales, and what became of the faults."""
+    """Give the tables for a terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    scaling = Table(
-        title=f"{bench.stage} on {bench.cores} cores", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    unit = "frames" if bench.counts_frames else "items"
-    for name in ("workers", "wall s", "attempted", "successful", f"{unit}/s", "speed-up", "cores", "MiB"):
-        scaling.add_column(name, justify="right")
-    faults = Table(title="faults", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in (
-        "workers",
-        "fault",
-        "planted",
-        "noticed",
-        "restarts",
-        "retries",
-        "saved",
-        "failed",
-        "runs",
-        "wall s",
-        "same",
-    ):
-        faults.add_column(name, justify="right")
-    for row in bench.rows:
-        if row.fault == "none":
-            counted = (f"{row.seconds:.1f}", str(row.attempted), str(row.successful))
-            speed = (f"{row.per_s:.2f}", f"{row.per_s / bench.rows[0].per_s:.2f}x")
-            scaling.add_row(str(row.workers), *counted, *speed, f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}")
-        noted = (row.planted, row.noticed, row.restarts, row.retries, row.recovered, row.failed, row.attempts)
-        same = {None: "-", True: "yes", False: "no"}[row.same_products]
-        faults.add_row(str(row.workers), row.fault, *map(str, noted), f"{row.seconds:.1f}", same)
-    return [scaling, faults]
+    from cosfly.bench.tables import tables
+
+    found = []
+    for title, head, rows in tables(bench):
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for number, name in enumerate(head):
+            table.add_column(name, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*row)
+        found.append(table)
+    return found
 
 
 def _counts(text: str) -> list[int]:
