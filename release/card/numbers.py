@@ -60,6 +60,7 @@ def count_shard(shard: Path) -> Counted:
     counted = Counted()
     for rows in row_lists(shard, COLUMNS):
         counted.add(rows)
+        del rows  # before the next ones are made
     return counted
 
 
@@ -82,7 +83,9 @@ def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]
                 raise InputError("a value is missing", where=where, got="null", expected=expected)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
+        del group
         yield rows
+        del rows
 
 
 def check_rows(shard: Path, rows: int) -> None:
