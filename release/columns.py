@@ -50,6 +50,7 @@ CAPTION_COLUMNS = (
 )  # fmt: skip
 ReleasedCaption = dict[str, Any]  # CAPTION_COLUMNS -> value
 PLACE = ("run", "town", "trajectory", "variant")  # what a flight is told from others by
+Place = tuple[str, str, str, str]
 SplitName = Literal["train", "validation", "test"]
 SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)  # as `datasets` shows them
 
@@ -234,3 +235,18 @@ def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:
     """Give the bytes of a picture in a row."""
     value = row[PICTURES[file].name]
     return value if file == "depth" else value["bytes"]
+
+
+# --- flights ----------------------------------------------------------------------------------------------------------
+
+
+def flight_spans(rows: pa.Table) -> list[tuple[Place, int, int]]:
+    """Give the rows that stand together by flight: its PLACE, its first row, and the one after its last."""
+    places: list[Place] = list(zip(*(rows.column(name).to_pylist() for name in PLACE), strict=True))
+    begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
+    return [(places[begin], begin, end) for begin, end in zip(begins, [*begins[1:], len(places)], strict=True)]
+
+
+def flight_name(place: Place) -> str:
+    """Give the name of a flight in the records."""
+    return "/".join(map(str, place))

@@ -232,8 +232,9 @@ def test_a_code_span_holds_a_text(text):
 
 
 def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
+    from release.package.config import ReleaseConfig
     from release.package.sources import Source
-    from release.package.stage import ReleaseConfig, run
+    from release.package.stage import run
 
     captions = caption(CaptionConfig(), tree, tmp_path / "caption")
     folder = run(ReleaseConfig(licence="mit"), [Source.of_files(tree, captions, inspection)], tmp_path / "release")

@@ -40,8 +40,8 @@ from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
 from distill.schema import SPLITS, open_split
 from release.package import stage as package
+from release.package.config import ReleaseConfig
 from release.package.sources import Source
-from release.package.stage import ReleaseConfig
 from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree

@@ -26,10 +26,11 @@ from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import Flight, find_flights, read_flight, write_flight
+from release.package.config import ReleaseConfig
 from release.package.depth import encoded
 from release.package.publishable import published, published_name
 from release.package.sources import Source
-from release.package.stage import ReleaseConfig, run
+from release.package.stage import run
 from release.record import ReleaseRecord, read_record
 from specimens import make_playback_tree
 
@@ -343,8 +344,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from test_release_build import split_cfg, source_of
-from release.package import stage
-stage.MB = 20_000  # many shards
+from release.package import config
+config.MB = 20_000  # many shards
 from release.package.stage import run
 run(split_cfg(), [source_of(Path({material!r}))], Path({out!r}), workers={workers})
 """
@@ -353,9 +354,9 @@ run(split_cfg(), [source_of(Path({material!r}))], Path({out!r}), workers={worker
 @pytest.mark.slow
 @pytest.mark.parametrize("has_failed_flight", [False, True])
 def test_ten_kills_leave_the_bytes_of_an_undisturbed_run(copy, tmp_path, monkeypatch, has_failed_flight):
-    from release.package import stage as package
+    from release.package import config
 
-    monkeypatch.setattr(package, "MB", 20_000)
+    monkeypatch.setattr(config, "MB", 20_000)
     whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
     assert len(read_record(whole / "release.json").shards) > 6
     picture = find_flights(copy / "tree")[9] / "frames_playback/frame_00005/rgb.png"
@@ -385,9 +386,10 @@ def test_ten_kills_leave_the_bytes_of_an_undisturbed_run(copy, tmp_path, monkeyp
 
 
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_path, monkeypatch):
+    from release.package import config
     from release.package import stage as package
 
-    monkeypatch.setattr(package, "MB", 20_000)
+    monkeypatch.setattr(config, "MB", 20_000)
     whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
     picture = find_flights(copy / "tree")[0] / "frames_playback/frame_00005/rgb.png"
     data = picture.read_bytes()

@@ -40,9 +40,10 @@ from cosfly.reading.files import sha256_file
 from cosfly.store import write_json
 from release.card.render import render_card, size_category
 from release.columns import SCALARS, Placed
+from release.package.config import ReleaseConfig
 from release.package.plan import plan_shards
 from release.package.sources import Source
-from release.package.stage import ReleaseConfig, run
+from release.package.stage import run
 from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_flight, make_playback_tree
@@ -442,7 +443,11 @@ def test_runs_of_the_same_town_are_told_apart_by_their_names(inputs, built, tmp_
     assert len(ids) == len(set(ids)) == 8 * (4 + 6)
     assert {i.partition("_Town")[0] for i in ids} == {"one", "two"}
     assert read_record(folder / "release.json").numbers.flights == 4 + 6
-    with pytest.raises(InputError, match=r"two flights have one name.*different names"):
+
+
+def test_two_runs_of_one_name_are_refused(inputs, tmp_path):
+    other = other_run(inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+    with pytest.raises(InputError, match=r"two runs have one name.*different names"):
         run(CFG, [source_of(inputs), source_of(other)], tmp_path / "r2")
 
 
@@ -704,9 +709,9 @@ def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
 
 def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
     """Parts that fill a shard are linked; the rows and their order are those of the copied shards."""
-    from release.package import stage as package
+    from release.package import config
 
-    monkeypatch.setattr(package, "MB", 1000)  # so that the specimen's small flights pass shard_mb
+    monkeypatch.setattr(config, "MB", 1000)  # so that the specimen's small flights pass shard_mb
     folder = build(inputs, tmp_path / "r")
     record = read_json(folder / "release.json")
     assert len(record["shards"]) == 4
@@ -715,12 +720,12 @@ def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
 
 
 def test_a_disk_without_links_gets_copies(inputs, built, tmp_path, monkeypatch):
-    from release.package import stage as package
+    from release.package import config
 
     def refuse(*args):
         raise OSError("no links here")
 
-    monkeypatch.setattr(package, "MB", 1000)
+    monkeypatch.setattr(config, "MB", 1000)
     linked = build(inputs, tmp_path / "linked")
     monkeypatch.setattr(os, "link", refuse)
     assert all_bytes(build(inputs, tmp_path / "copied")) == all_bytes(linked)

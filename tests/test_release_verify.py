@@ -28,8 +28,8 @@ from cosfly.products.playback import find_flights
 from cosfly.reading.documents import read_json
 from cosfly.settings import RunConfig
 from release.package import stage as package
+from release.package.config import ReleaseConfig
 from release.package.sources import Source
-from release.package.stage import ReleaseConfig
 from release.splits import split_groups
 from release.verify.findings import EXAMPLES, Findings
 from release.verify.verify import verify

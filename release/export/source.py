@@ -18,7 +18,7 @@ from cosfly.reading.arrays import png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
 from cosfly.store import inside
-from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, schema
+from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.depth import depth_of
 from release.record import DepthCoding, ReleaseRecord, read_record
 
@@ -154,13 +154,9 @@ def _unpacked_bytes(table: Any, k: int) -> int:
 def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: Any, num_bytes: int) -> None:
     """Note the flights of one row group, which may hold several."""
     with arrow_errors(shard):
-        rows = {name: group.column(name).to_pylist() for name in LIGHT}
-    if not len(group):
-        return
-    places: list[Place] = list(zip(*(rows[name] for name in PLACE), strict=True))
-    begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
-    for start, stop in zip(begins, [*begins[1:], len(places)], strict=True):
-        place = places[start]
+        rows = {name: group.column(name).to_pylist() for name in LIGHT if name not in PLACE}
+        spans = flight_spans(group)
+    for place, start, stop in spans:
         if not all(
             isinstance(part, str) and (PART.fullmatch(part) or (part == "" and n == 0)) for n, part in enumerate(place)
         ):
@@ -177,7 +173,7 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: A
         flight.frames.append(np.array(rows["frame_index"][start:stop], dtype=np.int32))
         flight.times.append(np.array(times, dtype=np.float64))
         flight.decisions += [decision or "" for decision in rows["decision"][start:stop]]
-        flight.num_bytes += num_bytes * (stop - start) // len(places)
+        flight.num_bytes += num_bytes * (stop - start) // len(group)
 
 
 def _check(flight: ReleasedRows, where: Path) -> None:

@@ -1,18 +1,24 @@
-"""Which flights stand in which shard. Decided before any is written, so that neither workers nor a kill change it."""
+"""What is released and which flights stand in which shard. Decided before any is written, so that neither workers nor a kill change it."""
 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
+from cosfly.stage_folder import StageFolder, Tally
 from release.columns import SPLIT_NAMES, SplitName
-from release.package.captions import FlightCaptions
+from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
+from release.package.config import ReleaseConfig
 from release.package.shards import FlightPart
-from release.package.survey import Placing, Surveyed, Tell
+from release.package.sources import Material, Source, choose_licence, gather, maps_of
+from release.package.survey import Placing, Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
+from release.package.wrong import Findings
+from release.record import ReleasedMap
 from release.subsample import select_frames
 
 
@@ -80,3 +86,92 @@ def shards_of(
             name = f"{split}-{number:05d}-{hashlib.sha256(named.encode()).hexdigest()[:12]}"
             shards.append(PlannedShard(name, split, parts, sum(entry[2] for entry in members)))
     return shards
+
+
+# --- the material ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that is decided before the first byte is written."""
+
+    flights: list[tuple[Surveyed, FlightCaptions, int, int]]
+    placings: dict[str, Placing]
+    shards: list[PlannedShard]
+    account: CaptionAccount
+    material: Material
+    left_out: Counter[str]
+    window_frames: int
+    maps: list[ReleasedMap]
+    licence: str
+
+
+def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> Plan:
+    """Look at all of the material, and decide what goes where.
+
+    Raises:
+        InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight. ConfigError: no licence.
+    """
+    findings = Findings(stage)
+    material = gather(sources, include_review=cfg.include_review, accept_unbound=cfg.unbound == "accept")
+    flights, walks, left_out = survey(material.candidates, cfg.tracks, findings.tell)
+    flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, findings.tell)
+    left_out = left_out + without_twin
+    check_alike(flights, findings.tell)
+    captions, account = _index(sources, material, flights, findings)
+    findings.check()
+    if not flights:
+        tally = Tally(input=len(material.candidates), dropped=left_out)
+        raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
+    sized = [
+        (
+            flight,
+            captions[flight.name],
+            *selected_bytes(flight, cfg.modalities, cfg.num_frames, account.window_frames, findings.tell),
+        )
+        for flight in flights
+    ]
+    findings.check()
+    placings = place_flights(flights, walks, cfg.split_by, cfg.fractions, cfg.split_seed)
+    maps = maps_of([flight.candidate for flight in flights])
+    return Plan(
+        flights=sized,
+        placings=placings,
+        shards=shards_of(sized, placings, cfg.shard_bytes),
+        account=account,
+        material=material,
+        left_out=left_out,
+        window_frames=account.window_frames,
+        maps=maps,
+        licence=choose_licence(cfg.licence, [(shown.town, shown.licence) for shown in maps]),
+    )
+
+
+def _index(
+    sources: list[Source], material: Material, flights: list[Surveyed], findings: Findings
+) -> tuple[dict[str, FlightCaptions], CaptionAccount]:
+    """Find the captions of each flight, by its name."""
+    total, found = CaptionAccount(), dict[str, FlightCaptions]()
+    for number, source in enumerate(sources):
+        own = _by_key([flight for flight in flights if flight.candidate.source == number])
+        others: set[FlightKey] = {one.key for one in material.candidates if one.source == number} - own.keys()
+        lengths = {key: min(flight.num_frames for flight in group) for key, group in own.items()}
+        captions, account = index_captions(source.captions, lengths, others, findings.tell)
+        for key, of_flight in captions.items():
+            if len(own[key]) > 1 and of_flight.count:
+                names = ", ".join(flight.name for flight in own[key])
+                what = "captions that may be of any of several flights"
+                findings.tell(
+                    names, InputError(what, where=source.captions, got=names, fix="release their trees apart")
+                )
+            found |= {flight.name: of_flight for flight in own[key]}
+        total = total + account
+    return found, total
+
+
+def _by_key(flights: list[Surveyed]) -> dict[FlightKey, list[Surveyed]]:
+    """Group flights by what their captions call them: of a tree with several towns of one name more than one."""
+    groups: dict[FlightKey, list[Surveyed]] = defaultdict(list)
+    for flight in flights:
+        groups[flight.candidate.key].append(flight)
+    return groups

@@ -117,8 +117,14 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
     """Read the inspections of the runs, and list their flights; of a tree without one all.
 
     Raises:
-        InputError: a file cannot be read, two flights cannot be told apart, or nobody says of which tree the captions were made.
+        InputError: a file cannot be read, two runs or flights cannot be told apart, or nobody says of which tree the captions were made.
     """
+    name, count = Counter(source.run for source in sources).most_common(1)[0]
+    if count > 1:  # rows and records know a run by its name alone
+        raise InputError(
+            "two runs have one name", got=f"{count} of {name}", expected="trees in folders of different names",
+            fix="rename the folder that one of the trees stands in",
+        )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
     found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []
     inspections: list[Inspection] = []

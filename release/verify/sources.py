@@ -19,7 +19,7 @@ from cosfly.products.places import Place, flight_ids
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table, read_row_group
-from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed
+from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed, flight_name, flight_spans
 from release.verify.rows import FlightRows, Row
 
 Pictures = dict[FrameFile, bytes | memoryview | None]
@@ -90,13 +90,8 @@ class Shards:
             with open_table(path, tree=self.folder) as table:
                 for group in range(table.num_row_groups):
                     places = read_row_group(path, table, group, list(PLACE))
-                    columns = [places.column(column).to_pylist() for column in PLACE]
-                    begin = 0
-                    flights = ["/".join(map(str, values)) for values in zip(*columns, strict=True)]
-                    for row, flight in enumerate([*flights, None]):
-                        if row and flight != flights[row - 1]:
-                            parts[flights[row - 1]].append((name, group, begin, row))
-                            begin = row
+                    for place, begin, end in flight_spans(places):
+                        parts[flight_name(place)].append((name, group, begin, end))
         entries = [Entry(name, tuple(own), sum(end - begin for *_, begin, end in own)) for name, own in parts.items()]
         return with_ids([entry for entry in entries if entry.name.count("/") == len(PLACE) - 1])
 
