@@ -19,16 +19,18 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from release_tampering import forge
 from test_release_export import TWO_SPLITS, make_release, rows_by_id
 from test_release_package import all_bytes
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.config import build as build_config
-from cosfly.errors import CosflyError, InputError, ResumeError
+from cosfly.errors import CosflyError, InputError, ResumeError, VerifyError
 from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
 from release.columns import PICTURES
 from release.get import remote as remotes
+from release.get import stage
 from release.get.choice import Choice
 from release.get.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
 from release.get.stage import NOT_ASKED_FOR
@@ -272,6 +274,64 @@ def test_a_finished_shard_is_not_fetched_again(dataset, tmp_path):
     assert all_bytes(found) == all_bytes(dataset)
 
 
+@pytest.mark.parametrize("ranges", ["http", "folder of fsspec"])
+def test_within_a_shard_it_goes_on_where_it_broke_off(ranges, dataset, tmp_path, monkeypatch):
+    shard = max(read_record(dataset / "release.json").shards, key=lambda shard: shard.bytes)
+    monkeypatch.setattr(stage, "CHUNK", shard.bytes // 10 + 1)
+    kind = HttpRemote if ranges == "http" else FsspecRemote
+    read, asked = kind.read, []
+
+    def breaks(self, name, start, length):
+        if name == shard.path and length == stage.CHUNK:
+            asked.append(start)
+            if len(asked) > 6:
+                raise InputError("the transfer broke")
+        return read(self, name, start, length)
+
+    with served(dataset) as (_, address):
+        address = address if ranges == "http" else f"local://{dataset}"
+        with monkeypatch.context() as broken:
+            broken.setattr(kind, "read", breaks)
+            with pytest.raises(InputError, match="could not be fetched"):
+                get(choice(), address, tmp_path / "out")
+        begun = tmp_path / f"out/parts/{Path(shard.path).name}.begun"
+        assert begun.stat().st_size == 6 * stage.CHUNK
+        begun.write_bytes(begun.read_bytes()[:-5])  # a kill in the middle of a write
+        asked_again: list[tuple[int, int]] = []
+
+        def counts(self, name, start, length):
+            if name == shard.path:
+                asked_again.append((start, length))
+            return read(self, name, start, length)
+
+        monkeypatch.setattr(kind, "read", counts)
+        found = get(choice(), address, tmp_path / "out")
+    assert all_bytes(found) == all_bytes(dataset)
+    assert (6 * stage.CHUNK - 5, stage.CHUNK) in asked_again
+    assert (0, stage.CHUNK) not in asked_again
+
+
+def test_bytes_of_another_shard_are_not_gone_on_with(dataset, tmp_path):
+    shard = read_record(dataset / "release.json").shards[0]
+    begun = tmp_path / f"out/parts/{Path(shard.path).name}.begun"
+    for first in (b"not of this shard", bytes(shard.bytes), bytes(shard.bytes + 7)):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        with pytest.raises(InputError, match="could not be fetched"):
+            get(choice(), _broken(dataset, tmp_path), tmp_path / "out")
+        begun.parent.mkdir(exist_ok=True)
+        begun.write_bytes(first)
+        found = get(choice(), str(dataset), tmp_path / "out", resume="force")
+        assert all_bytes(found) == all_bytes(dataset)
+
+
+def _broken(dataset: Path, tmp_path: Path) -> str:
+    """A copy whose shards are of another content."""
+    copy = shutil.copytree(dataset, tmp_path / "broken", dirs_exist_ok=True)
+    for path in (copy / "data").iterdir():
+        path.write_bytes(bytes(path.stat().st_size))
+    return str(copy)
+
+
 def test_a_transfer_that_breaks_is_tried_again(dataset, tmp_path):
     broken: set[str] = set()
 
@@ -423,6 +483,22 @@ def test_rows_of_a_part_that_are_not_those_of_the_record(dataset, tmp_path):
     ):
         get(choice(towns=["Town01"], modalities=["rgb"]), address, tmp_path / "out")
     assert "other rows than the record says" in (tmp_path / "out/failures.jsonl").read_text()
+
+
+def test_a_release_whose_rows_cannot_be_true_is_kept_if_asked(dataset, tmp_path, caplog):
+    def lie(rows):
+        rows[0]["visibility"] = 1.7
+
+    forged = forge(dataset, tmp_path / "forged", lie)
+    with pytest.raises(VerifyError, match="--findings accept"):
+        get(choice(), str(forged), tmp_path / "out")
+    assert not (tmp_path / "out/dataset").exists()
+    found = get(choice(), str(forged), tmp_path / "out", findings="accept")
+    assert all_bytes(found) == all_bytes(forged)
+    assert "does not verify" in caplog.text
+    told = json.loads((tmp_path / "out/findings.json").read_text())
+    assert not told["ok"]
+    assert any("visibility" in place for finding in told["findings"] for place in finding["examples"])
 
 
 def test_a_shard_of_garbage_is_an_error_of_one_line(dataset, tmp_path):

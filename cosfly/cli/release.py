@@ -223,6 +223,10 @@ def release_get(
     digest: Annotated[
         str | None, typer.Option(help="Content digest that the release must have, 12 characters of it or more.")
     ] = None,
+    findings: Annotated[
+        Literal["refuse", "accept"],
+        typer.Option(help="What rows say that cannot be true: refuse the release, or keep it and say so."),
+    ] = "refuse",
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     workers: options.Workers = None,
@@ -236,4 +240,5 @@ def release_get(
     cfg = options.resolve(config, overrides, {"workers": workers})
     asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}
     choice = build(Choice, {name: value for name, value in asked.items() if value}, "the options")
-    options.tell_product(get.run(choice, source, out, **options.manner(cfg, resume)), out, cfg)
+    product = get.run(choice, source, out, **options.manner(cfg, resume), findings=findings)
+    options.tell_product(product, out, cfg)

@@ -11,10 +11,13 @@ release, all that `cosfly release verify` finds in rows. The pictures of a shard
 from __future__ import annotations
 
 import hashlib
+import logging
+import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -22,13 +25,22 @@ from pydantic import BaseModel
 
 from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
-from cosfly.reading.files import sha256_file
+from cosfly.reading.files import open_file, sha256_file
 from cosfly.reading.tables import arrow_errors, open_stream, read_row_group, row_groups
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, result_of
-from cosfly.store import CHECKSUMS, atomic_file, atomic_folder, sha256_bytes, write_bytes
+from cosfly.store import (
+    CHECKSUMS,
+    atomic_file,
+    atomic_folder,
+    refuse_link,
+    sha256_bytes,
+    storage_errors,
+    write_bytes,
+    write_json,
+)
 from release.card.numbers import compute_numbers
-from release.columns import PLACE, SPLIT_NAMES, SplitName, schema
+from release.columns import PLACE, SPLIT_NAMES, SplitName, flight_name, flight_spans, schema
 from release.get.choice import RECORD, Choice, chosen_flights, fetch_record
 from release.get.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
 from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
@@ -43,6 +55,9 @@ from release.record import (
 )
 from release.verify.verify import verify
 
+log = logging.getLogger(__name__)
+
+Span = tuple[str, int, int]  # a flight, its first row in a row group, and the one after its last
 NOT_ASKED_FOR = "not asked for"
 ONE_FILE_EACH = ("README.md", "croissant.json", RECORD, CHECKSUMS)  # of a release that is taken whole
 
@@ -109,8 +124,8 @@ def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
             raise InputError(
                 "a shard with other rows", where=where, got=f"{table.metadata.num_rows}", expected=f"{shard.rows}"
             )
-        groups = [_names_in(table, k, where) for k in range(table.num_row_groups)]
-        flights = Counter(name for group in groups for name in group)
+        groups = [_spans_in(table, k, where) for k in range(table.num_row_groups)]
+        flights = _counted(groups)
         is_whole = wanted.names == found.names and flights.keys() <= plan.flights.keys()
         if not is_whole and flights.keys() & plan.flights.keys():
             return _write_part(table, groups, path, wanted, plan, where)
@@ -123,44 +138,49 @@ def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
     )
 
 
-def _names_in(table: pa.parquet.ParquetFile, k: int, where: str) -> list[str]:
-    """Give the flight of each row of a row group; reads these four columns alone."""
+def _spans_in(table: pa.parquet.ParquetFile, k: int, where: str) -> list[Span]:
+    """Give the flights of a row group, with their rows; reads the columns of their places alone."""
     group = read_row_group(where, table, k, list(PLACE))
     with arrow_errors(where):
-        return [
-            "/".join(map(str, place)) for place in zip(*(group.column(name).to_pylist() for name in PLACE), strict=True)
-        ]
+        return [(flight_name(place), begin, end) for place, begin, end in flight_spans(group)]
 
 
 def _write_part(
-    table: pa.parquet.ParquetFile, groups: list[list[str]], path: Path, wanted: pa.Schema, plan: _Plan, where: str
+    table: pa.parquet.ParquetFile, groups: list[list[Span]], path: Path, wanted: pa.Schema, plan: _Plan, where: str
 ) -> _Got:
     """Read the wanted rows and columns, and write them as a release does."""
-    flights: Counter[str] = Counter()
     captions = 0
     with atomic_file(path) as file, open_writer(file.name, wanted) as writer:
-        for k, names in enumerate(groups):
-            mask = [name in plan.flights for name in names]
+        for k, spans in enumerate(groups):
+            mask = [name in plan.flights for name, begin, end in spans for _ in range(begin, end)]
             if not any(mask):
                 continue
             rows = read_row_group(where, table, k, wanted.names)
             with arrow_errors(where):
                 rows = rows.filter(pa.array(mask)).select(wanted.names).replace_schema_metadata(wanted.metadata)
                 writer.write_table(rows, row_group_size=len(rows))
-            flights.update(name for name in names if name in plan.flights)
             captions += _captions(rows)
             advance(len(rows))
+    flights = {name: rows for name, rows in _counted(groups).items() if name in plan.flights}
     return _checked(
         _Got(
-            rows=flights.total(),
+            rows=sum(flights.values()),
             captions=captions,
-            flights=dict(flights),
+            flights=flights,
             bytes=path.stat().st_size,
             sha256=sha256_file(path),
         ),
         plan,
         where,
     )
+
+
+def _counted(groups: list[list[Span]]) -> Counter[str]:
+    """Count the rows of each flight, in the order in which they first stand."""
+    flights = Counter[str]()
+    for name, begin, end in (span for spans in groups for span in spans):
+        flights[name] += end - begin
+    return flights
 
 
 def _captions(rows: pa.Table) -> int:
@@ -179,22 +199,44 @@ def _checked(got: _Got, plan: _Plan, where: str) -> _Got:
 
 
 def _copy(remote: Remote, shard: Shard, path: Path) -> str:
-    """Copy a whole shard; give its sha256, which is the record's."""
+    """Copy a whole shard; give its sha256, which is the record's. One that was broken off goes on with the bytes that are here.
+
+    Raises:
+        InputError: bytes are not to be had; those that came stay. VerifyError: another sha256; none stay.
+    """
+    begun = path.with_name(f"{path.name}.begun")
+    refuse_link(begun)
+    here = begun.stat().st_size if begun.is_file() else 0
+    for first in dict.fromkeys(
+        (min(here, shard.bytes), 0)
+    ):  # where what is here is not of this shard, all of it comes anew
+        digest = _copy_from(first, remote, shard, begun)
+        if digest == shard.sha256:
+            os.replace(begun, path)
+            advance(shard.rows)
+            return digest
+    begun.unlink()
+    where = f"{remote.shown}/{shard.path}"
+    raise VerifyError("a shard is not the one of the record", where=where, got=digest, expected=shard.sha256)
+
+
+def _copy_from(first: int, remote: Remote, shard: Shard, begun: Path) -> str:
+    """Copy the bytes of a shard from `first` on behind those that are here; give the sha256 of all."""
     digest = hashlib.sha256()
-    with atomic_file(path) as file:
-        for start in range(0, shard.bytes, CHUNK):
-            data = remote.read(shard.path, start, min(CHUNK, shard.bytes - start))
-            digest.update(data)
-            file.write(data)
-            advance(0)
-        if digest.hexdigest() != shard.sha256:
-            raise VerifyError(
-                "a shard is not the one of the record",
-                where=f"{remote.shown}/{shard.path}",
-                got=digest.hexdigest(),
-                expected=shard.sha256,
-            )
-    advance(shard.rows)
+    with storage_errors(begun):
+        begun.parent.mkdir(parents=True, exist_ok=True)
+        with open(begun, "ab") as file:
+            file.truncate(first)
+            if first:
+                with open_file(begun) as known:
+                    digest = hashlib.file_digest(known, "sha256")
+            for start in range(first, shard.bytes, CHUNK):
+                data = remote.read(shard.path, start, min(CHUNK, shard.bytes - start))
+                digest.update(data)
+                file.write(data)
+                advance(0)
+            file.flush()
+            os.fsync(file.fileno())
     return digest.hexdigest()
 
 
@@ -209,8 +251,13 @@ def run(
     workers: int = 0,
     watch: Watch = Watch(),
     resume: Resume = "if-same",
+    findings: Literal["refuse", "accept"] = "refuse",
 ) -> Path:
-    """Fetch a release or a part of it from a folder or an address; give the folder that holds it."""
+    """Fetch a release or a part of it from a folder or an address; give the folder that holds it.
+
+    Args:
+        findings: of what `release verify` finds in its rows. accept: the release is kept as it is, and `findings.json` beside it says what.
+    """
     remote = open_remote(address)
     record, data = fetch_record(remote, choice.expected)
     flights = chosen_flights(record, choice)
@@ -254,11 +301,17 @@ def run(
             )  # fmt: skip
             write_records(folder, part_record(record, part, flights, modalities, named, taken, folder))
         report = verify(folder, level="rows", workers=0 if in_process else workers)
-        if not report.is_ok:
+        if not report.is_ok and findings == "refuse":
             raise VerifyError(
-                "what was fetched does not verify, so it is not kept", where=remote.shown, got=str(report)
-            )
-    stage.finish([dataset / name for name in ("README.md", RECORD, CHECKSUMS)], finished.tally, whole=is_whole)
+                "what was fetched does not verify, so it is not kept", where=remote.shown, got=str(report),
+                fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept (nothing is fetched again)",
+            )  # fmt: skip
+    outputs = [dataset / name for name in ("README.md", RECORD, CHECKSUMS)]
+    if not report.is_ok:
+        log.warning("%s is kept, and does not verify: %s", dataset, report)
+        write_json(out / "findings.json", report.as_json())
+        outputs.append(out / "findings.json")
+    stage.finish(outputs, finished.tally, whole=is_whole)
     shutil.rmtree(parts, ignore_errors=True)
     return dataset
 
