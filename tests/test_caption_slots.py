@@ -29,7 +29,6 @@ from caption.writing.slots import Slots, fact_table
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.errors import NothingKept
 from cosfly.products.captions import ACTIONS, Coc, Language, Parsed, read_captions
-from cosfly.products.sentences import _END, _ends_in
 from specimens import make_flight, make_playback_tree
 
 FACTS = Facts(
@@ -550,9 +549,3 @@ def test_the_rule_teacher_compares_where_the_targets_mean_and_last_step_agree(me
     )
     texts = [text for ways in describe(facts) for both in ways for text in both]
     assert any("{comparison:speed}" in text for text in texts) is is_compared
-
-
-@given(st.text(alphabet="ab. vs。！?\n0", max_size=20))
-def test_a_text_is_cut_alike_whichever_way_its_ends_are_found(text):
-    """Looking for the one mark that a text has is quicker than the pattern; a second mark goes through the pattern."""
-    assert _ends_in(text) == [match.end() for match in _END.finditer(text)]

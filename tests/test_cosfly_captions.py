@@ -22,6 +22,7 @@ from cosfly.products.captions import (
     read_captions,
     write_captions,
 )
+from cosfly.products.sentences import END, cut_sentences
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",
@@ -158,3 +159,19 @@ def test_a_glance_at_the_script_says_what_counting_says(text):
     num_han = sum("\u4e00" <= char <= "\u9fff" for char in bare)
     num_words, num_others = len(re.findall("[a-z]{2,}", bare)), bare.count("я")
     assert is_in_script(text, "zh") == (num_words + num_others <= num_han)
+
+
+PIECES = ["a", "b", "deg", "Max", "i.e", ". ", ".", "。", " ", "3", ".5", "\n", "!", "。 ", "\u3000", "x"]
+
+
+@given(st.lists(st.sampled_from(PIECES), max_size=12).map("".join))
+def test_texts_that_are_split_at_one_mark_are_cut_as_the_pattern_cuts_them(text):
+    pieces: list[str] = []
+    start = 0
+    for end in [*(match.end() for match in END.finditer(text)), len(text)]:
+        piece, start = text[start:end], end
+        if piece.strip():
+            pieces.append(piece)
+        elif pieces:
+            pieces[-1] += piece
+    assert cut_sentences(text) == tuple(pieces)
