@@ -124,6 +124,8 @@ SECOND_SET = Path(__file__).with_name(
     "prose_second.jsonl"
 )  # captions in the form of the gold set, by two further hands
 THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand that had seen no rule of the reader's
+# 40 in forty styles on flights of three maps, written before the rules were looked at: `q...` was read while rules were written, then `r...`.
+FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 
@@ -162,7 +164,16 @@ CASES = [
     Case("en", HOLD, H, "Neither the height nor, for practical purposes, the distance is changing.", ()),
     Case("en", FOLLOW, R, "For the second frame in a row the person is half hidden.", ()),
     Case("en", DIVE, "speed_up", "Our speed peaked at 6.1 m/s and has since halved to 3.1 m/s.", (("halved", "doubled"),)),
+    # ways
+    Case("en", FOLLOW, R, "The drone flew 5.4 m, and the walker covered 2.9 m.", (("5.4", "3.7"), ("2.9", "2.2"))),
+    Case("en", FOLLOW, R, "Our path length is 5.4 m, yet it ended only 5.2 m from where it began.", (("5.4", "2.2"), ("5.2", "3.6"))),
+    Case("zh", FOLLOW, R, "无人机一路飞了5.4米，行人走了2.9米。", (("5.4", "3.7"), ("2.9", "2.2"))),
+    Case("zh", FOLLOW, R, "离起点的直线距离是5.2米。", (("5.2", "3.6"), ("5.2", "27.7"))),
+    Case("en", FOLLOW, R, "In the last step the drone flew 1.7 m and the walker covered 0.7 m.", ()),
     # altitude
+    Case("en", FOLLOW, R, "The walker is 19.7 m off and 19.5 m beneath us.", (("19.5", "27.7"), ("19.5", "18.0"))),
+    Case("en", FOLLOW, R, "Our altitude rose from a low of 18.0 m.", (("18.0", "18.9"),)),
+    Case("zh", FOLLOW, R, "t3时高度蹿到19.6米，现在是20.4米。", (("19.6", "18.3"),)),
     Case("en", FOLLOW, R, "Flying height: 20.4 m, up 2.4 m on the first frame.", (("20.4", "17.4"), ("up", "down"))),
     Case("en", FOLLOW, R, "The aircraft keeps gaining height; it is 0.8 m higher than half a second ago.", (("gaining", "losing"), ("higher", "lower"), ("0.8", "2.8"))),
     Case("en", FOLLOW, R, "UAV climbing through 20.4 m AGL at about 1.6 m/s.", (("climbing", "descending"), ("20.4", "22.9"), ("1.6", "4.2"))),
@@ -170,6 +181,14 @@ CASES = [
     Case("en", HOLD, H, "The altitude has not budged from 25 m.", (("25", "28"),)),
     Case("en", HOLD, H, "The drone is neither climbing nor sinking.", (("neither climbing nor sinking", "climbing briskly"),)),
     # speeds
+    Case("en", FOLLOW, R, "I was going faster than she was: 3.4 metres a second as opposed to 1.4.", ()),
+    Case("en", FOLLOW, R, "The drone did 2.4 m/s for two steps, then 3.4 m/s.", ()),
+    Case("en", FOLLOW, R, "Our speed is 3.4 m/s, a shade faster than the walker's 1.4 m/s.", (("faster", "slower"),)),
+    Case("zh", FOLLOW, R, "无人机3.4米每秒，行人1.4米每秒，无人机较快。", (("较快", "较慢"),)),
+    Case("zh", FOLLOW, R, "无人机一步比一步快：2.0、2.4、2.9、3.4米每秒。", (("一步比一步快", "一步比一步慢"),)),
+    Case("en", FOLLOW, R, "She stood 52 px right of the cross hairs.", (("52 px right", "52 px left"),)),
+    Case("zh", FOLLOW, R, "目标在画面中心偏右52像素、偏上14像素处。", (("偏右", "偏左"),)),
+    Case("en", FOLLOW, R, "Therefore turning the nose to the right looks sensible.", (("right", "left"),)),
     Case("en", FOLLOW, R, "Our pace has picked up from 2.0 to 3.4 m/s while hers has stayed around 1.4 m/s.", (("picked up", "dropped"),), (("3.4", "2.4"), ("1.4", "2.8"))),
     Case("en", FOLLOW, R, "The quadcopter does 3.4 m/s, the pedestrian 1.4 m/s.", (("3.4", "2.0"), ("1.4", "3.4"), ("1.4", "0.7"))),
     Case("en", FOLLOW, R, "With 3.4 m/s the drone outruns its target, which makes no more than 1.4 m/s.", (("outruns", "lags behind"), ("3.4", "5.1"))),

@@ -45,7 +45,7 @@ class Beside:
         if numeral.unit == "deg" and self._is_of_person(token):
             self.used_sides.add(token)
             return 0, 0
-        if self.clause.has("move") and numeral.unit != "px":
+        if self.clause.has("move") and numeral.unit != "px" and token.value not in ("cw", "ccw"):
             return 0, 0
         if numeral.unit in ("px", "deg"):
             self.used_sides.add(token)

@@ -67,9 +67,15 @@ def _force(sentence: Sentence, clause: Clause, token: Token, *, is_plan: bool) -
         return "told"
     if clause.is_blocked(token.start, ("goal",)):
         return "aim"
-    if is_plan:
+    if is_plan or _is_praised(text, clause, token, language):
         return "directive"
     return "told" if clause.numerals or _TOLD[language].search(text, clause.start, clause.end) else "open"
+
+
+def _is_praised(text: str, clause: Clause, token: Token, language: str) -> bool:
+    if language == "en":
+        return _PRAISED["en"].match(text, token.end, clause.end) is not None
+    return _PRAISED["zh"].search(text, clause.start, token.start) is not None
 
 
 _IS_ATTRIBUTE = re.compile(
@@ -88,6 +94,11 @@ _TOLD = {
     "en": re.compile(r"\b(?:is|are|was|were|has|have|had|been|keeps|kept)\b|'s\b|'ve\b|'re\b"),
     "zh": re.compile(r"了|已|正|曾|刚|(?<!超|不|错)过(?!于|头|去|来)|(?<!接|顺|随)着|一直"),
 }
+# "bleeding off speed is wiser than turning": recommended after it is named; in Chinese before.
+_PRAISED = {
+    "en": re.compile(r"[^,;:]{0,20}\b(?:is|would be|seems|looks) (?:the |by far |surely )?(?:wiser?|wisest|better|best|right|safer|safest|prudent|sensible)\b(?! of)"),
+    "zh": re.compile(r"(?:正|最|更|很)适合"),
+}  # fmt: skip
 # "you have already let the nose go right": what was asked for once.
 _PERFECT = {
     "en": re.compile(r"(?:'ve|\bhas|\bhave|\bhad) (?:already |just |now )?(?!to\b|got\b)\w+"),
@@ -122,6 +133,8 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> bool:
     """
     asked = [one for one in said if one.force == "directive"] or [one for one in said if one.force == "aim"]
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
+    named = {one.action for one in asked if one.side}  # "turning the nose to the left": one turn, not two
+    asked = [one for one in asked if one.side or one.action not in named]
     if decision in _allowed(asked) or not any(_is_opposite(decision, one) for one in asked):
         return False
     sided = {one.action for one in said if one.side}

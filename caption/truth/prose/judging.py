@@ -7,6 +7,7 @@ from functools import lru_cache
 
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
+from caption.truth.prose.against_itself import compares_wrongly, goes_wrongly
 from caption.truth.prose.deciding import argues_against
 from caption.truth.prose.judging_numbers import NumberJudge
 from caption.truth.prose.judging_words import WordJudge
@@ -79,7 +80,9 @@ def _judge(name: str, text: str, form: Form, numbers: NumberJudge, words: WordJu
     is_proved, is_open = False, form.left_out
     for statement in form.statements:
         holds = numbers.holds(statement) if statement.kind in _NUMBERS else words.holds(statement)
-        if holds is False and statement.kind not in _NUMBERS and not statement.is_sure:
+        if compares_wrongly(statement, form, numbers) or goes_wrongly(statement, form, numbers):
+            holds = False
+        elif holds is False and statement.kind not in _NUMBERS and not statement.is_sure:
             holds = None
         if holds is None:
             is_open = True

@@ -6,6 +6,7 @@ import re
 
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import times_of
+from caption.truth.prose.lexicon import Token
 from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.statements import NOW
 
@@ -20,9 +21,14 @@ _ELSEWHERE = {
 }
 _LATER = {
     "en": re.compile(
-        r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since)\b|\|"
+        r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since|steps|frames)\b|\|"
     ),
     "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每|比|较|差|再|随|起|\|"),
+}
+# What goes on with another moment: "1.3 m/s for three steps, then 3.2".
+_THEN = {
+    "en": re.compile(r"[\s,;]*(?:and |but |only )?(?:then|before|afterwards?|later|until|followed)\b"),
+    "zh": re.compile(r"[\s,;]*(?:然后|随后|接着|后来|之后|再)"),
 }
 _PAST = re.compile(
     r"(?<!has )(?<!have )(?<!been )(?<!is )(?<!are )\b(?!cent(?:re|ere)d|occluded|\w*speed|need|indeed|exceed)\w{2,}ed\b|\b(?:went|came|rose|fell|flew|ran|shot|made|took)\b|了"
@@ -49,11 +55,11 @@ class Moments:
         after = following[0] if following else self.clause.end
         if _ELSEWHERE[self.language].search(self._without_todays(numeral)):
             return None
-        if _LATER[self.language].search(self.text, numeral.end, after):
+        if _LATER[self.language].search(self.text, numeral.end, after) or _THEN[self.language].match(self.text, after):
             return None
         for time in self.clause.of("time"):
-            if time.value == "until" and 0 <= numeral.start - time.end <= 1:
-                continue  # "已降到 17.8 米"
+            if _is_reached(time, numeral):
+                continue
             is_next = (bool(following) and time.end >= after - 2) or (
                 time.start >= numeral.end and time.value in ("since", "past")
             )
@@ -99,7 +105,9 @@ class Moments:
         times = times_of(self.clause)
         if len(times) != 1 or len(times[0][1]) != 1 or len(self._measured()) != 1:
             return None
-        if self.clause.has("time", *_SPANNING) or self.clause.has("link", "than", "from", "between"):
+        number = self._measured()[0]
+        spanning = [t for t in self.clause.of("time", *_SPANNING) if not _is_reached(t, number)]
+        if spanning or self.clause.has("link", "than", "from", "between"):
             return None
         return times[0][1][0]
 
@@ -117,11 +125,16 @@ class Moments:
         named = [
             (t, frames[0])
             for t, frames in times_of(self.clause)
-            if len(frames) == 1 and frames != (NOW,) and t.value not in _SPANS
+            if (len(frames) == 1 or t.value == "start") and frames != (NOW,) and t.value not in _SPANS
         ]
         before = [t.end for t in (*self.clause.of("time", "since"), *self.clause.of("link", "than"))]
         spans += [(frame, NOW) for t, frame in named if any(0 <= t.start - end <= 6 for end in before)]
         return spans[0] if len(set(spans)) == 1 and len(named) <= 1 else None
+
+
+def _is_reached(time: Token, numeral: Numeral) -> bool:
+    """Tell whether "up to" is to a number and not to a time: "已降到 17.8 米"."""
+    return time.value == "until" and 0 <= numeral.start - time.end <= 1
 
 
 def _reaches_now(clause: Clause) -> bool:
@@ -140,7 +153,7 @@ _TODAY = ("now", "window", "last_step", "last_second", "last", "last_s", "mean")
 _SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}
 _MOMENT_BEFORE = {
     "en": re.compile(r"(?:\bt(?P<frame>\d)|\b(?P<now>now|currently))\s*(?::|=|at|is|was|of|stands at|stood at|reads|read|about|only|just|a)*\s*$"),
-    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
+    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|一度|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
 }  # fmt: skip
 _MOMENT_AFTER = {
     "en": re.compile(r"\s*(?:(?:to the |to )?(?:left|right|high|low|up|down)\s+(?=at t|in t))?(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|~|→|,? ?t\d|(?:to|and)\b\s*(?:at )?t\d))|(?P<now>now|at present|currently)\b(?! than))"),

@@ -9,6 +9,11 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, cues_of, names_of, owner_of
 from caption.truth.prose.numerals import Numeral
 
+# "17.5 m beneath us", "19.1 m above the walker": how much higher the drone is.
+OVER_OTHER = re.compile(
+    r"\s*(?:straight |directly |right |vertically )?(?:above|over|below|beneath|under|underneath|higher than|lower than)"
+    r" (?:us|me|him|her(?! \w)|them|the (?:drone|aircraft|camera|craft|uav|walker|person|pedestrian|target|subject))\b(?!')"
+)
 _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
         "closer nearer farther further 近 远": ("distance", "slant"),
@@ -31,6 +36,8 @@ class Naming:
         in_brackets = self.text[: self.clause.start].endswith("(")
         if not named and (self.context.is_carried or (len(set(self.context.people)) == 2 and not in_brackets)):
             owner = ""
+        if numeral.unit == "m" and OVER_OTHER.match(self.text, numeral.end):
+            return ("height_over_target",), True
         cues = cues_of(self.sentence, self.clause, numeral, owner)
         if cues and not self.clause.has("who", "drone", "target") and cues[0].value in ("turn", "heading", "yaw_rate"):
             owner = ""

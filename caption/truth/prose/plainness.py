@@ -27,6 +27,9 @@ _RELATED = {
     "en": re.compile(r"\s*(?:-?hand side)?\s*of (?:our|its|his|hers?|him|them|us|it|their|that|this|the (?!image|frame|picture|cent|middle|cross|screen))"),
     "zh": re.compile(r"\s*(?:的)?一侧"),
 }  # fmt: skip
+_STANDS_AT = re.compile(
+    r"(?:stood|stands?|rests?|waits?)\b(?! still| there| motionless| idle| on the spot| in place|[.,;]|$)"
+)  # "stood 10 px right"
 _DONE = re.compile(r"了|着|已|正|在|中|持续|不断|逐")
 _TURNS = re.compile(
     r"\b(?:is|are|has|have|keeps?|comes?|turns?|turned|turning|rotates?|rotating|swings?|in progress|bend(?:s|ing)|curv(?:es|ing)|veer(?:s|ing))\b|在|正|已|了|着|转过|持续|每秒"
@@ -45,6 +48,7 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
         case "state":
             return (
                 found.word in ("walking", "standing")  # others are rarely met, or idioms: "running out"
+                and not _STANDS_AT.match(text, token.start)
                 and not clause.has("who", "scene")
                 and _has_subject(token, clause, language, found)
             )

@@ -25,7 +25,22 @@ _ALONE = re.compile(
 
 
 _WITH_ITSELF = re.compile(r"same|pace|equal|identical|一样|相同|一致")
-_BARE = ("更快", "更慢", "快", "慢", "略快", "略慢", "稍快", "稍慢", "快些", "慢些", "快一些", "慢一些")
+_BARE = (
+    "更快",
+    "更慢",
+    "快",
+    "慢",
+    "略快",
+    "略慢",
+    "稍快",
+    "稍慢",
+    "快些",
+    "慢些",
+    "快一些",
+    "慢一些",
+    "快一点",
+    "慢一点",
+)
 _DEGREE = re.compile(
     r"(?:略|稍|稍微|偏|明显|更|较)(?:偏)?(?:快|慢)(?!了|下|起|慢|快|速|步|走|飞)"
 )  # "行人明显更快": than the other one
@@ -50,8 +65,11 @@ def compared_speeds(sentence: Sentence, clause: Clause, context: Context, token:
         return None
     people = [t for t in clause.of("who", "drone", "target") if not _VERBS.fullmatch(sentence.text[t.start : t.end])]
     subjects, objects = [t for t in people if t.end <= token.start], [t for t in people if t.start >= token.end]
-    if sentence.language == "zh" and text in _BARE and not objects and not clause.has("link", "than"):
-        return _of_subject(subjects, context) if _DEGREE.search(sentence.text, clause.start, token.end) else None
+    thans = [t for t in clause.of("link", "than") if t.end != token.start]  # "较慢" names nobody
+    if sentence.language == "zh" and text in _BARE and not objects and not thans:
+        both = {"drone", "target"} <= {*context.people, *(t.value for t in subjects)}
+        is_of_two = _DEGREE.search(sentence.text, clause.start, token.end) or (both and text.endswith(("些", "一点")))
+        return _of_subject(subjects, context) if is_of_two else None
     if (
         sentence.language == "en"
         and token.value != "matching"

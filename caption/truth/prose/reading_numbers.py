@@ -12,7 +12,6 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     OVERALL,
     Context,
-    crossing,
     is_wide,
     times_of,
 )
@@ -22,24 +21,17 @@ from caption.truth.prose.reading_ratios import ratio_statement
 from caption.truth.prose.statements import NOW, Mode, Statement
 from caption.truth.prose.sureness import Sureness
 from caption.truth.prose.timing import MEASURED, Timing
+from caption.truth.prose.units import Units
 from caption.truth.prose.versus import owners_behind
-
-_IMPLIED = {
-    "speed": "mps", "distance": "m", "range": "m", "slant": "m", "altitude": "m", "over": "m", "yaw": "deg", "heading": "deg", "pitch": "deg",
-    "depression": "deg", "bearing": "deg", "box": "px", "width": "px", "tall": "px", "centre": "px", "climb_rate": "mps",
-    "yaw_rate": "dps", "travelled": "m", "displacement": "m", "target_heading": "deg",
-}  # fmt: skip
-
+from caption.truth.prose.ways import WAYS, Ways
 
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
 _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最")
 # A turn that is told from the window's start: its sum.
 _FROM_START = re.compile(
-    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it \w+ at t0)\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
+    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
-_AT_PACE = re.compile(r"(?:\b(?:at|doing|does|do|did|making|makes|our|their|his|her)|\w's|只有|为|是|有) ?$")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
-_WAYS = {"travelled", "displacement", "target_travelled"}
 
 
 class NumberReader:
@@ -55,11 +47,12 @@ class NumberReader:
         self.changing = Changing(sentence, clause, context)
         self.beside = Beside(sentence, clause, context, in_scene=in_scene)
         self.sureness = Sureness(sentence, clause, context)
+        self.ways, self.units = Ways(sentence, clause, self.sureness), Units(sentence, clause, context)
 
     def read(self) -> None:
         groups: dict[int, list[int]] = {}
         for i in self.clause.numerals:
-            numeral = self._with_unit(self.sentence.numerals[i])
+            numeral = self.units.with_unit(self.sentence.numerals[i])
             self.sentence.numerals[i] = numeral
             if numeral.unit not in ("s", "frames"):
                 groups.setdefault(numeral.group, []).append(i)
@@ -93,54 +86,6 @@ class NumberReader:
                     hedge=self.beside.hedge(a),
                 )
             )
-
-    def _with_unit(self, numeral: Numeral) -> Numeral:
-        """A number without a unit has that of the quantity right before it."""
-        if numeral.unit == "m" and self._is_per_second():
-            return replace(numeral, unit="")
-        if numeral.unit or numeral.whole is None or self.clause.has("quantity", "ratio"):
-            return numeral
-        earlier = [n for n in self.sentence.numerals if n.start < numeral.start and n.unit in MEASURED]
-        is_told = times_of(self.clause) or self.clause.has("time", "mean", "max", "min")
-        if earlier and is_told and not self.clause.has("quantity") and self._num_told() == 1:
-            return replace(numeral, unit=earlier[-1].unit, factor=earlier[-1].factor)
-        if earlier and earlier[-1].unit == "mps" and numeral.fraction is not None and self._is_pace(numeral):
-            return replace(numeral, unit="mps", factor=earlier[-1].factor)
-        near = [t for t in self.clause.of("quantity") if t.end <= numeral.start and t.value in _IMPLIED]
-        if (
-            not near
-            or numeral.start - near[-1].end > 12
-            or crossing(self.sentence, self.clause, near[-1], numeral.start, numeral.end)
-        ):
-            return numeral
-        if (
-            numeral.fraction is None
-            and near[-1].value in ("yaw", "centre", "box", "travelled", "speed")
-            and "=" not in self.text[near[-1].start : numeral.start]
-        ):
-            return numeral
-        return replace(numeral, unit=_IMPLIED[near[-1].value])
-
-    def _is_pace(self, numeral: Numeral) -> bool:
-        """ "and the walker crawls at 1.28", "而行人只有 0.62": a speed after one with its unit."""
-        people = self.clause.of("who", "drone", "target")
-        named = any(t.end <= numeral.start for t in people) or (not people and self.context.subject)
-        bare = [n for n in map(self.sentence.numerals.__getitem__, self.clause.numerals) if not n.unit]
-        alone = not self.clause.has("quantity") and len(bare) == 1
-        return bool(named) and alone and _AT_PACE.search(self.text, self.clause.start, numeral.start) is not None
-
-    def _is_per_second(self) -> bool:
-        """ "每秒 0.4 米,后又提到 1.2 米": a length that may be a speed."""
-        earlier = any(
-            "每秒" in self.text[max(0, n.start - 4) : n.start] for n in self.sentence.numerals if n.unit == "mps"
-        )
-        is_way = self.clause.has("time", "window") or not all(
-            t.value == "travelled" for t in self.clause.of("quantity")
-        )
-        return earlier and not is_way  # "他只走 1.59 米" goes on about paces
-
-    def _num_told(self) -> int:
-        return sum(self.sentence.numerals[i].unit not in ("s", "frames") for i in self.clause.numerals)
 
     def _read_group(self, members: list[int]) -> None:
         numerals = [self.sentence.numerals[i] for i in members]
@@ -235,7 +180,7 @@ class NumberReader:
     def _change(self, numeral: Numeral, names: tuple[str, ...]) -> tuple[tuple[str, ...], Mode, int]:
         """Say of what a number is, whether it is a change, and which way."""
         mode, trend = self.changing.change(numeral)
-        if names and set(names) <= _WAYS and mode != "value" and not self.changing.is_partial():
+        if names and set(names) <= WAYS and mode != "value" and not self.changing.is_partial():
             mode, trend = "value", 0
         if numeral.unit == "mps" and self.naming.differs_by(numeral):
             names, mode, trend = (*names, "speed_difference", "difference_mean"), "either", 0
@@ -247,7 +192,9 @@ class NumberReader:
             s = replace(s, mode="change", frames=None)  # "has bent left by 45 degrees"
         if set(s.names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
             s = replace(s, names=("target_turn",))
-        is_total = s.side and "yaw" in s.names and not self.clause.has("who", "target")
+        is_total = (
+            (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not self.clause.has("who", "target")
+        )
         if not is_total or not _FROM_START.search(self.text, self.clause.start, self.clause.end):
             return s
         named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]
@@ -262,10 +209,14 @@ class NumberReader:
         is_length = (
             numeral.unit == "m" and is_bare and self.clause.has("quantity") and not self.sureness.is_in_group(numeral)
         )
-        if set(s.names) <= _WAYS and not self.sureness.owner(numeral):
+        if set(s.names) <= WAYS and not self.sureness.owner(numeral):
             is_length = False  # of somebody who is not known to have been named
-        if is_length and s.names and set(s.names) <= _WAYS and (end := self.timing.end_of_all()):
+        if is_length and s.names and set(s.names) <= WAYS and (end := self.ways.end_of_all()):
             return replace(s, sure_names=s.sure_names or s.names, sure_frames=end, sure_mode="value")
+        if is_bare and (ways := self.ways.whole_way(numeral, s.names)):
+            return replace(s, names=s.names or ways, sure_names=ways, sure_frames=(NOW,), sure_mode="value")
+        if s.names and set(s.names) <= WAYS and self.ways.tells_part():
+            return replace(s, sure_frames=None, sure_mode="either")  # "in the last step the drone flew 1.7 m"
         if not s.sure_names and (s.sure_mode == "change" or is_length):
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:

@@ -13,17 +13,18 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import GOES_TO, OBJECTS, Context, names_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.moments import Moments
+from caption.truth.prose.naming import OVER_OTHER
 from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.statements import NOW, Mode
 from caption.truth.prose.versus import pairs_of_speeds
 
 _LINK = {
-    "en": re.compile(r"(?:[\s:=]|\bat t\d|\(t\d\)|is|was|are|of|at|now|currently|today|reads|stands|sits|holds|remains|stays|keeps|just|only|near|a mere|merely|still|a|an|steady|unchanged|constant|to (?:the )?(?:target|walker|subject|pedestrian|person|him|her|them)\b|(?:about|roughly|around|approximately|some|almost|nearly|exactly|again|back|down|up|to)\b)*"),
-    "zh": re.compile(r"(?:[\s:=]|t\d时?|为|是|仅|现|约|大约|只有|还有|仍有|目前|当前|现在|已|稳定|保持|维持|恒定|在|仍|有|达|到|回|升|降|至|了)*"),
+    "en": re.compile(r"(?:[\s:=]|\bat t\d|\(t\d\)|is|was|are|of|at|now|currently|today|reads|stands|sits|holds|remains|stays|keeps|just|only|near|a mere|merely|still|a|an|steady|unchanged|constant|to (?:the )?(?:target|walker|subject|pedestrian|person|him|her|them)\b|(?:about|roughly|around|approximately|some|almost|nearly|exactly|again|back|down|up|to|throughout|all along|on the ground|over ground|along the ground)\b)*"),
+    "zh": re.compile(r"(?:[\s:=]|t\d时?|为|是|仅|现|约|大约|只有|还有|仍有|目前|当前|现在|已|稳定|保持|维持|恒定|在|仍|有|达|到|回|升|降|至|了|一路|始终|一直|全程|均|都)*"),
 }  # fmt: skip
 _BEHIND = re.compile(r"\s*(?:of (?:the |our )?)?")  # "20.5 m of ground distance", "16 m flown"
 _OFF_TO = re.compile(
-    r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er))\b"
+    r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er)|axis|cross ?hairs?|reticle|midline)\b"
 )
 _DOES = re.compile(
     r"\s*(?:is )?(?:doing|does|do|did|makes?|making|moves? at|moving at|fl(?:y|ies|ying) at|goes at|going at|walks? at|walking at|on)?\s*(?:about |only |just |a mere |some |still )*"
@@ -33,8 +34,8 @@ _GENITIVE = re.compile(
 )
 # What a clause without a subject begins with when it goes on about the last one: "but is back to 3.2 m/s", "当前 2.3 米/秒".
 _GOES_ON = {
-    "en": re.compile(r"(?:[\s,=:]|and|but|yet|now|currently|still|is|has|at|about|roughly|only|just|back|down|up|to|doing|making|going|moving|flying|walking|slowed|dropped|fallen|risen|settled|presently|today|then|holding|steady|which|that|speed|a|mere|lazy|it)*"),
-    "zh": re.compile(r"(?:[\s,=:]|现在?|当前|目前|如今|此刻|已|仍|还|只|有|仅|达|约|为|是|回|升|降|落|减|增|到|至|速度|步速|了)*"),
+    "en": re.compile(r"(?:[\s,=:]|and|but|yet|now|currently|still|is|has|at|about|roughly|only|just|back|down|up|to|doing|making|going|moving|flying|walking|slowed|dropped|fallen|risen|settled|presently|today|then|holding|steady|which|that|speed|a|mere|lazy|it|earlier|before|previously|once|at first|initially|having|been|as low as|as high as)*"),
+    "zh": re.compile(r"(?:[\s,=:]|却|现在?|当前|目前|如今|此刻|已|仍|还|只|有|仅|达|约|为|是|回|升|降|落|减|增|到|至|速度|步速|了|起初|先前|之前|此前|原先|一开始|开头|曾)*"),
 }  # fmt: skip
 _ITS_OWN = re.compile(r"\s*(?:for|by|of) (?:the |our )?|\s*\((?:the )?")  # "1.1 m/s for us", "1.2 m/s (walker)"
 _OWNS = re.compile(r"[^,;)]{0,12}#")  # "(the walker 1.3 m/s)" is about another number
@@ -94,6 +95,8 @@ class Sureness:
         if numeral.unit == "px" and numeral.side and not self.clause.has("quantity", "box", "width", "tall", "height"):
             return ("offset_x",)
         cues = self._cues(numeral)
+        if numeral.unit == "m" and OVER_OTHER.match(self.text, numeral.end):
+            return ("height_over_target",)
         if numeral.unit == "mps" and not cues:
             return self._speeds(numeral)
         cues = cues or self._gone_on_about(numeral)
@@ -137,10 +140,19 @@ class Sureness:
     def is_in_group(self, numeral: Numeral) -> bool:
         """Tell whether numbers stand in a row, whose quantities may stand in one too: "height and range: 20 m and 21 m"."""
         row = [n for n in self.sentence.numerals if n.group == numeral.group]
+        if numeral.unit == "px" and all(_SIDED.search(self.text, 0, n.start) for n in row):
+            return False  # "偏右 12 像素、偏下 19 像素"
+        if len(row) > 1 and all(self._has_own_word(n) for n in row):
+            return False  # "12.0 m up, 9.5 m away"
         after = MORE_THAN.match(self.text, row[-1].end) if self.language == "en" and len(row) == 2 else None
         if after and after["than"]:
             return False  # "20.0 m, 1.2 m lower than at t3"
         return len(row) > 1 or any(numeral in pair for pair in self.pairs)
+
+    def _has_own_word(self, numeral: Numeral) -> bool:
+        return any(
+            numeral.start < t.start <= numeral.end + 1 and t.end > numeral.end for t in self.clause.of("quantity")
+        )
 
     def _cues(self, numeral: Numeral) -> set[str]:
         """Give the quantities right beside a number, else those of which its clause speaks."""
@@ -152,7 +164,9 @@ class Sureness:
         near = [t for t in tokens if t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)]
         near += [t for t in tokens if t.start >= numeral.end and _BEHIND.fullmatch(self.text, numeral.end, t.start)]
         if near:
-            return {t.value for t in near}
+            found = {t.value for t in near}
+            from_start = self.clause.has("quantity", "displacement") and found <= {"slant", "distance"}
+            return {"displacement"} if from_start else found  # "离起点的直线距离"
         told = [
             t
             for t in self.clause.tokens
@@ -201,6 +215,8 @@ class Sureness:
             if any(_GENITIVE.fullmatch(self.text, who.end, t.start) for t in quantities if who.end <= t.start):
                 return who.value
             is_subject = who.end <= numeral.start and self.text[who.start : who.end] not in OBJECTS
+            if is_subject and _COMPARED.search(self.text, 0, who.start) and ":" in self.text[who.end : numeral.start]:
+                continue  # "faster than she was: 4.3 m/s"
             if is_subject and any(
                 pattern.fullmatch(self.text, who.end, numeral.start) for pattern in (_GENITIVE, link, _DOES)
             ):
@@ -228,8 +244,17 @@ class Sureness:
             return ""
         if self.context.cue not in ("", "speed") or self.context.told not in ("", "speed"):
             return ""
-        goes_on = _GOES_ON[self.language].fullmatch(self.text, self.clause.start, numeral.start)
-        return self.context.subject if goes_on and len(set(self.context.people)) == 1 else ""
+        return self.gone_on_by(numeral)
+
+    def gone_on_by(self, numeral: Numeral) -> str:
+        """Give the only one of whom the sentence speaks, where a clause only goes on about them: "but is only 3 m from its start"."""
+        quantity = next((t for t in self.clause.of("quantity", "displacement") if t.end <= numeral.start), None)
+        at = self.clause.start  # "..., 净位移却仅 1.7 米": it begins with the quantity
+        if quantity is not None and _GOES_ON[self.language].fullmatch(self.text, at, quantity.start):
+            at = quantity.end
+        goes_on = _GOES_ON[self.language].fullmatch(self.text, at, numeral.start)
+        is_alone = len(set(self.context.people)) == 1 and not self.context.is_carried
+        return self.context.subject if goes_on and is_alone else ""
 
     def _opens(self, who: Token) -> bool:
         """Tell whether a clause begins with somebody, times and conjunctions aside."""
@@ -312,6 +337,8 @@ class Sureness:
         return self._follows_trend(numeral)
 
 
+_SIDED = re.compile(r"[左右上下](?:方|侧|边|偏|移)?\s*$")
+_COMPARED = re.compile(r"\b(?:than|as) (?:the )?$|比$")
 _DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|[,;(]\s*that is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
 _ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")
 _REACHED = re.compile(r"[到至]了[约近]?\s*$")

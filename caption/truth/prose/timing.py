@@ -17,16 +17,6 @@ _AT = re.compile(r"[\s,]*(?:at|in|during|for|on|of)?\s*(?:the )?")
 _PRESENT = {"en": re.compile(r"\b(?:is|are|has|have|reads|stands|sits)\b|'s\b"), "zh": re.compile(r"已|现|为止")}
 
 
-# The whole of what was seen, where ways are told.
-_IN_ALL = {
-    "en": re.compile(
-        r"\b(?:altogether|all told|in all|in total|overall|so far|since (?:t0|the start)|from t0 to (?:t(?P<last>\d)|now)"
-        r"|(?:in|over|across|during|throughout) (?:the )?(?:(?:whole|entire|full) \w+|two seconds|window))\b"
-    ),
-    "zh": re.compile(r"从?t0[到至]t(?P<last>\d)|一共|总共|共[飞走]|全程|累计|合计|总计|两秒|全窗|整个窗口|从头到尾"),
-}
-
-
 class Timing:
     """The times of one clause."""
 
@@ -82,16 +72,6 @@ class Timing:
             if nearest.start == numeral.start and not any(0 <= time.start - t.end <= 5 for t in spans):
                 return frames
         return None
-
-    def end_of_all(self) -> tuple[int, ...] | None:
-        """Give the last frame of a way that is told from the window's start: "from t0 to t4 she walked 2.0 m", "一共飞了 8.3 米"."""
-        words = _IN_ALL[self.language].search(self.text, self.clause.start, self.clause.end)
-        inside = {frames for _, frames in times_of(self.clause)} - {(0,), (0, 1), (NOW,)}
-        is_alone = sum(self.sentence.numerals[i].unit == "m" for i in self.clause.numerals) == 1
-        if words is None or not is_alone or self.clause.has("time", "last_step", "last_second"):
-            return None
-        last = (int(words["last"]),) if words["last"] else (NOW,)
-        return None if inside - {last} else last
 
     def _is_present(self) -> bool:
         return _PRESENT[self.language].search(self.text, self.clause.start, self.clause.end) is not None
