@@ -237,17 +237,24 @@ def _not_as_recorded(where: Path, wrong: list[str]) -> VerifyError:
 
 
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
-    """See that what an input was made of, where it is given too, is what is given."""
+    """See that what an input was made of, where it is given too, is what is given: of several, as playback trees, one of them."""
     begun = _record_of(path)
     if begun is None:
         return
     front = name.rpartition(".")[0]
     peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == front}
-    for made_of, record in begun.inputs.items():
-        peer = peers.get(_role(made_of), name)
-        if peer != name and record.sha256 not in _lineage(inputs[peer], found[peer].sha256):
+    made_of: dict[str, list[tuple[str, StageInput]]] = {}  # role -> the inputs of that role
+    for other, record in begun.inputs.items():
+        made_of.setdefault(_role(other), []).append((other, record))
+    for role, records in made_of.items():
+        peer = peers.get(role, name)
+        if peer == name:
+            continue
+        lineage = _lineage(inputs[peer], found[peer].sha256)
+        if not any(record.sha256 in lineage for _, record in records):
+            wanted, record = records[0]
             raise VerifyError(
-                f"it was made of another input {made_of!r} than the one given with it", where=path,
+                f"it was made of another input {wanted!r} than the one given with it", where=path,
                 got=f"given: {inputs[peer]}", expected=f"{record.path}, as it was then",
                 fix=f"give the two that belong together, or make {path.name} again",
             )  # fmt: skip
