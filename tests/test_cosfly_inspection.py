@@ -20,7 +20,9 @@ from cosfly.geometry import mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
 from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region
+from cosfly.inspection.jumps import Jumps
 from cosfly.inspection.others import check_others, others_told
+from cosfly.inspection.pixels import unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.issues import Issue, Report
@@ -420,6 +422,25 @@ def test_a_planted_defect_puts_a_flight_before_a_person(workplace, defect):
         for c in codes_of(found, Path(f.folder))
     }
     assert code not in others
+
+
+@pytest.mark.parametrize(("airs", "is_found"), [(("sun",) * 4, True), (("sun", "sun", "rain", "rain"), False)])
+def test_brightness_may_change_with_the_weather(workplace, airs, is_found):
+    """The third frame is lighter than the one before; the fourth is so too."""
+    flight = read_flight(first_flight(workplace))
+    jumps, report = Jumps(flight), Report()
+    for i, air in enumerate(airs):
+        files = {
+            name: (flight.frame_folder(i) / name).read_bytes() for name in ("rgb.png", "depth.npy", "instance.png")
+        }
+        picture = unpack(files, Path("frame"))
+        if i >= 2:
+            picture = replace(picture, colours=np.minimum(picture.colours, 215) + np.uint8(40))
+        jumps.see(i, picture, air)
+    assert jumps.judge(CFG, report) == 3
+    assert [(issue.code, frame_name(2) in issue.where) for issue in report.issues] == [
+        ("temporal_jump", True)
+    ] * is_found
 
 
 def test_a_time_that_nobody_planned(workplace):

@@ -100,7 +100,7 @@ def check_frames(
         _check_surfaces(look, where, cfg, report)
         if picture.depth.size and _check_depth(picture.depth, where, numbers, report):
             meta = metas.get(i)
-            jumps.see(i, picture, None if meta is None else meta.look)
+            jumps.see(i, picture, None if meta is None else meta.weather or meta.look)
             if picture.instance.size:
                 _check_mask(flight, i, picture, look, left_out, cfg.mask_visibility_min, numbers, report)
     numbers.num_compared = jumps.judge(cfg, report)

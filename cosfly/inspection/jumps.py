@@ -4,7 +4,6 @@ comes out otherwise than the poses say is a jump: something vanished, another pi
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,13 +28,13 @@ class Jumps:
     """Compares each frame with the one before; colours only where both were drawn in the same light and air (`air`)."""
 
     flight: Flight
-    _before: tuple[int, View, Hashable] | None = None
+    _before: tuple[int, View, object] | None = None
     _frames: list[int] = field(default_factory=list)
     _found: list[Agreement] = field(default_factory=list)
     _same_air: list[bool] = field(default_factory=list)
 
-    def see(self, i: int, picture: Picture, air: Hashable) -> None:
-        """Take the next frame, which has depth."""
+    def see(self, i: int, picture: Picture, air: object) -> None:
+        """Take the next frame, which has depth; air: what it was drawn in, anything that compares."""
         flight = self.flight
         pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
         rows = picture.colours[grid_rows(picture.colours.shape[0])]
