@@ -323,7 +323,7 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
 def _records(root: Path) -> None:
     (root / "sky.yaml").write_text(
         "presets:\n  sleet: {cloudiness: 90, precipitation: 40.5, fog_density: 20, fog_distance: 25}\n"
-        "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 1.2e1}\n"
+        "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 12.5}\n"
     )
     (root / "run.yaml").write_text(
         "name: a\nseed: 3\npedestrians: {num_paths: 3}\ncaption:\n  teacher: http://host/v1\n  window: {num_frames: 5}\nrelease: {licence: cc-by-4.0}\n"
