@@ -229,6 +229,38 @@ def test_depth_is_exact_far_from_the_world_origin(renderer_name):
     assert np.abs(frame.depth - depth)[inner].max() < DEPTH_TOLERANCE_M
 
 
+FAR_OFF_M = np.array([50_000.137, -50_000.291, 0.0])  # no whole numbers, which single precision holds exactly
+
+
+@pytest.mark.parametrize("offset_m", [np.zeros(3), FAR_OFF_M], ids=["here", "fifty_km"])
+@pytest.mark.parametrize(("least_m", "most_m", "bound_m"), [(25.0, 35.0, 0.0002), (450.0, 550.0, 0.001)])
+def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(least_m, most_m, bound_m, offset_m):
+    """At 30 m and at 500 m, on slanted faces too; and where the map reaches to a box a hundred kilometres off."""
+    near = [(least_m + 5.37, 12.3 * k, 3.1) for k in range(-2, 3)]
+    far = [(k, y, 10.0) for k, y in ((most_m - 50.0, -80.0), (most_m - 45.0, 0.0), (most_m - 60.0, 90.0))]
+    centers = np.array([*near, *far, (0.0, 0.0, -0.5)]) + offset_m
+    centers = np.vstack([centers, -offset_m])  # the middle of the map, and its origin, lie far from the flight
+    halves = [(1.5, 4.0, 4.0)] * len(near) + [(15.0, 20.0, 30.0)] * len(far) + [(700.0, 700.0, 0.5), (2.0, 2.0, 0.1)]
+    turns = [(0.0, 17.0 * k, 0.0) for k in range(len(centers) - 2)] + [(0.0, 0.0, 0.0)] * 2
+    kinds = [KINDS["Buildings"]] * (len(near) + len(far)) + [KINDS["Roads"], KINDS["Walls"]]
+    box_map = make_box_map(centers, halves, turns, kinds, header=MapHeader(name="far", ground_z_m=-5.0))
+    renderer = opened("gl", box_map)
+    measured = 0
+    for eye, aim in (((0.271, 3.113, 14.07), (60.0, 0.0, 4.0)), ((2.019, -9.333, 25.0), (40.0, 3.0, 0.0))):
+        pose, intrinsic = pose_towards(eye + offset_m, aim + offset_m), intrinsic_matrix(*SIZE, 60.0)
+        renderer.prepare(pose[:3, 3] - 60.0, pose[:3, 3] + 60.0)
+        frame = renderer.render(pose, intrinsic, None)
+        depth, kinds_seen, ids = traced(box_map, plane_z_m(box_map), pose, intrinsic)
+        inner = away_from_silhouettes(depth, ids)
+        np.testing.assert_array_equal(frame.ids[inner], ids[inner])
+        np.testing.assert_array_equal(frame.kinds[inner], kinds_seen[inner])
+        there = inner & (depth > least_m) & (depth < most_m)
+        measured += there.sum()
+        assert np.abs(frame.depth - depth)[there].max(initial=0.0) < bound_m
+    renderer.close()
+    assert measured > 1000
+
+
 def test_types_ranges_and_sky(renderer):
     pose = pose_towards((0.0, -20.0, 6.0), (0.0, 40.0, 14.0))
     frame = renderer.render(pose, intrinsic_matrix(*SIZE, 90.0), None)

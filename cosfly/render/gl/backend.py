@@ -37,6 +37,7 @@ MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
 PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
+ORIGIN_STEP_M = 2.0 * PATTERN_M  # a flight farther off than half of this has an origin of its own
 
 
 def open_context() -> Any:
@@ -123,13 +124,13 @@ class GlRenderer:
         )
         sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define or ""))
         loose = {
-            material: self._loose_arrays((materials[material], near_movers[material]), rows)
-            for material, rows in self.scene.loose.items()
+            material: self._loose_arrays((materials[material], near_movers[material]), buffer)
+            for material, buffer in self._loose_buffers.items()
         }
         weather = None
         if define is not None:
             rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl")))
-            weather = WeatherPass(self.context, self.scene, self._color, self._depth, rain, self.num_others)
+            weather = WeatherPass(self.context, self._color, self._depth, rain, self.num_others)
         sky = self.context.vertex_array(sky_program, [])
         return _Look(materials, near_movers, sky_program, sky, loose, weather)
 
@@ -154,12 +155,21 @@ class GlRenderer:
             for mesh in meshes.all_meshes()
         ]
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
-        self._groups = _groups(self.scene.parts.records, self.scene.parts.mesh)
+        self._loose_buffers = {
+            material: self.context.buffer(reserve=rows.nbytes) for material, rows in self.scene.loose.items()
+        }
 
-    def _loose_arrays(self, programs: tuple[Any, Any], vertices: np.ndarray) -> dict[int, Any]:
+    def _fill_loose(self) -> None:
+        """Hand over the loose triangles, counted from the origin of now."""
+        for material, buffer in self._loose_buffers.items():
+            vertices = self.scene.loose[material].copy()
+            vertices["center"] -= (self.origin_m - self.scene.origin_m).astype(np.float32)
+            buffer.write(vertices.tobytes())
+
+    def _loose_arrays(self, programs: tuple[Any, Any], buffer: Any) -> dict[int, Any]:
         """Vertex arrays, one a program, of triangles that are no instances: every vertex brings its part along."""
         names = [f"in_{name}" for name in LOOSE_VERTEX.names or ()]
-        buffer, arrays = self.context.buffer(vertices.tobytes()), {}
+        arrays = {}
         for program in programs:
             content = _attributes(program, buffer, "3f 3f 3f 3f 4f 4f 1u 1f", tuple(names))
             arrays[program.glo] = self.context.vertex_array(program, [content])
@@ -185,27 +195,43 @@ class GlRenderer:
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Compute sun shadows and sky openness for an area of the world, (3,) corners; once for each flight. Takes its weather."""
-        low, high = np.asarray(low_m) - self.scene.origin_m, np.asarray(high_m) - self.scene.origin_m
+        self._settle(np.asarray(low_m), np.asarray(high_m))
+        low, high = np.asarray(low_m) - self.origin_m, np.asarray(high_m) - self.origin_m
         middle = (low + high) / 2.0
         half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
-        parts = self.scene.parts
+        parts = self._parts
         near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
         casting = np.flatnonzero(near & (parts.max_px > 1e8))
         with self.context:
             self._use_look(None if weather is None else defines(weather))
+            self._fill_loose()
             if self._weather is not None and weather is not None:
-                self._weather.prepare(weather, middle, half)
+                self._weather.prepare(weather, parts, middle, half)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
             self._prepare_shadow(casting, middle, half)
             self._prepare_openness(casting, middle, half)
+
+    def _settle(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
+        """Keep the parts that a camera within these corners can see, counted from near it.
+
+        Of a city of kilometres that is little, and every frame looks through what is kept. Kilometres from its zero, single
+        precision is worth a millimetre.
+        """
+        parts, zero = self.scene.parts, self.scene.origin_m
+        outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
+        away_m = np.linalg.norm(np.maximum(outside, 0.0), axis=1) - parts.object_radii
+        steps = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0]
+        self.origin_m = zero + steps * ORIGIN_STEP_M
+        self._parts = parts.select(away_m < FAR_M).about(steps * ORIGIN_STEP_M)
+        self._groups = _groups(self._parts.records, self._parts.mesh)
 
     def _prepare_shadow(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
         sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
-        away = np.abs((self.scene.parts.object_centers[casting] - middle) @ sun)
-        depth_half = float((away + self.scene.parts.object_radii[casting]).max(initial=half))  # towers cast from afar
+        away = np.abs((self._parts.object_centers[casting] - middle) @ sun)
+        depth_half = float((away + self._parts.object_radii[casting]).max(initial=half))  # towers cast from afar
         clip_from_world = np.eye(4)
         clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
         clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
@@ -218,8 +244,8 @@ class GlRenderer:
 
     def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
         """A height map from above, blurred: what stands higher than a point darkens it."""
-        parts = self.scene.parts
-        ground_z = self.scene.plane_z_m - self.scene.origin_m[2]
+        parts = self._parts
+        ground_z = self.scene.plane_z_m - self.origin_m[2]
         top = float((parts.object_centers[casting, 2] + parts.object_radii[casting]).max(initial=ground_z)) + 1.0
         depth_m = top - ground_z + 10.0
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
@@ -243,10 +269,10 @@ class GlRenderer:
     def _ground_z(self, low: np.ndarray, pixel_m: float) -> np.ndarray | float:
         """Height of the ground over the map of openness, relative to the origin: one figure where it is flat."""
         if self.scene.ground.is_flat:
-            return self.scene.plane_z_m - self.scene.origin_m[2]
-        x, y = (low[axis] + self.scene.origin_m[axis] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for axis in (0, 1))
+            return self.scene.plane_z_m - self.origin_m[2]
+        x, y = (low[axis] + self.origin_m[axis] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for axis in (0, 1))
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        return self.scene.ground.height_at(places).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX) - self.scene.origin_m[2]
+        return self.scene.ground.height_at(places).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX) - self.origin_m[2]
 
     def _draw_depth(self, target: Any, clip_from_world: np.ndarray, rows: np.ndarray) -> None:
         target.use()
@@ -254,7 +280,7 @@ class GlRenderer:
         self.context.enable_only(self.context.DEPTH_TEST)
         _set(self._depth_program, "clip_from_world", clip_from_world)
         for mesh in range(len(self._meshes)):
-            self._draw(self._depth_program, mesh, self.scene.parts.records[rows[self.scene.parts.mesh[rows] == mesh]])
+            self._draw(self._depth_program, mesh, self._parts.records[rows[self._parts.mesh[rows] == mesh]])
 
     # --- one frame ---
 
@@ -268,19 +294,17 @@ class GlRenderer:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         body = None if person is None else make_body(person)
-        view = View(
-            camera_pose[:3, :3], camera_pose[:3, 3] - self.scene.origin_m, intrinsic, self.width_px, self.height_px
-        )
-        moving = [] if body is None else [placed(body, self.scene.origin_m)]
-        moving += draw_others(others, self.scene.origin_m, view)
+        view = View(camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px)
+        moving = [] if body is None else [placed(body, self.origin_m)]
+        moving += draw_others(others, self.origin_m, view)
         bones = self._bones(body)
-        capsules = capsules_of(others, self.scene.origin_m, view)
+        capsules = capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights
         shades = shades_of(bones, capsules, self._sun, view, has_headlights)
         frame_values = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
         with self.context:
             self._set_camera(self._materials, view, frame_values)
-            rows = view.rows(self.scene.parts)
+            rows = view.rows(self._parts)
             self._image.use()
             self._image.clear(depth=1.0)
             self.context.enable_only(self.context.DEPTH_TEST | self.context.CULL_FACE)
@@ -320,8 +344,8 @@ class GlRenderer:
             "clip_m": np.array([NEAR_M, FAR_M]),
             "camera_from_world": view.world_from_camera.T,
             "camera_position": view.eye,
-            "world_offset": np.mod(self.scene.origin_m[:2], PATTERN_M),
-            "ground_z": self.scene.plane_z_m - self.scene.origin_m[2],
+            "world_offset": np.mod(self.origin_m[:2], PATTERN_M),
+            "ground_z": self.scene.plane_z_m - self.origin_m[2],
             "shadow_map": 0,
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,
@@ -336,11 +360,11 @@ class GlRenderer:
         """Capsules of the person's shadow, relative to the origin, as `moving.capsules_of` gives those of others."""
         bones = np.zeros((0 if body is None else len(body.bones_m), 2, 4), np.float32)
         if body is not None:
-            bones[..., :3], bones[:, 0, 3] = body.bones_m - self.scene.origin_m, body.bone_radii_m
+            bones[..., :3], bones[:, 0, 3] = body.bones_m - self.origin_m, body.bone_radii_m
         return bones
 
     def _set_person(self, body: Body | None) -> None:
-        center = np.zeros(3) if body is None else body.center_m - self.scene.origin_m
+        center = np.zeros(3) if body is None else body.center_m - self.origin_m
         for program in self._near_movers:
             _set(program, "person_center", center)
 
@@ -360,7 +384,7 @@ class GlRenderer:
                 if name in program:
                     program[name].write(padded.tobytes())
                 _set(program, count, len(capsules))
-        parts = self.scene.parts
+        parts = self._parts
         away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
         x0, y0, x1, y1 = shade.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
@@ -369,7 +393,7 @@ class GlRenderer:
 
     def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Draw standing things before the ground, near before far: what is hidden costs nothing. moving: records and meshes."""
-        records = np.concatenate([*(part for part, _ in moving), self.scene.parts.records[rows]])
+        records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):

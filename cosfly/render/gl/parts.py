@@ -23,7 +23,7 @@ DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *
 PART = np.dtype(
     [("center", "3f4"), ("half", "3f4"), ("quaternion", "4f4"), ("color", "4f4"), ("tag", "u4"), ("bias", "f4")]
 )
-PART_COLUMNS = ("records", "mesh", "object_centers", "object_radii", "min_px", "max_px")  # of Parts
+PART_COLUMNS = ("records", "mesh", "centers", "object_centers", "object_radii", "min_px", "max_px")  # of Parts
 # A vertex of a triangle that is no instance of a mesh: place and normal as a mesh's vertices have them, then its part.
 LOOSE_VERTEX = np.dtype([("position", "3f4"), ("normal", "3f4"), *((name, PART[name]) for name in PART.names or ())])
 
@@ -34,12 +34,13 @@ FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is dr
 class Parts:
     """Drawable parts, k of them. Positions are relative to the scene's origin.
 
-    records: (k,) PART; mesh: (k,) mesh numbers; object_centers (k, 3), object_radii (k,): the whole object a part belongs to;
+    records: (k,) PART; mesh: (k,) mesh numbers; centers: (k, 3) float64, the records' centers before they were rounded; object_centers (k, 3), object_radii (k,): the whole object a part belongs to;
     a part is drawn while the object's radius on the image lies in [min_px, max_px).
     """
 
     records: np.ndarray
     mesh: np.ndarray
+    centers: np.ndarray
     object_centers: np.ndarray
     object_radii: np.ndarray
     min_px: np.ndarray
@@ -50,6 +51,15 @@ class Parts:
 
     def select(self, keep: np.ndarray) -> Parts:
         return Parts(*(getattr(self, column)[keep] for column in PART_COLUMNS))
+
+    def about(self, place: np.ndarray) -> Parts:
+        """The same parts relative to a place, (3,): single precision is best near its zero."""
+        if not place.any():
+            return self
+        records = self.records.copy()
+        records["center"] = self.centers - place
+        object_centers = (self.object_centers - place).astype(np.float32)
+        return replace(self, records=records, centers=self.centers - place, object_centers=object_centers)
 
 
 @dataclass(frozen=True)
@@ -105,9 +115,11 @@ class PartBuilder:
         if n == 0:
             return
         records = np.zeros(n, PART)
-        records["center"] = boxes.centers
+        records["center"] = centers = boxes.centers.astype(np.float64)
         if offset is not None:
-            records["center"] += np.einsum("nij,nj->ni", boxes.turns, np.broadcast_to(offset, (n, 3)))
+            from_middle = np.einsum("nij,nj->ni", boxes.turns, np.broadcast_to(offset, (n, 3)))
+            records["center"] += from_middle
+            centers = centers + from_middle
         records["half"] = np.maximum(half, 1e-3)
         turns = boxes.turns if turn is None else boxes.turns @ turn
         records["quaternion"] = Rotation.from_matrix(turns).as_quat()
@@ -117,7 +129,7 @@ class PartBuilder:
         records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer)
         self._parts.append(
             Parts(
-                records, np.full(n, mesh, np.uint8), boxes.centers.astype(np.float32),
+                records, np.full(n, mesh, np.uint8), centers, boxes.centers.astype(np.float32),
                 np.linalg.norm(boxes.half, axis=1).astype(np.float32), np.full(n, min_px, np.float32), np.full(n, max_px, np.float32),
             )
         )  # fmt: skip

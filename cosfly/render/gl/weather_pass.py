@@ -17,7 +17,7 @@ from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.atmosphere import light_direction, uniforms
-from cosfly.render.gl.scene import Scene
+from cosfly.render.gl.parts import Parts
 
 # Files of shaders that follow light.glsl.
 FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")
@@ -45,12 +45,12 @@ def defines(params: WeatherParams) -> str:
 class WeatherPass:
     """The weather of a flight on one GL context. `set_uniform(program, name, value)` passes over what a program does not use."""
 
-    def __init__(self, context: Any, scene: Scene, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
-        self._context, self._origin_m = context, scene.origin_m
+    def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
+        self._context = context
         self._depth, self._rain_program = depth, rain_program
         self._rain = context.vertex_array(rain_program, [])
         self._over_color = context.framebuffer([color])
-        self._lamps = street_lamps.lamps_of(scene.parts)
+        self._lamps = np.zeros((0, 3))
         self._lamp_map = context.texture((street_lamps.MAP_PX, street_lamps.MAP_PX), 2, dtype="f4")
         self._lamp_map.repeat_x = self._lamp_map.repeat_y = False
         self._lamp_area = np.zeros(4)
@@ -58,8 +58,9 @@ class WeatherPass:
         self.values: dict[str, Any] = {}
         self.sun_direction = np.zeros(3)
 
-    def prepare(self, params: WeatherParams, middle: np.ndarray, half_m: float) -> None:
-        """Get ready for a flight over a square round `middle`, relative to the scene's origin."""
+    def prepare(self, params: WeatherParams, parts: Parts, middle: np.ndarray, half_m: float) -> None:
+        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit."""
+        self._lamps = street_lamps.lamps_of(parts)
         self.values, self.sun_direction = uniforms(params), light_direction(params)
         near = self._lamps[(np.abs(self._lamps[:, :2] - middle[:2]) < half_m + street_lamps.REACH_M).all(axis=1)]
         light, self._lamp_area = street_lamps.lamp_map(near, middle, half_m)
