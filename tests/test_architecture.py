@@ -24,7 +24,7 @@ SHARED = (
     "coverage_page",
 )  # what several stages use; knows products
 # What may know all stages and siblings.
-ASSEMBLY = ("cli", "pipeline", "settings", "runs", "doctor", "gallery", "bench", "depth_study", "__main__")
+ASSEMBLY = ("cli", "pipeline", "settings", "runs", "library", "doctor", "gallery", "bench", "depth_study", "__main__")
 HEAVY = {
     "torch",
     "transformers",

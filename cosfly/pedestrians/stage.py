@@ -39,6 +39,7 @@ from cosfly.pedestrians.walkable import (
 )  # fmt: skip
 from cosfly.pedestrians.walking import arrival_times, resample
 from cosfly.products.boxes import read_boxes
+from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, write_paths
@@ -75,13 +76,26 @@ def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng:
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces move no route
     route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
     with clock("report"):
-        name = draw_by_share(cfg.pace, pace_rng)
-        way = take_pace(route_m, PACES[name], pace_rng)
-        waypoint_mps = speeds_at(way, PACES[name], cfg, rng)
-        times_s = arrival_times(way.polyline_m, waypoint_mps)
-        time_s, positions_m, speeds_mps = resample(way.polyline_m, waypoint_mps, times_s, cfg.dt_s, way.stops_s)
-        on_ground = np.column_stack([positions_m, ground.heights.height_at(positions_m)])
-    return MadeWalk(Walk(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name), retries, clock.seconds)
+        walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng)
+    return MadeWalk(walk, retries, clock.seconds)
+
+
+def walk_along(
+    path_id: str,
+    route_m: np.ndarray,
+    heights: Ground,
+    cfg: PedestriansConfig,
+    rng: np.random.Generator,
+    pace_rng: np.random.Generator,
+) -> Walk:
+    """Walk a route, (k, 2) m, at a pace that is drawn, and sample it."""
+    name = draw_by_share(cfg.pace, pace_rng)
+    way = take_pace(route_m, PACES[name], pace_rng)
+    waypoint_mps = speeds_at(way, PACES[name], cfg, rng)
+    times_s = arrival_times(way.polyline_m, waypoint_mps)
+    time_s, positions_m, speeds_mps = resample(way.polyline_m, waypoint_mps, times_s, cfg.dt_s, way.stops_s)
+    on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
+    return Walk(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name)
 
 
 def _draw_route(

@@ -1,0 +1,159 @@
+"""cosfly as a library: the stages as functions over values in memory, with the settings and the results of the commands.
+
+`import cosfly` brings these names and loads nothing until one is used. Positions are world metres, x east, y north, z up; angles are degrees.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosfly.chance import rng_for
+from cosfly.config import build
+from cosfly.errors import ConfigError, InputError
+from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
+from cosfly.maps.stage import SOURCES, MapsConfig
+from cosfly.maps.stage import load_map as load_source
+from cosfly.pedestrians.stage import make_walk, walk_along
+from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.stage import plan_flight
+from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.captions import read_captions
+from cosfly.products.traces import DroneTrace
+from cosfly.render.contract import Frame
+from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.stage import RenderConfig, open_renderer
+from cosfly.simplify.passes import SimplifyConfig, simplify
+
+__all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
+
+STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
+FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
+
+
+def load_map(path: str | Path | None = None, *, source: str | None = None, seed: int = 0, **settings: Any) -> BoxMap:
+    """Load or invent a map.
+
+    Args:
+        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or with `source` its file; None invents a town.
+        source: `synthetic`, `simworld`, `cityjson` or `boxes`; None goes by the file.
+        settings: of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
+    Raises:
+        ConfigError: an unknown source or setting. InputError: the file is malformed.
+    """
+    if source is None and path is not None and Path(path).suffix == ".json" and not settings:
+        return read_boxes(Path(path))
+    source = source or ("synthetic" if path is None else "boxes")
+    if source not in SOURCES:
+        raise ConfigError("there is no such source of maps", got=source, expected=", ".join(SOURCES))
+    if path is not None and source not in FILE_SETTING:
+        raise ConfigError(
+            "this source reads no file",
+            where="load_map",
+            got=str(path),
+            fix=f"leave the path out, or give another source than {source}",
+        )
+    given = settings if path is None else {FILE_SETTING[source]: Path(path), **settings}
+    return load_source(build(MapsConfig, {"source": source, source: given}, "load_map"), seed=seed)
+
+
+def plan(
+    box_map: BoxMap, way_m: Any = None, *, seed: int = 0, walk: dict[str, Any] | None = None, **settings: Any
+) -> DroneTrace:
+    """Plan one flight behind one walk. A map that was not simplified yet is simplified first.
+
+    Args:
+        way_m: (k, 2) the way that the person walks, over free ground; None draws one, another for each seed.
+        walk: settings of the walk, as in `pedestrians` of a configuration.
+        settings: as in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
+    Raises:
+        ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight that is free of collisions.
+    """
+    from cosfly.kernels import obstacle_index
+    from cosfly.planners.styles.reacquire import screens_of
+
+    walking = build(PedestriansConfig, walk or {}, "plan: walk")
+    cfg = build(PlanConfig, settings, "plan")
+    if not box_map.header.passes:
+        box_map = simplify(box_map, SimplifyConfig()).box_map
+    rng = rng_for(seed, "pedestrians", "path_00000")
+    if way_m is None:
+        person = make_walk("path_00000", walkable_ground(box_map, walking), walking, rng).walk
+    else:
+        route_m = np.asarray(way_m, dtype=np.float64)
+        if route_m.ndim != 2 or route_m.shape[1] != 2 or len(route_m) < 2 or not np.isfinite(route_m).all():
+            raise InputError(
+                "not a way",
+                where="way_m",
+                got=f"an array of shape {route_m.shape}",
+                expected="(k, 2) finite places, two or more",
+            )
+        person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
+    return plan_flight(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
+
+
+def render_frames(
+    box_map: BoxMap,
+    position_m: Any,
+    rotation_deg: Any = None,
+    *,
+    target_m: Any = None,
+    fov_deg: float = 60.0,
+    size_px: tuple[int, int] = (1280, 720),
+    seed: int = 0,
+    **settings: Any,
+) -> list[Frame]:
+    """Draw what a camera sees from one or more places.
+
+    Args:
+        position_m: (3,) or (n, 3). rotation_deg: pitch, yaw, roll of the same shape; None looks at the target.
+        target_m: hip of the person, the same shape; None: nobody is there.
+        fov_deg: horizontal. size_px: width and height.
+        settings: as in `render` of a configuration: `look`, `backend`.
+    Returns:
+        n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
+    Raises:
+        ConfigError: an unknown setting. InputError: shapes that do not belong together. EnvironmentMissing: there is no OpenGL.
+    """
+    positions = _places(position_m, "position_m")
+    targets = None if target_m is None else _places(target_m, "target_m", len(positions))
+    if rotation_deg is not None:
+        rotations = _places(rotation_deg, "rotation_deg", len(positions))
+    elif targets is not None:
+        pitch, yaw = look_at(positions, targets)
+        rotations = np.degrees(np.column_stack([pitch, yaw, np.zeros(len(positions))]))
+    else:
+        raise InputError(
+            "nobody says where to look", where="render_frames", expected="rotation_deg, or target_m to look at"
+        )
+    cfg = build(
+        RenderConfig,
+        {**settings, "width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]},
+        "render_frames",
+    )
+    intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
+    gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))
+    clothes = choose_clothes(rng_for(seed, "render", "library"))
+    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
+    try:
+        renderer.prepare(positions.min(axis=0), positions.max(axis=0))
+        people = [
+            None if gait is None or targets is None else gait.posed(i, targets[i], clothes)
+            for i in range(len(positions))
+        ]
+        poses = [world_from_camera(*pose) for pose in zip(positions, rotations, strict=True)]
+        return [renderer.render(pose, intrinsic, person) for pose, person in zip(poses, people, strict=True)]
+    finally:
+        renderer.close()
+
+
+def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
+    """Give (n, 3) of one row or n."""
+    places = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0 or count not in (None, len(places)):
+        expected = "(3,) or (n, 3)" if count is None else f"({count}, 3), as position_m"
+        raise InputError("not places or turns", where=name, got=f"an array of shape {places.shape}", expected=expected)
+    return places

@@ -1,0 +1,118 @@
+"""cosfly as a library: the same results as the commands give, and what is wrong said in their words."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import cosfly
+from cosfly.errors import ConfigError, InputError
+from cosfly.maps import stage as maps_stage
+from cosfly.maps.stage import MapsConfig
+from cosfly.pedestrians import stage as pedestrians_stage
+from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.planners import stage as plan_stage
+from cosfly.planners.contract import PlanConfig
+from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.render.contract import PERSON_ID
+from cosfly.simplify import stage as simplify_stage
+from cosfly.simplify.passes import SimplifyConfig
+
+NOTEBOOK = Path(__file__).parents[1] / "docs/first_flight.ipynb"
+TOWN = {"size_m": 120.0, "num_blocks": 1}
+WALK = {"min_distance_m": 15, "max_distance_m": 25}
+
+
+@pytest.fixture(scope="module")
+def town() -> BoxMap:
+    return cosfly.load_map(seed=4, **TOWN)
+
+
+@pytest.fixture(scope="module")
+def flight(town) -> DroneTrace:
+    return cosfly.plan(town, planner="muco", walk=WALK, seed=4)
+
+
+def test_the_name_brings_nothing_heavy():
+    program = "import sys, cosfly; print(cosfly.__all__); print('LOADED', *sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert not set(done.stdout.split("LOADED")[1].split()) & {"numpy", "numba", "pydantic", "cv2", "moderngl"}
+    with pytest.raises(AttributeError, match="no attribute 'load_mop'"):
+        cosfly.load_mop  # noqa: B018
+
+
+def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
+    boxes = maps_stage.run(MapsConfig(synthetic=TOWN), tmp_path / "maps", seed=4)  # type: ignore[arg-type]
+    simplified = simplify_stage.run(SimplifyConfig(), boxes, tmp_path / "simplify")
+    walks = pedestrians_stage.run(PedestriansConfig(num_paths=1, **WALK), simplified, tmp_path / "walks", seed=4)  # type: ignore[arg-type]
+    (made,) = read_traces(plan_stage.run(PlanConfig(planner="muco"), simplified, walks, tmp_path / "plan", seed=4))
+    for name in ("time_s", "positions_m", "targets_m", "rotations_deg"):
+        assert_allclose(getattr(flight, name), getattr(made, name), atol=1e-3)
+    assert flight.drop_reason == made.drop_reason
+
+
+def test_a_way_of_ones_own_is_flown(town):
+    walk = cosfly.plan(town, planner="muco", walk=WALK, seed=4).targets_m[:, :2]
+    own = cosfly.plan(town, walk[::6], planner="muco", altitude_max_m=25)
+    assert_allclose(own.targets_m[0, :2], walk[0], atol=1e-3)
+    assert own.positions_m[:, 2].max() < 26
+    with pytest.raises(InputError, match=r"way_m: not a way; got an array of shape \(3,\)"):
+        cosfly.plan(town, [1, 2, 3])
+
+
+def test_a_pose_is_drawn_and_its_depth_is_the_distance(town, flight):
+    i = len(flight.time_s) // 2
+    frames = cosfly.render_frames(
+        town, flight.positions_m[i : i + 2], target_m=flight.targets_m[i : i + 2], size_px=(320, 180)
+    )
+    assert [frame.rgb.shape for frame in frames] == [(180, 320, 3)] * 2
+    turned = cosfly.render_frames(
+        town, flight.positions_m[i], flight.rotations_deg[i], target_m=flight.targets_m[i], size_px=(320, 180)
+    )[0]
+    is_town = (turned.ids != PERSON_ID) & (frames[0].ids != PERSON_ID)  # a place alone has no stride
+    assert_allclose(turned.depth[is_town], frames[0].depth[is_town], atol=1e-4)  # the flight looks at the target too
+    distance_m = np.linalg.norm(flight.targets_m[i] - flight.positions_m[i])
+    assert abs(float(np.median(turned.depth[turned.ids == PERSON_ID])) - distance_m) < 0.5
+    empty = cosfly.render_frames(town, flight.positions_m[i], flight.rotations_deg[i], size_px=(320, 180))[0]
+    assert not (empty.ids == PERSON_ID).any()
+
+
+def test_files_and_sources_are_loaded(town, tmp_path):
+    write_boxes(tmp_path / "boxes_3d.json", town)
+    assert len(cosfly.load_map(tmp_path / "boxes_3d.json")) == len(town)
+    (tmp_path / "own.csv").write_text("type,x,y,length,width,height\nhouse,0,0,9,9,8\n")
+    assert cosfly.load_map(tmp_path / "own.csv", types={"house": "Buildings"}).counts() == {"Buildings": 1}
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: cosfly.load_map(sise_m=3), ConfigError, "sise_m: unknown setting.*'size_m'"),
+        (lambda: cosfly.load_map(source="carla"), ConfigError, "no such source of maps; got carla; expected synthetic"),
+        (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
+        (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
+        (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 0, 9]), InputError, "nobody says where to look"),
+        (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 9], [0, 0, 0]), InputError, "position_m: not places"),
+        (lambda: cosfly.plan(cosfly.load_map(**TOWN), planer="muco"), ConfigError, "plan: planer: unknown setting"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_as_on_the_command_line(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_the_notebook_runs_and_its_numbers_fit():
+    """Its cells, one after another; what it says in the end is true."""
+    names: dict = {}
+    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == []
+            exec("".join(cell["source"]), names)
+    assert names["flight"].drop_reason is None
+    assert names["plot"].shape[2] == 3
+    assert abs(names["depth_m"] - names["distance_m"]) < 0.5
