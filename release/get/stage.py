@@ -207,9 +207,7 @@ def _copy(remote: Remote, shard: Shard, path: Path) -> str:
     begun = path.with_name(f"{path.name}.begun")
     refuse_link(begun)
     here = begun.stat().st_size if begun.is_file() else 0
-    for first in dict.fromkeys(
-        (min(here, shard.bytes), 0)
-    ):  # where what is here is not of this shard, all of it comes anew
+    for first in sorted({min(here, shard.bytes), 0}, reverse=True):  # anew where what is here is not of this shard
         digest = _copy_from(first, remote, shard, begun)
         if digest == shard.sha256:
             os.replace(begun, path)
