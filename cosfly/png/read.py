@@ -33,13 +33,17 @@ class Png:
     _is_undone: bool = False
 
     def rows(self, wanted: np.ndarray) -> np.ndarray:
-        """Give some rows, (k, w, channels) uint8."""
-        if not self._is_undone and (self.lines[:, 0] <= 1).all():
-            lines = self.lines[wanted]
-            _undo(lines, self.channels)
-        else:
-            lines = self._undone()[wanted]
-        return lines[:, 1:].reshape(len(wanted), self.width_px, self.channels)
+        """Give some rows, (k, w, channels) uint8; of the others those are undone that these lean on."""
+        if not self._is_undone:
+            stand_alone = self.lines[:, 0] <= 1
+            first = np.maximum.accumulate(np.where(stand_alone, np.arange(self.height_px), 0))[wanted]
+            if (wanted - first + 1).sum() < self.height_px // 2:
+                parts = [self.lines[begin : row + 1].copy() for begin, row in zip(first, wanted, strict=True)]
+                for part in parts:
+                    _undo(part, self.channels)
+                found = np.stack([part[-1, 1:] for part in parts])
+                return found.reshape(len(wanted), self.width_px, self.channels)
+        return self._undone()[wanted, 1:].reshape(len(wanted), self.width_px, self.channels)
 
     def pixels(self) -> np.ndarray:
         """Give the picture, (h, w, channels) uint8."""

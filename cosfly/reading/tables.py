@@ -93,12 +93,31 @@ def read_row_group(path: Path | str, table: pq.ParquetFile, k: int, columns: lis
     Raises:
         InputError: it is damaged, or over the limit.
     """
+    _check_size(path, table, k)
+    with arrow_errors(path):
+        return table.read_row_group(k, columns=columns)
+
+
+def row_batches(
+    path: Path | str, table: pq.ParquetFile, k: int, columns: list[str], num_rows: int
+) -> Iterator[pa.RecordBatch]:
+    """Yield one row group of an open table, few rows at a time, so that the same memory serves again; raises as `read_row_group`."""
+    _check_size(path, table, k)
+    with arrow_errors(path):
+        batches = table.iter_batches(num_rows, row_groups=[k], columns=columns, use_threads=False)
+    while True:
+        with arrow_errors(path):
+            batch = next(batches, None)
+        if batch is None:
+            return
+        yield batch
+
+
+def _check_size(path: Path | str, table: pq.ParquetFile, k: int) -> None:
     about = table.metadata.row_group(k)
     size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
     if size > limits().file_mb * MB:
         raise over_limit("file_mb", f"{path}: row group {k}", f"{size / MB:,.0f} MB", " MB")
-    with arrow_errors(path):
-        return table.read_row_group(k, columns=columns)
 
 
 def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[dict[str, Any]]:

@@ -18,10 +18,11 @@ from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Place, flight_ids
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.reading.files import read_bytes
-from cosfly.reading.tables import open_table, read_row_group
+from cosfly.reading.tables import open_table, read_row_group, row_batches
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed, flight_name, flight_spans
 from release.verify.rows import FlightRows, Row
 
+BATCH_ROWS = 2  # whose pictures are in memory at once
 Pictures = dict[FrameFile, bytes | memoryview | None]
 
 
@@ -97,22 +98,28 @@ class Shards:
 
     def rows(self, entry: Entry) -> list[Row]:
         found: list[Row] = []
-        for table, begin, end, path in self._groups(entry, SCALAR_NAMES):
-            found += rows_of_table(table.slice(begin, end - begin), path)
+        for path, table, group, begin, end in self._groups(entry):
+            own = read_row_group(path, table, group, SCALAR_NAMES)
+            found += rows_of_table(own.slice(begin, end - begin), path)
         return found
 
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
-        names = [PICTURES[file].name for file in self.files]
-        for table, begin, end, _ in self._groups(entry, names):
-            columns = {file: table.column(PICTURES[file].name) for file in self.files}
-            for row in range(begin, end):
-                yield {file: _bytes_at(column, row) for file, column in columns.items()}
+        names = {file: PICTURES[file].name for file in self.files}
+        for path, table, group, begin, end in self._groups(entry):
+            row = 0
+            for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
+                for i in range(max(begin - row, 0), min(end - row, len(batch))):
+                    yield {file: _bytes_at(batch.column(name), i) for file, name in names.items()}
+                row += len(batch)
+                if row >= end:
+                    break
 
-    def _groups(self, entry: Entry, names: list[str]) -> Iterator[tuple[Any, int, int, Path]]:
+    def _groups(self, entry: Entry) -> Iterator[tuple[Path, Any, int, int, int]]:
+        """Yield where a flight's rows are: file, the same opened, row group, first row, row behind the last."""
         for shard, group, begin, end in entry.parts:
             path = self.folder / shard
             with open_table(path, tree=self.folder) as table:
-                yield read_row_group(path, table, group, names), begin, end, path
+                yield path, table, group, begin, end
 
 
 def rows_of_table(table: Any, path: Path) -> list[Row]:

@@ -31,6 +31,7 @@ from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
 from release.verify.sources import Entry, FlightSource, Shards, Tree
+from release.verify.tars import found_tars
 
 RECORD, EXPORT = "release.json", "export.json"
 RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
@@ -54,7 +55,7 @@ def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: C
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
     elif (folder / EXPORT).is_file():
-        _verify_export(folder, level, workers, findings)
+        _verify_export(folder, level, workers, reader, findings)
     elif (folder / RECORD).is_file() or ((folder / CHECKSUMS).is_file() and not _is_tree(folder)):
         _verify_release(folder, level, workers, reader, findings)
     else:
@@ -163,9 +164,9 @@ def _check_shard_splits(
 # --- an export --------------------------------------------------------------------------------------------------------
 
 
-def _verify_export(folder: Path, level: Level, workers: int, findings: Findings) -> None:
-    """Check an export: its record, its files against its list of checksums, and one that is a playback tree as such. Rows of other formats
-    are those of its release, which is verified where it stands."""
+def _verify_export(folder: Path, level: Level, workers: int, reader: CaptionReader | None, findings: Findings) -> None:
+    """Check an export: its record, its files against its list of checksums, and the rows and pictures of a playback tree or a WebDataset
+    as such. LeRobot rounds poses and cuts flights: its rows are those of its release, which is verified where it stands."""
     try:
         record = read_export(folder / EXPORT)
     except InputError as error:
@@ -185,8 +186,30 @@ def _verify_export(folder: Path, level: Level, workers: int, findings: Findings)
         check_digests(folder, digests, good, findings)
     if is_tree:
         _verify_tree(folder, level, workers, findings)
+    elif record.format == "webdataset" and level != "structure":
+        _verify_tars(
+            folder, [name for name in good if name.endswith(".tar")], record.frames, level, reader, workers, findings
+        )
     elif level != "structure":
         findings.note("not_checked", EXPORT, "rows of this format", "verify the release that it was made of: its digest stands there")  # fmt: skip
+
+
+def _verify_tars(
+    folder: Path, shards: list[str], num_frames: int, level: Level, reader: CaptionReader | None, workers: int,
+    findings: Findings,
+) -> None:  # fmt: skip
+    """Check rows and pictures of a WebDataset as those of a release."""
+    try:
+        source, entries, coding = found_tars(folder, shards, findings)
+    except InputError as error:
+        findings.error("unreadable", error.where, error.got or error.what, error.expected or "rows of all shards")
+        return
+    told = Told(depth=coding or LOSSLESS)
+    flights = check_all(source, entries, level, told, reader, workers, findings)
+    check_across(flights, by_town=False, both=False, findings=findings)
+    num_rows = sum(entry.num_rows for entry in entries)
+    if num_rows != num_frames:
+        findings.error("rows", EXPORT, f"{num_rows:,} frames", f"{num_frames:,}, as {EXPORT} says")
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
