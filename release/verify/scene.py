@@ -34,7 +34,9 @@ COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
     160,
 )  # that median itself, honest 0.92; of pictures narrower than so much 0.70
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
-BETTER_BY = 0.07  # how much better the next frame's place must explain a frame's colours to be where they are from
+# How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
+# before as usual in the flight, and of others.
+BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.03, 0.04
 # Flights of others: depth may be rough, but it is equally rough in all frames.
 ROUGH_ERROR, TIMES_ROUGH = 1e-3, 20.0
 
@@ -149,5 +151,7 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
             findings.error("scene_colour", where, f"{pair.correlation:.2f} with the frame before", f"at least {usual_colour - drop:.2f}, by the flight's other frames")  # fmt: skip
         elif pair.tint > usual_tint + TINT:
             findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
-        elif elsewhere > pair.correlation + BETTER_BY:
+        elif elsewhere > pair.correlation + (
+            BETTER_BY_USUAL if pair.correlation >= usual_colour - UNUSUAL else BETTER_BY
+        ):
             findings.error("scene_colour", where, f"{pair.correlation:.3f} with the frame before", f"less than {elsewhere:.3f}, which these colours have at the next frame's place")  # fmt: skip
