@@ -451,6 +451,9 @@ void main() {
 #endif
 
     out_color = vec4(toned(color), 1.0);
+#ifdef WEATHER
+    out_color.rgb = noised(out_color.rgb);
+#endif
     out_depth = v_depth;
     out_tag = f_tag & 0xffff00ffu;
 }

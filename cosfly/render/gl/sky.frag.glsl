@@ -47,6 +47,9 @@ void main() {
     sky += vec3(8.0, 7.0, 5.0) * smoothstep(0.9993, 0.9998, dot(d, sun_direction));
 #endif
     out_color = vec4(toned(sky), 1.0);
+#ifdef WEATHER
+    out_color.rgb = noised(out_color.rgb);
+#endif
     out_depth = sky_depth_m;
     out_tag = sky_tag;
 }

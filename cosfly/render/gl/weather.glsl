@@ -15,6 +15,7 @@ uniform float wetness;            // of the ground
 uniform float puddles;
 uniform float lights_on;          // street lamps and windows
 uniform vec3 lamp_light;          // on the ground under a lamp
+uniform float rain_phase;         // where drops and the sensor's noise fall in this frame
 
 vec3 horizon_color() { return fog_color; }
 vec3 sky_gradient(vec3 d) {
@@ -28,3 +29,5 @@ float seen_through(float distance_m) {
     float far = distance_m / haze_m;
     return exp(-far * sqrt(far) - fog.x * max(distance_m - fog.y, 0.0));
 }
+// Noise of a sensor, one level of 255: without it fog would be bands and flat surfaces.
+vec3 noised(vec3 screen) { return screen + (hash21(gl_FragCoord.xy + floor(rain_phase * 9973.0)) - 0.5) * (2.0 / 255.0); }

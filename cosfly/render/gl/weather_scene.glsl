@@ -7,7 +7,6 @@ uniform float penumbra_m;         // width of a shadow's border
 uniform float shadow_texel_m;
 uniform uint lowest_other;        // instance ids from here to highest_other are of those who move
 uniform uint highest_other;
-uniform float rain_phase;         // where drops fall in this frame
 
 // The shadow map round a place: clouds spread the sun, and its shadows have wide borders.
 float soft_shadow(sampler2DShadow map, mat4 map_from_world, vec3 p, vec3 n) {
