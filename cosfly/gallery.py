@@ -1,4 +1,4 @@
-"""Pictures of a playback tree for people: a contact sheet, and a short animation of one flight."""
+"""Pictures of a playback tree for people: a contact sheet, a short animation of one flight, and one frame's four pictures."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.frame_views import VIEW_FILES, read_view
-from cosfly.products.frames import read_rgb
+from cosfly.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
+from cosfly.overlay import Overlay
+from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import DEBUG_FILE, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.products.instance_ids import read_instance_ids
 from cosfly.products.playback import Flight, find_flights, read_flight
-from cosfly.store import write_bytes
-from cosfly.topview import draw_text
+from cosfly.reading.arrays import read_picture
+from cosfly.store import inside, write_bytes
+from cosfly.topview import add_caption, draw_text
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
@@ -55,6 +59,47 @@ def preview_gif(tree: Path, out_gif: Path) -> None:
     write_bytes(out_gif, data)
 
 
+def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
+    """Reads a frame of a playback tree, writes it as one PNG: colours, depth, instances, and boxes with ids and distances.
+
+    Args:
+        frame: its folder in the tree; None: the frame of the first clean flight that shows most of the target.
+        box_map: what was drawn, for a frame without `debug.png`.
+    Returns:
+        the frame's folder in the tree.
+    Raises:
+        InputError: no such frame, one without pictures, or neither `debug.png` nor a map.
+    """
+    folder = _best_frame(tree) if frame is None else inside(tree, frame)
+    meta, rgb = read_meta(folder), read_rgb(folder)
+    if (folder / DEBUG_FILE).exists():
+        debug = cv2.cvtColor(read_picture(folder / DEBUG_FILE, tree=tree), cv2.COLOR_BGR2RGB)
+    elif box_map is not None:
+        ids = read_instance_ids(folder.parents[3]).of_boxes(box_map)
+        debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
+    else:
+        raise InputError(
+            "a frame without debug.png", where=folder, expected="debug.png, or the map that was drawn",
+            fix="give --map boxes_3d.json, or render with --set render.debug=true",
+        )  # fmt: skip
+    panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
+    titles = (
+        f"RGB, {meta.camera.fov_deg:.0f} deg", f"depth, black: {DEPTH_RANGE_M:g} m and beyond", "instances, the target red",
+        f"boxes, ids, distances; visibility {meta.target.visibility:.2f}",
+    )  # fmt: skip
+    tiles = [add_caption(panel, title) for panel, title in zip(panels, titles, strict=True)]
+    picture = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
+    write_bytes(out_png, rgb_bytes(picture))
+    return folder.relative_to(tree).as_posix()
+
+
+def _best_frame(tree: Path) -> Path:
+    folders = find_flights(tree)
+    flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    frames = _frames_with(flight, "rgb.png", "depth.npy", "instance.png", "meta.json")
+    return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.visibility[i]), i)))
+
+
 # --- pieces -----------------------------------------------------------------------------------------------------------
 
 
@@ -84,7 +129,8 @@ def _row(flight: Flight) -> np.ndarray:
             tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
-    text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {flight.camera.fov_deg:.0f} deg   {visible}"
+    fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in flight.fovs_deg))
+    text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {fov} deg   {visible}"
     draw_text(strip, text, 8, 15, 0.45, (235, 235, 235))
     return np.vstack([strip, np.hstack(tiles)])
 

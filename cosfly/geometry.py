@@ -118,6 +118,14 @@ def mask_box(mask: np.ndarray) -> np.ndarray:
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], dtype=np.float64)
 
 
+def box_iou(one: np.ndarray, two: np.ndarray) -> float:
+    """Intersection over union of two boxes xmin, ymin, xmax, ymax; 0 when both are empty."""
+    sides = np.minimum(one[2:], two[2:]) - np.maximum(one[:2], two[:2])
+    shared = float(np.prod(np.clip(sides, 0, None)))
+    union = float(np.prod(one[2:] - one[:2]) + np.prod(two[2:] - two[:2])) - shared
+    return shared / union if union > 0 else 0.0
+
+
 def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
     """Bring angles to [-180, 180)."""
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0

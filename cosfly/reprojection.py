@@ -14,6 +14,7 @@ from cosfly.compiled import njit
 
 COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M = 0.3
+ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
 # Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
@@ -57,16 +58,25 @@ def grid_rows(height_px: int) -> np.ndarray:
     return ((np.arange(ROWS) + 0.5) * height_px / ROWS).astype(np.int64)
 
 
-def compare_views(one: View, other: View, intrinsics: np.ndarray) -> Agreement:
+def is_zoomed(one: np.ndarray, other: np.ndarray) -> bool:
+    """Tell whether two cameras, (4,) fx, fy, cx, cy, draw things so differently large that their colours are not those of the same detail."""
+    return bool(abs(np.log(one[0] / other[0])) > ZOOMED)
+
+
+def compare_views(
+    one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray | None = None
+) -> Agreement:
     """Carry the grid's points of one frame into another.
 
     Args:
-        intrinsics: (4,) fx, fy, cx, cy of both.
+        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between them.
     """
+    intrinsics = intrinsics.astype(np.float64)
+    others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
     turn = other.rotation.T @ one.rotation
     shift = other.rotation.T @ (one.position_m - other.position_m)
     counts, errors, brightness = _carry(
-        one.depth, one.instance, other.depth, other.instance, intrinsics.astype(np.float64), turn, shift, MOVING
+        one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING
     )
     pairs: np.ndarray = np.empty((0, 2))
     tint = shade = np.nan
@@ -150,10 +160,11 @@ def _survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, turn, shift, moving):  # type: ignore[no-untyped-def]
+def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving):  # type: ignore[no-untyped-def]
     """Counts (5,), errors (k,), matches (k, 4): column, row of the grid, column and row in the other picture."""
     height, width = depth_a.shape
     fx, fy, cx, cy = intrinsics
+    other_fx, other_fy, other_cx, other_cy = others
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
     errors, num_errors = np.empty(COLUMNS * ROWS), 0
@@ -171,7 +182,7 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, turn, shift, moving):  
             z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
             if z < NEAR_M:
                 continue
-            s, t = fx * px / z + cx, fy * py / z + cy
+            s, t = other_fx * px / z + other_cx, other_fy * py / z + other_cy
             if not (s > 1.5 and t > 1.5 and s < width - 2.5 and t < height - 2.5):
                 continue
             column, row = int(s), int(t)

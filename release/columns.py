@@ -23,6 +23,7 @@ from cosfly.products.weather import WeatherParams
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
+INTRINSICS = ("fx", "fy", "cx", "cy")
 LOOK = tuple(Look.model_fields)
 WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
@@ -175,8 +176,8 @@ SCALARS = (  # everything but pictures and depth
     Column("time_s", "float64", lambda f, i, _: f.time_s[i]),
     Column("width_px", "int32", lambda f, i, _: f.camera.width_px),
     Column("height_px", "int32", lambda f, i, _: f.camera.height_px),
-    Column("fov_deg", "float64", lambda f, i, _: round(f.camera.fov_deg, 6)),
-    Column("intrinsics", ("fx", "fy", "cx", "cy"), lambda f, i, _: f.camera.intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
+    Column("fov_deg", "float64", lambda f, i, _: round(f.camera_at(i).fov_deg, 6)),
+    Column("intrinsics", INTRINSICS, lambda f, i, _: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
     Column("pose", POSE, lambda f, i, _: np.concatenate([f.positions_m[i], f.rotations_deg[i]])),
     Column("target", POINT, lambda f, i, _: f.targets_m[i]),
     Column("target_heading_deg", "float64", lambda f, i, _: f.target_headings_deg[i]),
@@ -205,6 +206,14 @@ SCALARS = (  # everything but pictures and depth
     *(_said(name, "indices") for name in CAPTION_LISTS),
 )
 SCALAR_NAMES = [column.name for column in SCALARS]
+
+
+def matrices_of(intrinsics: np.ndarray) -> np.ndarray:
+    """Give camera matrices, (n, 3, 3), of INTRINSICS (n, 4)."""
+    matrices = np.zeros((len(intrinsics), 3, 3))
+    matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = intrinsics
+    matrices[:, 2, 2] = 1.0
+    return matrices
 
 
 def columns_of(files: Collection[FrameFile]) -> list[Column]:

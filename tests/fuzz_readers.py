@@ -58,6 +58,7 @@ from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, w
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection
+from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
 from cosfly.products.playback import find_flights, read_flight, read_twin
@@ -160,6 +161,15 @@ def make_specimens(root: Path) -> Path:
     _maps(root)
     tree = make_playback_tree(root / "render", 3, 12)
     write_town_map(tree / "Town01", MapHeader(name="Town01"))
+    ids = {
+        "person": 65535,
+        "shared": 65534,
+        "others": [65533],
+        "num_shared": 0,
+        "are_box_ids": True,
+        "boxes": [[1, 1], [7, 7]],
+    }
+    write_json(tree / "Town01" / IDS_FILE, {"schema": IDS_SCHEMA, "schema_version": IDS_VERSION, **ids})
     for folder in find_flights(tree):
         write_checksums(
             folder, {name: digest for name, digest in provenance.folder_digests(folder).items() if name != CHECKSUMS}
@@ -588,6 +598,7 @@ READERS: dict[str, Reader] = {
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
     "PNG, by rows": Reader(PICTURES[::2], lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]]),
+    "instance_ids": _one(f"render/Town01/{IDS_FILE}", lambda path: read_instance_ids(path.parent)),
     "town": _one("render/Town01/map.json", lambda path: read_town_map(path.parent)),
     "flight's checksums": Reader((f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True),
     "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),

@@ -19,6 +19,7 @@ SHARED = (
     "grid",
     "flight_metrics",
     "topview",
+    "overlay",
     "frame_views",
     "student_chat",
     "coverage_page",

@@ -261,7 +261,8 @@ def test_a_shift_into_somebody_falls_back():
     cfg = PerturbationConfig(position_probability=1.0, rotation_probability=0.0)
     cast = cast_of(ring, np.arange(n) * 0.5, np.random.default_rng(0))
     free, among = (
-        perturb(planned, CAMERA, nothing, cfg, np.random.default_rng(3), others) for others in (NOBODY, cast)
+        perturb(planned, [CAMERA] * len(planned.positions_m), nothing, cfg, np.random.default_rng(3), others)
+        for others in (NOBODY, cast)
     )
     fell = [state["position"] == "fallback: person in an obstacle" for state in among.states]
     assert sum(fell) > n / 4
@@ -370,7 +371,7 @@ def planned(n: int = 200, box_map=None) -> Poses:
 
 def perturbed(cfg: PerturbationConfig, n: int = 200, box_map=None, seed: int = 0):
     box_map = box_map or street()
-    return perturb(planned(n, box_map), CAMERA, Surroundings(box_map), cfg, np.random.default_rng(seed))
+    return perturb(planned(n, box_map), [CAMERA] * n, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("sampling", ["cubic", "spherical"])
@@ -462,14 +463,20 @@ def along_a_wall(gap_m: float, n: int = 120) -> tuple[Poses, BoxMap]:
 def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m, least_m):
     """3.0 m, or as near as the plan itself where that flies at its relaxed floor of 2.5 m; far from the wall nothing falls back."""
     before, wall = along_a_wall(gap_m)
-    after = perturb(before, CAMERA, Surroundings(wall), PerturbationConfig(), np.random.default_rng(1))
+    after = perturb(
+        before, [CAMERA] * len(before.positions_m), Surroundings(wall), PerturbationConfig(), np.random.default_rng(1)
+    )
     distances, _ = signed_distances(obstacle_index(wall), after.poses.positions_m, 100.0)
     assert distances.min() >= least_m - 1e-9
     moved = [state["position"] for state in after.states]
     assert moved.count("applied") > 0.15 * len(moved)
     assert ("fallback: drone clearance" in moved) == (gap_m < 6.0)
     careless = perturb(
-        before, CAMERA, Surroundings(wall), PerturbationConfig(min_clearance_m=0.6), np.random.default_rng(1)
+        before,
+        [CAMERA] * len(before.positions_m),
+        Surroundings(wall),
+        PerturbationConfig(min_clearance_m=0.6),
+        np.random.default_rng(1),
     )
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
@@ -655,14 +662,14 @@ def test_no_flight_to_draw(tmp_path):
 
 def test_scripts_depend_on_the_seed_only():
     cfg, around = RenderConfig(width_px=160, height_px=90, first_timestamp=0), Surroundings(street())
-    fovs = {script_flight(circling(3), 0, "clean", "T", around, cfg, seed).camera.fov_deg for seed in range(30)}
+    fovs = {script_flight(circling(3), 0, "clean", "T", around, cfg, seed).cameras[0].fov_deg for seed in range(30)}
     assert {round(fov) for fov in fovs} == {110, 90, 60, 30}
     a, b = (script_flight(circling(9), 0, "perturbed", "T", around, cfg, 3) for _ in range(2))
     np.testing.assert_array_equal(a.perturbed.poses.positions_m, b.perturbed.poses.positions_m)
     fixed = script_flight(
         circling(3), 4, "clean", "T", around, RenderConfig(fovs_deg=(60.0,), first_timestamp=1776000000), 1
     )
-    assert fixed.camera.fov_deg == pytest.approx(60.0)
+    assert fixed.cameras[0].fov_deg == pytest.approx(60.0)
     assert fixed.trajectory == "trajectory_1776000004"
 
 

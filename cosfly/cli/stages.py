@@ -232,6 +232,70 @@ def weather_gallery(
         typer.echo(path)
 
 
+@render_app.command("zoom-study")
+def render_zoom_study(
+    map_: options.Map,
+    simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
+    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
+    out: options.Out,
+    flights: Annotated[int | None, typer.Option(help="Flights at most. [default: 50]")] = None,
+    every: Annotated[int | None, typer.Option(help="Every how many frames of a flight are drawn. [default: 2]")] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    workers: options.Workers = None,
+    verify: options.Verify = False,
+    resume: options.Resume = "if-same",
+    repair: options.Repair = False,
+) -> None:
+    """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
+    from rich.table import Table
+
+    from cosfly.config import build
+    from cosfly.console import console
+    from cosfly.reading.documents import read_object
+    from cosfly.render.zoom import study
+
+    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    options.set_aside(out, repair)
+    options.verify_first(verify, map_, simplified, traces, out)
+    given = {"num_flights": flights, "every": every}
+    settings = cfg.render.model_dump() | {name: value for name, value in given.items() if value is not None}
+    studied = build(study.ZoomStudyConfig, settings, "--flights, --every")
+    product = study.run(studied, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
+    table = Table(title="Zoom (mean ± standard deviation over flights)", title_justify="left")
+    for column in ("level", "deg", "35 mm", "target px", "visibility %", "IoU"):
+        table.add_column(column)
+    for row in study.text_rows(read_object(product, what="zoom study")):
+        table.add_row(*row)
+    console.print(table)
+    options.tell_product(product, out, cfg)
+
+
+@render_app.command("sample")
+def render_sample(
+    out: Annotated[Path, typer.Option(help="PNG to write.")],
+    data: options.Data = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(help="Folder of a frame in the tree. [default: a frame that shows the target whole]"),
+    ] = None,
+    map_: Annotated[
+        Path | None, typer.Option("--map", help="Boxes that were drawn: boxes_3d.json; needed without debug.png.")
+    ] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
+    """One frame's four pictures: colours, depth, instances, and boxes with ids and distances."""
+    from cosfly.gallery import four_panels
+    from cosfly.products.boxes import read_boxes
+
+    options.resolve(config, overrides)
+    box_map = None if map_ is None else read_boxes(map_)
+    typer.echo(four_panels(options.data_folder(data), out, frame=frame, box_map=box_map))
+    typer.echo(out)
+
+
 @app.command()
 def gallery(
     out: Annotated[Path, typer.Option(help="Folder for contact_sheet.png and preview.gif.")],

@@ -5,6 +5,7 @@ The poses that were drawn are measured against the map themselves: a perturbed f
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,7 +32,7 @@ from cosfly.issues import Report
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.inspection import FlightInspection
 from cosfly.products.inspection import Result as FlightResult
-from cosfly.products.playback import Flight, read_flight, read_twin
+from cosfly.products.playback import STATES, Flight, read_flight, read_twin
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.provenance import digest_of, folder_digests
@@ -81,6 +82,9 @@ def inspect_flight(
         check_poses(flight, trace, cfg, report)
     clearance_m = None if obstacles is None else check_surroundings(flight, obstacles, cfg, report, metrics)
     check_shifts(flight, report, metrics)
+    if not flight.is_original:
+        counts = Counter(flight.states)
+        metrics.update({f"frames_{state.replace(' ', '_')}": counts[state] for state in STATES})
     check_motion(flight, cfg, report)
     check_projection(flight, cfg, report)
     check_recorded(flight, root, recorded, report)
@@ -256,7 +260,7 @@ def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None
                 report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
             continue
         pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
-        uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera.intrinsic)
+        uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera_at(i).intrinsic)
         box = target_box(flight, i)
         recorded = (
             ("image_uv", flight.target_uv[i], uv[0], cfg.reprojection_tolerance_px, "px"),

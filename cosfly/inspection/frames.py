@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.geometry import box_corners, mask_box, project, world_from_camera
+from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.jumps import Jumps
 from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
@@ -211,7 +211,7 @@ def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
 
 def target_box(flight: Flight, i: int) -> np.ndarray:
     """Project the target's 3D box: xmin, ymin, xmax, ymax px, cut to the image; NaN where it is not in view."""
-    camera = flight.camera
+    camera = flight.camera_at(i)
     corners_m = box_corners(flight.targets_m[i], np.array(PERSON_HALF_EXTENTS_M))
     uv, _ = project(corners_m, world_from_camera(flight.positions_m[i], flight.rotations_deg[i]), camera.intrinsic)
     low, high = uv.min(axis=0), uv.max(axis=0)  # NaN where a corner lies behind the camera
@@ -236,11 +236,3 @@ def pedestrian_region(kinds: np.ndarray, box: np.ndarray) -> np.ndarray | None:
 
 def _encloses(outer: np.ndarray, inner: np.ndarray) -> bool:
     return bool((outer[:2] <= inner[:2]).all() and (inner[2:] <= outer[2:]).all())
-
-
-def box_iou(one: np.ndarray, two: np.ndarray) -> float:
-    """Intersection over union of two boxes xmin, ymin, xmax, ymax; 0 when both are empty."""
-    sides = np.minimum(one[2:], two[2:]) - np.maximum(one[:2], two[:2])
-    shared = float(np.prod(np.clip(sides, 0, None)))
-    union = float(np.prod(one[2:] - one[:2]) + np.prod(two[2:] - two[:2])) - shared
-    return shared / union if union > 0 else 0.0

@@ -14,7 +14,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.issues import Report
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import Flight
-from cosfly.reprojection import Agreement, View, compare_views, grid_rows, usual_correlation
+from cosfly.reprojection import Agreement, View, compare_views, grid_rows, is_zoomed, usual_correlation
 
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
 LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share of them to mean something
@@ -25,7 +25,7 @@ USUAL_LEAST = 0.6  # correlation from frame to frame: pictures that agree less a
 
 @dataclass
 class Jumps:
-    """Compares each frame with the one before; colours only where both were drawn in the same light and air (`air`)."""
+    """Compares each frame with the one before; colours only where both were drawn in the same light and air (`air`) and as large."""
 
     flight: Flight
     _before: tuple[int, View, object] | None = None
@@ -40,12 +40,11 @@ class Jumps:
         rows = picture.colours[grid_rows(picture.colours.shape[0])]
         view = View(picture.depth, picture.instance, rows, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
         if self._before is not None and i - self._before[0] <= NEAR_FRAMES:
-            _, before, air_before = self._before
-            matrix = flight.camera.intrinsic
-            intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+            k, before, air_before = self._before
+            intrinsics = [flight.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]
             self._frames.append(i)
-            self._found.append(compare_views(before, view, intrinsics))
-            self._same_air.append(air == air_before)
+            self._found.append(compare_views(before, view, *intrinsics))
+            self._same_air.append(air == air_before and not is_zoomed(*intrinsics))
         self._before = (i, view, air)
 
     def judge(self, cfg: InspectConfig, report: Report) -> int:

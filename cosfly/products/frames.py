@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.geometry import mirror_positions, mirror_rotations
+from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.png.write import areas_png, colours_png
 from cosfly.products.places import tree_of_flight
 from cosfly.products.weather import WeatherRecord
@@ -28,7 +28,12 @@ from cosfly.store import dump_json
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
 FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
+DEBUG_FILE = "debug.png"  # for people, where the settings ask for it: no label, and nobody reads it but they
 FRAME_FILES = (*FILE_NAMES.values(), "meta.json")
+FILM_WIDTH_MM = 36.0  # of a 35 mm film's picture
+# Fields of view, degrees: nearer to 0 and 180 a picture is one point, or one line is all of it.
+LEAST_FOV_DEG, MOST_FOV_DEG = 0.1, 179.0
+LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
 META_SCHEMA, META_VERSION = "cosfly.frame", "1.0"
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
@@ -58,6 +63,16 @@ class Camera:
     def fov_deg(self) -> float:
         """Horizontal field of view."""
         return float(np.degrees(2.0 * np.arctan(self.width_px / (2.0 * self.focal_px))))
+
+    @property
+    def focal_35mm_mm(self) -> float:
+        """Focal length of a lens that shows as much, from left to right, on film 36 mm wide."""
+        return FILM_WIDTH_MM * self.focal_px / self.width_px
+
+
+def level_name(fov_deg: float) -> str:
+    """Give the paper's name of a level of zoom, "" for one that is not among them."""
+    return LEVEL_NAMES.get(round(fov_deg, 3), "")
 
 
 class Look(Config):
@@ -90,6 +105,11 @@ class TreePosition(_Group):
     y: float
     z: float
 
+    @property
+    def vector_m(self) -> np.ndarray:
+        """The same in the project's axes, (3,)."""
+        return mirror_positions(np.array([self.x, self.y, self.z]))
+
 
 class TreeAngles(_Group):
     """A turn in the tree's axes, degrees."""
@@ -101,6 +121,11 @@ class TreeAngles(_Group):
 
 class TreePose(TreeAngles, TreePosition):
     """The camera's pose in the tree's axes, m and degrees: x, y, z, pitch, yaw, roll."""
+
+    @property
+    def camera_pose(self) -> np.ndarray:
+        """world_from_camera in the project's axes, (4, 4)."""
+        return world_from_camera(self.vector_m, mirror_rotations(np.array([self.pitch, self.yaw, self.roll])))
 
 
 def tree_position(position_m: np.ndarray) -> TreePosition:
@@ -127,6 +152,7 @@ class CameraMeta(_Group):
     height: int
     fov_deg: float
     focal_length_px: float
+    focal_length_35mm_mm: float | None = None  # null in trees of before it stood here
     intrinsic: list[list[float]]
     near_m: float
     far_m: float
@@ -135,7 +161,7 @@ class CameraMeta(_Group):
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     return CameraMeta(
         width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
-        focal_length_px=camera.focal_px, intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
+        focal_length_px=camera.focal_px, focal_length_35mm_mm=round(camera.focal_35mm_mm, 6), intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
     )  # fmt: skip
 
 
@@ -154,6 +180,11 @@ class TargetMeta(_Group):
     visible: bool
     visibility: float
     num_pixels: int
+
+    @property
+    def center_m(self) -> np.ndarray:
+        """Middle of the box in the project's axes, (3,)."""
+        return self.world_location.vector_m
 
 
 class PerturbationMeta(_Group):
@@ -179,8 +210,7 @@ class OtherMeta(_Group):
     @property
     def center_m(self) -> np.ndarray:
         """Middle of the box in the project's axes, (3,)."""
-        place = self.world_location
-        return mirror_positions(np.array([place.x, place.y, place.z]))
+        return self.world_location.vector_m
 
     @property
     def heading_rad(self) -> float:

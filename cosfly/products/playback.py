@@ -12,7 +12,7 @@ project sees the right-handed frame. Keys that we do not know are kept in `Fligh
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -68,6 +68,8 @@ class Flight:
     drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to each point, zero where none,
     NaN where the file has none for a perturbed point (public files say only that there was one).
     segments, mission: the styles of its parts and the order that ended it, as its plan has them.
+    intrinsics: (n, 3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who projects asks
+    `camera_at`.
     """
 
     town: str
@@ -97,6 +99,7 @@ class Flight:
     run: str = ""  # where flights of several runs are put together
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
+    intrinsics: np.ndarray | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -106,6 +109,16 @@ class Flight:
     def flight_id(self) -> str:
         """`trajectory_1776047127_ORI`, the stem of its sample ids."""
         return self.given_id or f"{self.trajectory}_{self.variant}"
+
+    def camera_at(self, index: int) -> Camera:
+        """The camera that frame `index` was drawn with."""
+        return self.camera if self.intrinsics is None else replace(self.camera, intrinsic=self.intrinsics[index])
+
+    @property
+    def fovs_deg(self) -> tuple[float, float]:
+        """Least and greatest field of view."""
+        fovs = [self.camera_at(i).fov_deg for i in range(len(self) if self.intrinsics is not None else 1)]
+        return min(fovs), max(fovs)
 
     @cached_property
     def styles(self) -> list[str]:
@@ -265,11 +278,13 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         offsets_of(points, name, axes, is_original)
         for name, axes in (("drone_position", XYZ), ("drone_rotation", ANGLES), ("target_position", XYZ))
     )
+    camera = reader.camera(raw.get("camera"))
     return Flight(
         town=folder.resolve().parent.parent.name,
         trajectory=trajectory,
         variant=variant,
-        camera=reader.camera(raw.get("camera")),
+        camera=camera,
+        intrinsics=reader.intrinsics(points, camera),
         time_s=time_s,
         positions_m=mirror_positions(poses[:, :3]),
         rotations_deg=mirror_rotations(poses[:, 3:]),
@@ -345,8 +360,7 @@ def write_flight(folder: Path, flight: Flight) -> None:
         **object_of(raw, "camera"),
         "width": camera.width_px,
         "height": camera.height_px,
-        "focal_length_px": camera.focal_px,
-        "intrinsic": camera.intrinsic.tolist(),
+        **_focal(camera),
     }
     raw["augmentation"] = {
         "enabled": not flight.is_original,
@@ -375,6 +389,8 @@ def write_flight(folder: Path, flight: Flight) -> None:
         following = dict(zip(XYZ, poses[i + 1], strict=False)) if i + 1 < len(points) else None
         point["nav_waypoint"] = {**object_of(point, "nav_waypoint"), "t1_world": following}
         point["perturbation"] = object_of(point, "perturbation")
+        if flight.intrinsics is not None:
+            point["camera"] = {**object_of(point, "camera"), **_focal(flight.camera_at(i))}
         is_nobody = "target" in point and point["target"] is None and np.isnan(flight.targets_m[i]).all()
         if not is_nobody:
             point["target"] = _target(object_of(point, "target"), flight, i)
@@ -383,6 +399,14 @@ def write_flight(folder: Path, flight: Flight) -> None:
                 _put_vector(point[group], key, names, values[i])
     raw["points"] = points
     write_json(folder / "trajectory.json", raw)
+
+
+def _focal(camera: Camera) -> dict:
+    return {
+        "focal_length_px": camera.focal_px,
+        "focal_length_35mm_mm": round(camera.focal_35mm_mm, 6),
+        "intrinsic": camera.intrinsic.tolist(),
+    }
 
 
 def _target(group: dict, flight: Flight, i: int) -> dict:

@@ -142,6 +142,19 @@ class FieldReader:
         check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
         return Camera(int(width), int(height), matrix)
 
+    def intrinsics(self, points: list[dict], camera: Camera) -> np.ndarray | None:
+        """Matrices of the frames, (n, 3, 3), of a flight that zooms; None where `camera` is that of all."""
+        found = np.tile(camera.intrinsic, (len(points), 1, 1))
+        for i, own in enumerate(object_of(point, "camera") for point in points):
+            if own.get("intrinsic") is None:
+                continue
+            try:
+                size = {"width": camera.width_px, "height": camera.height_px}
+                found[i] = self.camera({**size, "intrinsic": own["intrinsic"]}).intrinsic
+            except InputError as error:
+                self.issue(f"points[{i}].camera.intrinsic", error.got, error.expected or "a camera")
+        return None if (found == camera.intrinsic).all() else found
+
 
 def object_of(group: dict, key: str) -> dict:
     value = group.get(key)

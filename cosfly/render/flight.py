@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.geometry import mask_box, world_from_camera
+from cosfly.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
@@ -35,12 +36,12 @@ FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 M
 
 @dataclass(frozen=True)
 class FlightScript:
-    """All that is drawn in one flight, n frames, before a pixel is drawn. source: who planned it; segments, mission: what it was to be."""
+    """All that is drawn in one flight, n frames, before a pixel is drawn. cameras: of each frame. source: who planned it; segments, mission: what it was to be."""
 
     town: str
     trajectory: str
     variant: str
-    camera: Camera
+    cameras: tuple[Camera, ...]
     time_s: np.ndarray
     perturbed: Perturbed
     gait: Gait
@@ -68,10 +69,11 @@ class Seen:
 
 @dataclass(frozen=True)
 class Writing:
-    """How frames are written."""
+    """How frames are written. overlay: draws `debug.png`; None writes none."""
 
     files: tuple[FrameFile, ...]
     visible_threshold: float
+    overlay: Overlay | None = None
 
 
 def render_flight(
@@ -97,10 +99,10 @@ def render_flight(
     digests: dict[str, str] = {}
     with ThreadPoolExecutor(num_threads) as pool:
         for i in range(len(script.time_s)):
-            frame, seen = _draw(renderer, script, i, poses, writing.visible_threshold)
+            frame, seen = draw_frame(renderer, script, i, poses, writing.visible_threshold)
             if script.perturbed.is_shifted(i) and not seen.is_visible:
                 assert script.perturbed.unshifted is not None
-                without = _draw(renderer, script, i, script.perturbed.unshifted.poses, writing.visible_threshold)
+                without = draw_frame(renderer, script, i, script.perturbed.unshifted.poses, writing.visible_threshold)
                 if without[1].is_visible:
                     script.perturbed.drop_shift(i, HIDDEN)
                     frame, seen = without
@@ -121,19 +123,20 @@ def render_flight(
     return flight
 
 
-def _draw(renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float) -> tuple[Frame, Seen]:
+def draw_frame(renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float) -> tuple[Frame, Seen]:
     """Draw frame i from the given poses and see what shows of the target."""
     pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
+    camera = script.cameras[i]
     person, others = script.gait.posed(i, target, script.clothes), script.others.posed(i)
-    frame = renderer.render(pose, script.camera.intrinsic, person, others)
-    view = view_target(target, pose, script.camera)
-    score, num_px = rendered_visibility(frame, target, view, pose, script.camera)
+    frame = renderer.render(pose, camera.intrinsic, person, others)
+    view = view_target(target, pose, camera)
+    score, num_px = rendered_visibility(frame, target, view, pose, camera)
     # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
     is_visible = view.in_view and score > threshold and num_px > 0
     told = None
     if len(script.others):
         ids = np.array([other.instance_id for other in others])
-        hidden = hidden_shares(frame, target, view, pose, script.camera, ids)
+        hidden = hidden_shares(frame, target, view, pose, camera, ids)
         told = script.others.meta(i, frame, *hidden)
     return frame, Seen(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
 
@@ -149,6 +152,9 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
         "instance": lambda: frames.instance_bytes(frame.kinds, frame.ids),
     }
     contents = {frames.FILE_NAMES[file]: makers[file]() for file in writing.files}
+    if writing.overlay is not None:
+        debug = writing.overlay.draw(frame.rgb, frame.ids, meta)
+        contents[frames.DEBUG_FILE] = frames.rgb_bytes(debug)
     contents["meta.json"] = meta.to_bytes()
     target = folder / name
     with storage_errors(target):
@@ -170,7 +176,7 @@ def _annotation(script: FlightScript, i: int, seen: Seen) -> FrameMeta:
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=frames.camera_meta(script.camera, NEAR_M, FAR_M),
+        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
         drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
         target=TargetMeta(
             world_location=frames.tree_position(perturbed.poses.targets_m[i]),
@@ -217,11 +223,13 @@ def _report(perturbed: Perturbed) -> dict:
 
 def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndarray) -> Flight:
     perturbed = script.perturbed
+    zooms = any(camera is not script.cameras[0] for camera in script.cameras)
     return Flight(
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=script.camera,
+        camera=script.cameras[0],
+        intrinsics=np.array([camera.intrinsic for camera in script.cameras]) if zooms else None,
         time_s=script.time_s,
         positions_m=perturbed.poses.positions_m,
         rotations_deg=perturbed.poses.rotations_deg,

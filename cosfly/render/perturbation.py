@@ -8,6 +8,7 @@ the person out of the picture or, once it is drawn, out of sight, is not made, a
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,6 +23,7 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import Camera
 from cosfly.products.kinds import GROUND_KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.render.contract import plane_z_m
 from cosfly.render.others import NOBODY, Cast
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
@@ -119,27 +121,40 @@ class Surroundings:
         slabs = box_map.select(np.isin(box_map.kinds, sorted(GROUND_KINDS)))
         self._centers, self._half = slabs.centers, slabs.half_extents
         self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
-        self._tops = slabs.maxs[:, 2]
+        self._tops, self._bottoms = slabs.maxs[:, 2], slabs.mins[:, 2]
+        self._plane_m = plane_z_m(box_map)
 
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
         """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none. On a slope, the ground."""
         if not self._ground.is_flat:
             return float(self._ground.height_at(np.array([[x_m, y_m]]))[0])
+        over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
+        return float(self._tops[over].max()) if over.any() else near_z_m
+
+    def below_ground_m(self, place_m: np.ndarray) -> float:
+        """How deep a place, (3,), lies in the ground, 0 where it does not: in a slab of it, under the lowest of it, or under a slope."""
+        x_m, y_m, z_m = place_m.tolist()
+        if not self._ground.is_flat:
+            return max(0.0, float(self._ground.height_at(place_m[None])[0]) - z_m)
+        inside = self._slabs_at(x_m, y_m) & (self._bottoms < z_m)
+        return max(0.0, self._plane_m - z_m, float(self._tops[inside].max(initial=-np.inf)) - z_m)
+
+    def _slabs_at(self, x_m: float, y_m: float) -> np.ndarray:
+        """Tell which slabs of the ground are over or under a place, (n,) bool."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
-        over = (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
-        return float(self._tops[over].max()) if over.any() else near_z_m
+        return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
 
 
 def perturb(
     planned: Poses,
-    camera: Camera,
+    cameras: Sequence[Camera],
     surroundings: Surroundings,
     cfg: PerturbationConfig,
     rng: np.random.Generator,
     others: Cast = NOBODY,
 ) -> Perturbed:
-    """Perturb every frame of a flight. The same number of random draws is used for every frame, whatever happens in it."""
+    """Perturb every frame of a flight, seen through its camera. The same number of random draws is used for every frame, whatever happens in it."""
     unshifted = Perturbed.nothing(planned)
     result = replace(Perturbed.nothing(planned), unshifted=unshifted)
     for i in range(len(result.states)):
@@ -149,10 +164,10 @@ def perturb(
         view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
         position = NONE
         if events[0] < cfg.position_probability:
-            position = _shift(result, planned, i, person_offset, drone_offset, camera, surroundings, cfg, others)
+            position = _shift(result, planned, i, person_offset, drone_offset, cameras[i], surroundings, cfg, others)
         if events[1] < cfg.rotation_probability:
             for each in (unshifted, result):
-                _turn(each, i, view_offset, camera, cfg)
+                _turn(each, i, view_offset, cameras[i], cfg)
         if position != APPLIED:
             result.drop_shift(i, position)
     return result

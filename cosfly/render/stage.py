@@ -17,9 +17,10 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from cosfly.chance import rng_for
 from cosfly.config import MayDiffer
 from cosfly.errors import ConfigError, InputError
-from cosfly.geometry import intrinsic_matrix
+from cosfly.overlay import Overlay
 from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.frames import Camera, FrameFile, Look
+from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
+from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION
 from cosfly.products.others import Company, read_others
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.town import write_town_map
@@ -32,7 +33,9 @@ from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.others import NOBODY, Cast, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
+from cosfly.render.sense import check_flight, check_ground
 from cosfly.render.weather import WeatherConfig, coverage_of, drawn_seed, read_pools, told_coverage, weather_of
+from cosfly.render.zoom.lens import ZoomConfig, cameras_of
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Kept, Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
@@ -44,7 +47,6 @@ VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
 FROM_ONE_RUN = "give the others.json that was written beside the walks' path.json"
-IDS_SCHEMA, IDS_VERSION = "cosfly.instance_ids", "1.0"
 
 
 class RenderConfig(WeatherConfig):
@@ -59,8 +61,9 @@ class RenderConfig(WeatherConfig):
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
-        description="horizontal fields of view, degrees; one is drawn for each walk, and both its tracks keep it; a list of one fixes it",
+        description="levels of zoom: horizontal fields of view in (0, 180) degrees; one is drawn for each walk, and both its tracks keep it; a list of one fixes it",
     )
+    zoom: ZoomConfig = Field(ZoomConfig(), description="whether a flight changes its level")
     town: str | None = Field(
         None,
         description="name of the town; null takes the map's. Its folder has `Town_` in front unless it begins with `Town`",
@@ -79,6 +82,9 @@ class RenderConfig(WeatherConfig):
     modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
     )
+    debug: bool = Field(
+        False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
+    )
     visible_threshold: float = Field(
         0.1,
         ge=0,
@@ -92,8 +98,10 @@ class RenderConfig(WeatherConfig):
     @field_validator("fovs_deg")
     @classmethod
     def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
-        if not all(1.0 <= fov < 170.0 for fov in fovs):
-            raise ValueError("every field of view must lie in [1, 170) degrees")
+        if wrong := [fov for fov in fovs if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG]:
+            raise ValueError(
+                f"every field of view must lie in (0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}; got {wrong[0]:g}"
+            )
         return fovs
 
     @model_validator(mode="after")
@@ -154,18 +162,20 @@ def script_flight(
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
-    camera = Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
+    lens_rng = rng_for(seed, "render", f"{trace.path_id}/zoom")
+    size_px = cfg.width_px, cfg.height_px
+    cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
     planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
-        perturbed = perturb(planned, camera, surroundings, cfg.perturbation, rng, others)
+        perturbed = perturb(planned, cameras, surroundings, cfg.perturbation, rng, others)
     else:
         perturbed = Perturbed.nothing(planned)
     return FlightScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
-        camera=camera,
+        cameras=cameras,
         time_s=trace.time_s,
         perturbed=perturbed,
         gait=gait_of(trace.targets_m, trace.time_s),
@@ -217,6 +227,7 @@ def run(
     if stage.is_complete:
         return out
     box_map = read_boxes(boxes)
+    check_ground(box_map, boxes)
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)
     passed = [(number, trace) for number, trace in enumerate(all_traces) if trace.drop_reason is None]
@@ -235,7 +246,7 @@ def run(
     ]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
-    ids_file = out / town / "instance_ids.json"
+    ids_file = out / town / IDS_FILE
     write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)
     made = [result_of(record, _Rendered) for record in finished.kept]
@@ -376,13 +387,16 @@ def make_worker(
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
     companies = _companies(others, all_traces)
     num_others = num_others_of(companies)
-    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, num_others)
+    drawn = read_boxes(boxes)
+    renderer = open_renderer(cfg.backend, drawn, cfg.width_px, cfg.height_px, cfg.look, num_others)
     pools = read_pools(cfg)
-    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold)
+    overlay = Overlay(drawn, instance_ids(drawn, num_others)) if cfg.debug else None
+    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, overlay)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
         trace = all_traces[number]
+        check_flight(trace, surroundings)
         company = companies.get(trace.path_id)
         rng = rng_for(seed, "render", f"{trace.path_id}/others")
         cast = NOBODY if company is None else cast_of(company.others, trace.time_s, rng)
@@ -396,7 +410,8 @@ def make_worker(
             {
                 "folder": str(folder.relative_to(out)),
                 "num_frames": len(flight),
-                "fov_deg": round(script.camera.fov_deg, 6),
+                "fov_deg": round(flight.camera.fov_deg, 6),
+                **({} if flight.intrinsics is None else {"fovs_deg": [round(fov, 6) for fov in flight.fovs_deg]}),
                 "num_visible": int(flight.target_visible.sum()),
                 "mean_visibility": round(float(flight.visibility.mean()), 6),
                 "num_perturbed": int(flight.is_perturbed.sum()),

@@ -209,7 +209,7 @@ class Counted:
     characters: Counter[str] = field(default_factory=Counter)
     sums: dict[str, Sum] = field(default_factory=lambda: {name: Sum() for name in SUMS})
     flights: dict[tuple[str, ...], FlightCount] = field(default_factory=dict)  # by track and PLACE
-    fovs: dict[tuple[str, ...], str] = field(default_factory=dict)  # a trajectory keeps its field of view
+    fovs: dict[tuple[str, ...], Counter[str]] = field(default_factory=dict)  # of a trajectory: field of view -> frames
     coverage: Coverage = field(default_factory=Coverage)
     example: dict[str, str] = field(default_factory=dict)
 
@@ -242,7 +242,8 @@ class Counted:
             self.sums[name].join(values)
         for key, flight in later.flights.items():
             self._go_on(key, flight)
-        self.fovs.update(later.fovs)
+        for trajectory, frames in later.fovs.items():
+            self.fovs.setdefault(trajectory, Counter()).update(frames)
         if later.rows:
             self.coverage = Coverage.total([self.coverage, later.coverage]) if self.rows else later.coverage
         self.example = self.example or later.example
@@ -251,9 +252,10 @@ class Counted:
     def _add(self, row: dict[str, Any]) -> tuple[float, ...]:
         """Count a row; give what the coverage needs: person to drone (x, y, z), heading, height in px, visibility."""
         self.totals.update(name for name in FLAGS if row[name])
-        fov = self.fovs[row["run"], row["town"], row["trajectory"]] = f"{row['fov_deg']:g}"
+        trajectory = row["run"], row["town"], row["trajectory"]
+        self.fovs.setdefault(trajectory, Counter())[f"{row['fov_deg']:g}"] += 1
         size = f"{row['width_px']} x {row['height_px']}"
-        for name, value in {"town": row["town"], "track": row["track"], "fov_deg": fov, "image_px": size}.items():
+        for name, value in {"town": row["town"], "track": row["track"], "image_px": size}.items():
             self.counts[name][value] += 1
         pose, target, box = row["pose"], row["target"], row["target_mask_bbox"]
         place = clean_place(row)
@@ -289,6 +291,9 @@ class Counted:
 
     def numbers(self, shards: list[Path], num_frames: int | None) -> Numbers:
         """Give the numbers of the rows of these shards."""
+        self.counts["fov_deg"] = Counter()
+        for frames in self.fovs.values():
+            self.counts["fov_deg"][_fov_of(frames)] += frames.total()
         flights, sums, totals = self.flights.values(), self.sums, self.totals
         spread = {name: values.spread() for name, values in sums.items()}
         return Numbers(
@@ -296,7 +301,7 @@ class Counted:
             flights=len(flights),
             trajectories=len(self.fovs),
             frames_by=FramesBy(**{name: _sorted(self.counts[name]) for name in FramesBy.model_fields}),
-            trajectories_by_fov_deg=_sorted(Counter(self.fovs.values())),
+            trajectories_by_fov_deg=_sorted(Counter(map(_fov_of, self.fovs.values()))),
             flights_by_track=_sorted(Counter(track for track, *_ in self.flights)),
             frames_per_flight=spread_of(float(flight.frames) for flight in flights),
             flights_shorter_than_num_frames=sum(flight.frames < (num_frames or 0) for flight in flights),
@@ -353,6 +358,11 @@ def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
                     chunk = table.metadata.row_group(group).column(column)
                     sizes[owner.get(chunk.path_in_schema.split(".")[0], "annotations")] += chunk.total_compressed_size
     return dict(sorted(sizes.items()))
+
+
+def _fov_of(frames: Counter[str]) -> str:
+    """Name a trajectory's field of view, or say that it changes."""
+    return next(iter(frames)) if len(frames) == 1 else "changing"
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:

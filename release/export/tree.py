@@ -29,7 +29,7 @@ from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.runner import advance
 from cosfly.store import CHECKSUMS, checksum_lines, write_model
-from release.columns import BOX, PICTURES, POINT, POSE, SCALAR_NAMES
+from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, matrices_of
 from release.export.contract import ExportConfig, Facts, Files, Unit, Written
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
 
@@ -140,15 +140,14 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
     """Give the flight that released rows are of; `number` is its trajectory's among those of the release.
 
     Raises:
-        InputError: a row has no pose or intrinsics, or the camera changes on the way.
+        InputError: a row has no pose or intrinsics, or the pictures' size changes on the way.
     """
-    cameras = {(r["width_px"], r["height_px"], *(r["intrinsics"] or {}).values()) for r in rows}
-    if len(cameras) != 1 or any(r["pose"] is None or r["intrinsics"] is None for r in rows):
+    sizes = {(r["width_px"], r["height_px"]) for r in rows}
+    if len(sizes) != 1 or any(r["pose"] is None or r["intrinsics"] is None for r in rows):
         raise InputError(
-            "a flight has one camera, and every frame a pose", where=placed.name, got=f"{len(cameras)} cameras"
-        )
-    k = rows[0]["intrinsics"]
-    intrinsic = np.array([[k["fx"], 0.0, k["cx"]], [0.0, k["fy"], k["cy"]], [0.0, 0.0, 1.0]])
+            "a flight has pictures of one size, and every frame a pose and intrinsics", where=placed.name, got=f"{len(sizes)} sizes"
+        )  # fmt: skip
+    intrinsics = matrices_of(_vectors(rows, "intrinsics", INTRINSICS))
     poses = _vectors(rows, "pose", POSE)
     offsets = _vectors(rows, "drone_offset", POSE)
     has_mask_box = any(row["target_mask_bbox"] is not None for row in rows)
@@ -157,7 +156,8 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
         town=placed.town,
         trajectory=placed.trajectory,
         variant=placed.variant,
-        camera=Camera(rows[0]["width_px"], rows[0]["height_px"], intrinsic),
+        camera=Camera(rows[0]["width_px"], rows[0]["height_px"], intrinsics[0]),
+        intrinsics=None if (intrinsics == intrinsics[0]).all() else intrinsics,
         time_s=placed.time_s,
         positions_m=poses[:, :3],
         rotations_deg=poses[:, 3:],

@@ -17,6 +17,7 @@ from release.card.numbers import Place3, Sum, bounded, clean_place
 from release.columns import BOX, PLACE, POINT
 
 LANGUAGES: tuple[Language, ...] = ("en", "zh")
+SAME_FOV_DEG = 0.05
 LEAST_STEP_S = 1e-3  # between two frames
 TEXT_BIN = {"en": 25, "zh": 10}  # characters
 STATES = ("proved", "contradicted", "unread")
@@ -38,7 +39,7 @@ ANNOTATIONS = {
 
 @dataclass
 class FlightSums:
-    """Sums over the frames of one flight.
+    """Sums over the frames of one flight. fov_deg, focal_px: of its first frame; zooms: later ones have others.
 
     path_m: the way of the clean motion through its frames. accel, jerk: squares of the differences of four frames in a row, and how many. tail: the
     last frames in a row, index, s, place.
@@ -50,6 +51,7 @@ class FlightSums:
     walk: str
     fov_deg: float
     focal_px: float | None
+    zooms: bool = False
     frames: int = 0
     captions: int = 0
     path_m: float = 0.0
@@ -67,6 +69,7 @@ class FlightSums:
     def add(self, row: Mapping[str, Any]) -> None:
         """Add a frame."""
         self.frames += 1
+        self.zooms |= abs(bounded(row["fov_deg"]) - self.fov_deg) > SAME_FOV_DEG
         self.captions += row["has_caption"]
         place, time_s = clean_place(row), bounded(row["time_s"])
         if place is None:

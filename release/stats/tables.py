@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 
 from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
+from cosfly.products.frames import LEVEL_NAMES
 from release.card.numbers import bounded, spread_of
 from release.columns import PICTURES
 from release.record import ReleaseRecord
@@ -14,7 +15,6 @@ from release.stats.counting import ANNOTATIONS, Counts, FlightSums
 from release.stats.pixels import Pixels
 from release.stats.schema import Absent, Cell, Stats, Table
 
-ZOOM_LEVELS = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 
 
@@ -175,24 +175,26 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
 
 
 def _zoom(counts: Counts) -> Table:
-    groups: dict[tuple[float, str], list[FlightSums]] = defaultdict(list)
+    groups: dict[tuple[float | None, str], list[FlightSums]] = defaultdict(list)
     for flight in counts.flights.values():
-        groups[round(flight.fov_deg, 1), flight.track].append(flight)
+        groups[None if flight.zooms else round(flight.fov_deg, 1), flight.track].append(flight)
     rows: list[list[Cell]] = []
-    for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-pair[0][0], pair[0][1])):
+    for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-(pair[0][0] or 0.0), pair[0][1])):
         means = [
             mean_over(flights, of)
             for of in (lambda f: f.width_px, lambda f: f.height_px, lambda f: f.visibility, lambda f: f.iou)
         ]
         visibility = None if means[2] is None else 100.0 * means[2]
-        level = ZOOM_LEVELS.get(round(fov), "")
-        focal_px = mean_cell(flight.focal_px for flight in flights if flight.focal_px is not None)
+        level = "changing" if fov is None else LEVEL_NAMES.get(round(fov), "")
+        focal_px = (
+            None if fov is None else mean_cell(flight.focal_px for flight in flights if flight.focal_px is not None)
+        )
         rows.append([level, fov, track, *rounded(focal_px), len(flights), *rounded(*means[:2], visibility, means[3])])
-    here = {round(fov) for fov, _ in groups}
-    missing = ", ".join(f"{name} ({fov} deg)" for fov, name in ZOOM_LEVELS.items() if fov not in here)
+    here = {round(fov) for fov, _ in groups if fov is not None}
+    missing = ", ".join(f"{name} ({fov} deg)" for fov, name in LEVEL_NAMES.items() if fov not in here)
     note = (
         "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of that box and the box of the person's pixels. "
-        "Each flight has one field of view, so rows are of different flights; the paper's study of the same flights at four is another matter."
+        'A flight of one field of view is in its row, one that zooms under "changing", so rows are of different flights; the paper\'s study of the same flights at four is another matter.'
     )
     note += f" Not in this release: {missing}." if missing else ""
     head = [
@@ -212,13 +214,20 @@ def _zoom(counts: Counts) -> Table:
 def _fovs(counts: Counts) -> Table:
     frames, trajectories = Counter[float](), Counter[float]()
     for flight in counts.flights.values():
-        frames[round(flight.fov_deg, 1)] += flight.frames
+        frames[_fov_of(flight)] += flight.frames
     for flight in _trajectories(counts):
-        trajectories[round(flight.fov_deg, 1)] += 1
-    rows: list[list[Cell]] = [[f"{fov:g}", trajectories[fov], frames[fov]] for fov in sorted(frames)]
+        trajectories[_fov_of(flight)] += 1
+    rows: list[list[Cell]] = [
+        [f"{fov:g}" if fov else "changing", trajectories[fov], frames[fov]] for fov in sorted(frames)
+    ]
     head = ["degrees", "trajectories", "frames"]
     paper = "tab:zoom_config, sec:exp_release"
     return Table(key="fovs", title="Fields of view", paper=paper, head=head, rows=rows, plot="bars")
+
+
+def _fov_of(flight: FlightSums) -> float:
+    """Its field of view, degrees; 0 for one that zooms."""
+    return 0.0 if flight.zooms else round(flight.fov_deg, 1)
 
 
 def _towns(record: ReleaseRecord, counts: Counts) -> Table:

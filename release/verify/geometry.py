@@ -48,21 +48,23 @@ def project_targets(flight: FlightRows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_camera(flight: FlightRows, findings: Findings) -> None:
-    """The camera is the same in all rows (identity.py), so the first one tells."""
-    fx, fy, cx, cy = flight.intrinsics[0]
-    width, height = flight.size_px[0]
-    fov = flight.numbers("fov_deg")[0]
-    if not (fx > 0 and fy > 0):
-        findings.error("intrinsics", flight.where(0, "intrinsics"), f"fx {fx}, fy {fy}", "focal lengths above 0")
-        return
-    expected = float(np.degrees(2.0 * np.arctan(width / (2.0 * fx))))
-    if not abs(fov - expected) <= FOV_DEG:
-        got = f"{fov} degrees, and a focal length of {fx} px"
-        findings.error("field_of_view", flight.where(0, "fov_deg"), got, f"{expected:.6f} degrees, of width and focal length")  # fmt: skip
-    if abs(fx - fy) > SQUARE * fx:
-        findings.error("intrinsics", flight.where(0, "intrinsics"), f"fx {fx}, fy {fy}", "square pixels")
-    if not (abs(cx - width / 2) <= CENTRE_PX and abs(cy - height / 2) <= CENTRE_PX):
-        findings.error("intrinsics", flight.where(0, "intrinsics"), f"principal point ({cx}, {cy})", f"the middle, ({width / 2:g}, {height / 2:g})")  # fmt: skip
+    """Where the camera is the same in all rows, which identity.py holds, the first one tells."""
+    fovs = flight.numbers("fov_deg")
+    for i in range(len(flight) if flight.zooms else 1):
+        fx, fy, cx, cy = flight.intrinsics[i]
+        width, height = flight.size_px[i]
+        fov = fovs[i]
+        if not (fx > 0 and fy > 0):
+            findings.error("intrinsics", flight.where(i, "intrinsics"), f"fx {fx}, fy {fy}", "focal lengths above 0")
+            return
+        expected = float(np.degrees(2.0 * np.arctan(width / (2.0 * fx))))
+        if not abs(fov - expected) <= FOV_DEG:
+            got = f"{fov} degrees, and a focal length of {fx} px"
+            findings.error("field_of_view", flight.where(i, "fov_deg"), got, f"{expected:.6f} degrees, of width and focal length")  # fmt: skip
+        if abs(fx - fy) > SQUARE * fx:
+            findings.error("intrinsics", flight.where(i, "intrinsics"), f"fx {fx}, fy {fy}", "square pixels")
+        if not (abs(cx - width / 2) <= CENTRE_PX and abs(cy - height / 2) <= CENTRE_PX):
+            findings.error("intrinsics", flight.where(i, "intrinsics"), f"principal point ({cx}, {cy})", f"the middle, ({width / 2:g}, {height / 2:g})")  # fmt: skip
 
 
 def _check_projection(flight: FlightRows, uv: np.ndarray, depth: np.ndarray, findings: Findings) -> None:

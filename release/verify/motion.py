@@ -15,7 +15,7 @@ STEP_S = 1e-3  # frames are one time step apart; times are written with three di
 # The inspection's limits for teleports: nothing in the data flies 25 m/s or walks 10 m/s.
 DRONE_MPS, TARGET_MPS = 25.0, 10.0
 UNTOLD_M = 6.0  # a shift that a public file does not tell: the paper's 3 m of the drone, at both ends
-EXACT_M, EXACT_DEG = 1e-4, 1e-3  # sums and differences of what stands in two rows
+EXACT_M, EXACT_DEG, EXACT_PX = 1e-4, 1e-3, 1e-3  # sums and differences of what stands in two rows
 # Greatest shifts of tab:augmentation_params, in a cube (sampling: cubic) and with a step of the ground.
 DRONE_SHIFT_M, TARGET_SHIFT_M, TURN_DEG = 3.0 * np.sqrt(3.0), 2.0 * np.sqrt(2.0) + 0.5, 45.0
 
@@ -139,6 +139,9 @@ def _check_twin(flight: FlightRows, twin: FlightRows, findings: Findings) -> Non
     if not pairs:
         return
     mine, theirs = (np.array(rows) for rows in zip(*pairs, strict=True))
+    if flight.zooms or twin.zooms:  # else the first rows told
+        for i in np.flatnonzero(np.abs(flight.intrinsics[mine] - twin.intrinsics[theirs]).max(axis=1) > EXACT_PX):
+            findings.error("pair", flight.where(mine[i], "intrinsics"), flight.intrinsics[mine[i]].tolist(), f"{twin.intrinsics[theirs[i]].tolist()}, as in its clean flight")  # fmt: skip
     drone, target, untold = clean_positions(flight)
     off_drone = np.linalg.norm(drone[mine] - twin.pose[theirs, :3], axis=1)
     off_target = np.linalg.norm(target[mine] - twin.target_m[theirs], axis=1)

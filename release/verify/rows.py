@@ -15,12 +15,14 @@ from cosfly.products.frames import Camera
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from release.columns import BOX, PICTURE_PX, POINT, POSE, WINDOW
+from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 NEAR_M = 0.3  # the renderers' near plane
-INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,12 @@ class FlightRows:
         return self.vectors("intrinsics", INTRINSICS)
 
     @cached_property
+    def zooms(self) -> bool:
+        """Whether its camera changes; one or two rows that differ from all others are no zoom."""
+        _, counts = np.unique(self.intrinsics, axis=0, return_counts=True)
+        return bool(len(self) - counts.max() >= LEAST_ZOOMED)
+
+    @cached_property
     def size_px(self) -> np.ndarray:
         """(n, 2) width, height."""
         return np.stack([self.numbers("width_px"), self.numbers("height_px")], axis=1)
@@ -151,10 +159,8 @@ class FlightRows:
     def flight(self) -> Flight:
         """The same as a flight of the playback tree, for those who know that."""
         first = self.rows[0]
-        fx, fy, cx, cy = self.intrinsics[0]
-        camera = Camera(
-            int(self.size_px[0, 0]), int(self.size_px[0, 1]), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        )
+        matrices = matrices_of(self.intrinsics)
+        camera = Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0])
         has_mask = not np.isnan(self.mask_box).all()
         return Flight(
             town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
@@ -165,6 +171,7 @@ class FlightRows:
             is_perturbed=self.flags("is_perturbed"), drone_offsets_m=self.drone_offset[:, :3],
             rotation_offsets_deg=self.drone_offset[:, 3:], target_offsets_m=self.target_offset,
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
+            intrinsics=matrices if self.zooms else None,
         )  # fmt: skip
 
     def shown(self, twin: FlightRows | None, settings: dict[str, Any] | None) -> ShownFlight:

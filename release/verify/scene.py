@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.reprojection import Agreement, View, compare_views, usual_correlation
+from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlation
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
@@ -105,11 +105,17 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
     k, previous = before[-1]
     pairs.rows.append(i)
     pairs.gaps.append(int(flight.index[i] - flight.index[k]))
-    pairs.found.append(compare_views(previous, view, flight.intrinsics[i]))
+    pairs.found.append(compare_views(previous, view, flight.intrinsics[k], flight.intrinsics[i]))
     pairs.elsewhere.append(np.nan)
+    if is_zoomed(
+        flight.intrinsics[k], flight.intrinsics[i]
+    ):  # other detail is seen: depth and instances tell, colours do not
+        pairs.found[-1] = replace(pairs.found[-1], correlation=np.nan, tint=np.nan)
     if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
         moved = replace(view, colours=previous.colours)
-        pairs.elsewhere[-2] = compare_views(before[0][1], moved, flight.intrinsics[i]).correlation
+        pairs.elsewhere[-2] = compare_views(
+            before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i]
+        ).correlation
 
 
 def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Findings) -> None:

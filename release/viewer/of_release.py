@@ -54,6 +54,7 @@ class Scanned:
 
     def __init__(self, row: Mapping[str, Any]) -> None:
         self.row = row
+        self.fovs_deg = set[float]()
         self.places: dict[int, tuple[list[float], list[float]]] = {}
         self.kinds: dict[int, tuple] = {}
         self.groups: dict[int, tuple[Path, int]] = {}
@@ -65,6 +66,7 @@ class Scanned:
         numbers = [row["time_s"], row["fov_deg"], *row["pose"].values(), *(target or {}).values()]
         for value in (*numbers, row["visibility"] or 0.0):
             bounded(value)
+        self.fovs_deg.add(round(row["fov_deg"], 1))
         drone = [row["pose"][axis] for axis in POINT[:2]]
         self.places[index] = (drone, [np.nan] * 2 if target is None else [target[axis] for axis in POINT[:2]])
         self.groups[index] = (shard, group)
@@ -149,6 +151,7 @@ def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) ->
         is_perturbed=bool(row["is_perturbed"]),
         events=row["perturbation"],
         style=row["style"],
+        fov_deg=round(row["fov_deg"], 1),
         box=None if box is None else box_of([box[name] for name in BOX], row["width_px"], row["height_px"]),
         pictures=pictures.of_frame(views),
         caption=_caption(row) if row["has_caption"] else None,
@@ -200,7 +203,7 @@ def _flight(scanned: Scanned) -> ShownFlight:
         track=row["track"],
         split=row["split"],
         result=None,
-        fov_deg=round(row["fov_deg"], 1),
+        fovs_deg=(min(scanned.fovs_deg), max(scanned.fovs_deg)),
         num_frames=len(order),
         num_captions=len(scanned.kinds),
         drone_path=path_of(np.array([scanned.places[index][0] for index in order])),

@@ -65,13 +65,14 @@ class ShownFrame(BaseModel):
     is_perturbed: bool
     events: dict[str, str | None] | None
     style: str | None
+    fov_deg: float
     box: tuple[float, float, float, float] | None = None
     pictures: dict[View, str] = {}
     caption: ShownCaption | None = None
 
 
 class ShownFlight(BaseModel):
-    """A flight. group: what both tracks of a trajectory share; map: key of its map; result: of the inspection; paths from above."""
+    """A flight. fovs_deg: the least and the greatest of its frames. group: what both tracks of a trajectory share; map: key of its map; result: of the inspection; paths from above."""
 
     name: str
     group: str
@@ -80,7 +81,7 @@ class ShownFlight(BaseModel):
     track: Literal["clean", "perturbed"]
     split: str | None
     result: str | None
-    fov_deg: float
+    fovs_deg: tuple[float, float]
     num_frames: int
     num_captions: int
     drone_path: list[Point2]

@@ -123,7 +123,7 @@ function drawFlights() {
   const rows = data.flights.map((flight, number) => {
     if (!counts.has(number)) return null;
     const [head, tail] = [flight.name.split("/").slice(0, -2).join("/"), flight.name.split("/").slice(-2).join(" / ")];
-    const facts = [flight.track, flight.split, flight.result, `${flight.fov_deg}\u00b0`].filter(Boolean).join(" \u00b7 ");
+    const facts = [flight.track, flight.split, flight.result, `${[...new Set(flight.fovs_deg)].join(" to ")}\u00b0`].filter(Boolean).join(" \u00b7 ");
     const row = make("button", { type: "button", class: number === state.flight ? "here" : "", "aria-current": number === state.flight },
       make("small", {}, head), make("b", {}, tail), make("small", {}, `${facts} \u00b7 ${counts.get(number)} of ${flight.frames.length} frames`));
     row.addEventListener("click", () => { state.flight = number; state.index = null; update(); });
@@ -181,10 +181,10 @@ function drawMap(sample) {
   const boxes = (data.maps[flight.map] || []).map((box) => draw("polygon", { points: box.corners.map(at).join(" "), class: `box ${box.kind}` }, draw("title", {}, box.kind)));
   const parts = [...boxes, ...both.map((one) => line(one.drone_path, `drone other ${one.track}`)), line(flight.target_path, "target"), line(flight.drone_path, `drone ${flight.track}`)];
   if (sample) {
-    const frame = flight.frames[sample.frame], [x, y, , yaw] = frame.drone, open = (flight.fov_deg / 360) * Math.PI;
+    const frame = flight.frames[sample.frame], [x, y, , yaw] = frame.drone, open = (frame.fov_deg / 360) * Math.PI;
     const away = frame.target ? Math.hypot(x - frame.target[0], y - frame.target[1]) : 0, reach = Math.max(side / 8, (1.25 * away) / Math.max(0.2, Math.cos(open)));
     const ray = (turn) => { const angle = ((yaw + turn) * Math.PI) / 180; return at([x + reach * Math.cos(angle), y + reach * Math.sin(angle)]); };
-    parts.push(draw("polygon", { points: [at([x, y]), ray(-flight.fov_deg / 2), ray(flight.fov_deg / 2)].join(" "), class: "view" }));
+    parts.push(draw("polygon", { points: [at([x, y]), ray(-frame.fov_deg / 2), ray(frame.fov_deg / 2)].join(" "), class: "view" }));
     const dot = (place, name) => { const [cx, cy] = at(place).split(","); return draw("circle", { cx, cy, r: side / 80, class: name }); };
     if (frame.target) parts.push(dot(frame.target, "target dot"));
     parts.push(dot([x, y], `drone dot ${flight.track}`));

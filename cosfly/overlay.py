@@ -1,0 +1,148 @@
+"""What a frame's labels say, drawn over its colours: the 3D boxes of map, target and others, with ids and distances (`debug.png`).
+
+Everything is projected again from `meta.json` and the map, nothing is taken from the picture's own shapes: where a line does not fit what is
+drawn under it, one of them is wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cosfly.geometry import box_corners, rotation_matrices
+from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import FrameMeta
+from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES
+from cosfly.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
+
+TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
+LEAST_SHARE = 5e-4  # of the picture: boxes of which less is seen are left out
+MOST_LABELS = 16  # of the boxes that take most of the picture
+FAR_PX = 20_000.0  # lines are drawn so far beyond the picture
+# Pairs of corners, in the order of geometry.box_corners, that an edge of a box joins.
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+
+
+class _Box(NamedTuple):
+    """One box to draw: corners (8, 3) and middle (3,), world m."""
+
+    corners_m: np.ndarray
+    center_m: np.ndarray
+    color: Color
+    label: str
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """The boxes of a map and their ids in `instance.png`, (n,)."""
+
+    box_map: BoxMap
+    instance_ids: np.ndarray
+
+    def draw(self, rgb: np.ndarray, ids: np.ndarray, meta: FrameMeta) -> np.ndarray:
+        """Give the picture with boxes, ids and distances drawn in, (h, w, 3) uint8.
+
+        Args:
+            rgb: (h, w, 3) uint8; ids: (h, w) of `instance.png`, which tell what of the map is seen.
+        """
+        picture = np.ascontiguousarray(rgb).copy()
+        camera_pose, intrinsic = meta.drone_pose.camera_pose, np.array(meta.camera.intrinsic)
+        scale = picture.shape[1] / 1280.0
+        labels = _Labels(picture, scale)
+        for boxes, width in ((self._seen(ids), 1), (_moving(meta), 2)):
+            for box in boxes:
+                lines = _lines(box.corners_m, camera_pose, intrinsic, meta.camera.near_m)
+                for begin, end in lines:
+                    cv2.line(picture, begin, end, box.color, max(1, round(width * scale)), cv2.LINE_AA)
+                if box.label and lines:
+                    ends = np.array(lines).reshape(-1, 2)
+                    text = f"{box.label} {np.linalg.norm(box.center_m - camera_pose[:3, 3]):.1f} m"
+                    labels.add(text, float(ends[:, 0].mean()), float(ends[:, 1].min()), box.color)
+        labels.write()
+        return picture
+
+    def _seen(self, ids: np.ndarray) -> list[_Box]:
+        """Give the boxes that take enough of the picture, ground left out, the largest last: their labels are on top."""
+        found, counts = np.unique(ids, return_counts=True)
+        pixels = dict(zip(found.tolist(), counts.tolist(), strict=True))
+        seen = np.array([pixels.get(int(one), 0) for one in self.instance_ids.tolist()])
+        rows = np.flatnonzero((seen >= LEAST_SHARE * ids.size) & ~self.box_map.is_any_of(GROUND_KINDS))
+        rows = rows[np.argsort(seen[rows], kind="stable")]
+        turns = rotation_matrices(np.radians(self.box_map.rotations_deg[rows]))
+        boxes = []
+        for place, (row, turn) in enumerate(zip(rows.tolist(), turns, strict=True)):
+            kind, center_m = KIND_NAMES[int(self.box_map.kinds[row])], self.box_map.centers[row]
+            corners_m = box_corners(np.zeros(3), self.box_map.half_extents[row]) @ turn.T + center_m
+            label = f"{kind} {self.instance_ids[row]}" if place >= len(rows) - MOST_LABELS else ""
+            boxes.append(_Box(corners_m, center_m, _bright(COLORS.get(kind, OTHER_COLOR)), label))
+        return boxes
+
+
+def _bright(color: Color) -> Color:
+    """A tone that stands out from a picture."""
+    return tuple(round(255 - 0.55 * (255 - value)) for value in color)
+
+
+def _moving(meta: FrameMeta) -> list[_Box]:
+    """Give the boxes of who moves, the target last."""
+    boxes = []
+    for other in meta.others.others if meta.others else ():
+        corners_m = box_corners(other.center_m, np.array(other.half_extents_m), other.heading_rad)
+        boxes.append(_Box(corners_m, other.center_m, OTHERS_COLOR, str(other.instance_id)))
+    center_m = meta.target.center_m
+    corners_m = box_corners(center_m, np.array(meta.target.half_extents_m))
+    return [*boxes, _Box(corners_m, center_m, TARGET_COLOR, f"target {meta.target.instance_id}")]
+
+
+def _lines(
+    corners_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray, near_m: float
+) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Project the edges of a box, cut at the near plane; pairs of pixels, none for a box behind the camera."""
+    points = (corners_m - camera_pose[:3, 3]) @ camera_pose[:3, :3]
+    lines = []
+    for a, b in _EDGES:
+        ends = np.stack([points[a], points[b]])
+        (za, zb) = ends[:, 2]
+        if max(za, zb) <= near_m:
+            continue
+        for k, behind in enumerate(ends[:, 2] < near_m):
+            if behind:
+                ends[k] += (ends[1 - k] - ends[k]) * (near_m - ends[k, 2]) / (ends[1 - k, 2] - ends[k, 2])
+        uv = ends @ intrinsic.T
+        places = np.clip(uv[:, :2] / uv[:, 2:], -FAR_PX, FAR_PX).round().astype(int)
+        lines.append(((int(places[0, 0]), int(places[0, 1])), (int(places[1, 0]), int(places[1, 1]))))
+    return lines
+
+
+class _Labels:
+    """Words at the boxes; what is added last matters most, and what would lie on another is left out."""
+
+    def __init__(self, picture: np.ndarray, scale: float) -> None:
+        self._picture, self._size = picture, max(0.33, 0.45 * scale)
+        self._waiting: list[tuple[str, float, float, Color]] = []
+
+    def add(self, text: str, x: float, y: float, color: Color) -> None:
+        """Put a text over a place, px, if that is in the picture."""
+        height, width = self._picture.shape[:2]
+        if 0 <= x < width and -height / 2 <= y < height:
+            self._waiting.append((text, x, y, color))
+
+    def write(self) -> None:
+        height, width = self._picture.shape[:2]
+        taken: list[tuple[float, float, float, float]] = []
+        for text, x, y, color in reversed(self._waiting):
+            (long, high), _ = cv2.getTextSize(text, FONT, self._size, 1)
+            left, base = (
+                float(np.clip(x - long / 2, 2, max(2, width - long - 2))),
+                float(np.clip(y - 4, high + 2, height - 4)),
+            )
+            own = left - 2, base - high - 2, left + long + 2, base + 3
+            if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
+                continue
+            taken.append(own)
+            corner, other = (round(own[0]), round(own[1])), (round(own[2]), round(own[3]))
+            cv2.rectangle(self._picture, corner, other, (20, 20, 20), -1)
+            draw_text(self._picture, text, left, base, self._size, color)

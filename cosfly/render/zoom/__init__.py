@@ -1,0 +1,1 @@
+"""Zoom: levels, changes between them, and what they cost (app:zoom)."""
