@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.errors import InputError, NothingKept
-from cosfly.geometry import mask_box
+from cosfly.geometry import box_iou, mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
-from cosfly.inspection.frames import box_iou, choose_frames, pedestrian_region
+from cosfly.inspection.frames import choose_frames, pedestrian_region
 from cosfly.inspection.jumps import Jumps
 from cosfly.inspection.others import check_others, others_told
 from cosfly.inspection.pixels import unpack
@@ -681,6 +681,29 @@ def test_the_page_stands_alone_and_shows_every_flight(workplace):
     assert "&lt;b&gt;&amp;" in page
     for record in found.flights:
         assert record.trajectory in page
+
+
+def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_shares(workplace):
+    """Of two perturbed flights of 10 frames: two with neither offset, one shifted alone, two turned alone, the others both."""
+    for number, flight in enumerate(sorted((workplace / "tree").glob("*/*/aug_001"))):
+
+        def change(record: dict, number: int = number) -> None:
+            for i, point in enumerate(record["points"]):
+                if number or i in (0, 3, 4):
+                    point["perturbation"]["drone_rotation"] = dict.fromkeys(("pitch", "yaw", "roll"), 0.0)
+                if (number and i < 1) or (not number and i in (0, 1, 2)):
+                    point["perturbation"]["drone_position"] = dict.fromkeys("xyz", 0.0)
+
+        edit(flight, change)
+    inspect(workplace)
+    page = (workplace / "out" / "report.html").read_text(encoding="utf-8")
+    section = page.partition("<h2>Perturbation</h2>")[2].partition("</table>")[0]
+    rows = re.findall(
+        r'<td>([a-z ]+)</td><td class="n">(\d+)</td><td class="n">([\d.]+)%</td><td class="n">(\d+)%</td>', section
+    )
+    assert rows == [
+        ("unperturbed", "2", "10.0", "16"), ("position only", "11", "55.0", "24"), ("rotation only", "2", "10.0", "24"), ("full", "5", "25.0", "36"),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "not json", '{"schema": "cosfly.inspect", "schema_version": "1.0"}'])

@@ -13,6 +13,7 @@ from cosfly.escaping import for_html, html_page
 from cosfly.inspection.view import PLOTS, FlightView
 from cosfly.issues import Issue
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
+from cosfly.products.playback import STATES
 from cosfly.reading.files import read_text
 from cosfly.store import write_bytes
 
@@ -57,7 +58,7 @@ def report_html(inspection: Inspection, views: dict[str, FlightView], page_mb: f
 <p class="lead">{for_html(summary)} A rejected flight breaks a rule; one in review is for a person to decide (cosfly inspect review).</p>
 <h2>Funnel</h2>
 <div class="funnel">{_funnel(inspection)}</div>
-{_covered(inspection)}<h2>Flights</h2>
+{_covered(inspection)}{_states(inspection)}<h2>Flights</h2>
 <p class="lead">{LEGEND}</p>
 {HEAD}
 {rows}
@@ -71,6 +72,27 @@ def _covered(inspection: Inspection) -> str:
         return ""
     lead = f"{inspection.coverage.frames:,} frames of accepted flights, and where 5 % to 95 % of them lie; the line is the plain run that ships (quickstart)."
     return f'<h2>What is covered</h2>\n<p class="lead">{lead}</p>\n{coverage_html(inspection.coverage)}\n'
+
+
+def _states(inspection: Inspection) -> str:
+    """The frames of perturbed flights by what was applied to them, beside the paper's shares (tab:augmentation_states)."""
+    counts = {
+        state: sum(int(flight.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for flight in inspection.flights)
+        for state in STATES
+    }
+    if not (total := sum(counts.values())):
+        return ""
+    rows = "".join(
+        f'<tr><td>{for_html(state)}</td><td class="n">{counts[state]:,}</td><td class="n">{counts[state] / total:.1%}</td><td class="n">{share:.0%}</td></tr>'
+        for state, share in STATES.items()
+    )
+    perturbed = total - counts["unperturbed"]
+    lead = (
+        f"{total:,} frames of perturbed flights, {perturbed / total:.1%} of them perturbed. The paper's shares are what is drawn where each event has a "
+        "chance of 0.6; here a shift or turn that cannot be made falls back."
+    )
+    head = '<tr><th>state</th><th class="n">frames</th><th class="n">share</th><th class="n">paper</th></tr>'
+    return f'<h2>Perturbation</h2>\n<p class="lead">{lead}</p>\n<table class="states"><thead>{head}</thead><tbody>{rows}</tbody></table>\n'
 
 
 # --- the funnel -------------------------------------------------------------------------------------------------------
