@@ -131,7 +131,7 @@ def test_a_training_set_of_an_earlier_version_is_refused(tmp_path):
 
 
 def test_file_kinds_are_no_views():
-    with pytest.raises(ValidationError, match="'rgb', 'depth' or 'segmentation'"):
+    with pytest.raises(ValidationError, match="'rgb', 'depth', 'segmentation' or 'middle'"):
         PrepareConfig.model_validate({"modalities": ("rgb", "instance")})
 
 
