@@ -15,6 +15,7 @@ from cosfly.compiled import njit
 COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M = 0.3
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
+LEAST_PAIRS = 4  # of frames, for one to be unusual among them
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
 # Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
@@ -95,13 +96,23 @@ def compare_views(
     return Agreement(seen, agree, hidden, through, same, error, correlation, tint, shade)
 
 
-def usual_correlation(correlations: np.ndarray, least_drop: float) -> tuple[float, float]:
-    """Give the usual correlation of a flight's frames with the one before each, and how much less is too little; NaN where none is known."""
-    known = correlations[np.isfinite(correlations)]
-    if not len(known):
-        return np.nan, np.nan
-    usual = float(np.median(known))
-    return usual, max(least_drop, 8.0 * float(np.median(np.abs(known - usual))))
+def usual_correlations(
+    correlations: np.ndarray, focal_px: np.ndarray, least_drop: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give the usual correlation of a flight's frames with the one before each, and how much less is too little, (n,) each.
+
+    Frames are judged by those of about their focal length, (n,) px: what is seen in more detail agrees otherwise. NaN where fewer than
+    LEAST_PAIRS are known.
+    """
+    usual, drops = np.full(len(correlations), np.nan), np.full(len(correlations), np.nan)
+    levels = np.round(np.log(focal_px) / ZOOMED)
+    for level in np.unique(levels):
+        rows = levels == level
+        known = correlations[rows & np.isfinite(correlations)]
+        if len(known) >= LEAST_PAIRS:
+            usual[rows] = np.median(known)
+            drops[rows] = max(least_drop, 8.0 * float(np.median(np.abs(known - np.median(known)))))
+    return usual, drops
 
 
 def _colours_at(matches: np.ndarray, one: np.ndarray, other: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:

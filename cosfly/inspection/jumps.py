@@ -14,7 +14,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.issues import Report
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import Flight
-from cosfly.reprojection import Agreement, View, compare_views, grid_rows, is_zoomed, usual_correlation
+from cosfly.reprojection import Agreement, View, compare_views, grid_rows, is_zoomed, usual_correlations
 
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
 LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share of them to mean something
@@ -58,8 +58,11 @@ class Jumps:
         known = shades[np.isfinite(shades)]
         # Pictures whose brightness is never the same have another cause than a jump.
         brightness_max = max(cfg.jump_brightness_max, TIMES_USUAL * float(np.median(known)) if len(known) else 0.0)
-        usual, drop = usual_correlation(np.array(colours), cfg.jump_colour_drop)
-        for i, pair, same_air in zip(self._frames, self._found, self._same_air, strict=True):
+        focal_px = np.array([self.flight.camera_at(i).intrinsic[0, 0] for i in self._frames])
+        usuals, drops = usual_correlations(np.array(colours), focal_px, cfg.jump_colour_drop)
+        for i, pair, same_air, usual, drop in zip(
+            self._frames, self._found, self._same_air, usuals, drops, strict=True
+        ):
             if pair.seen < LEAST_SEEN:
                 continue
             gone, agree, where = pair.through / pair.seen, pair.agree / pair.seen, frame_name(i)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlation
+from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
@@ -27,7 +27,7 @@ AGREE_LEAST = 0.5  # honest 0.81 and more
 THROUGH_MOST = 0.02  # points in front of what is drawn: honest 0.001
 ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of planes; honest below 1e-5 as float32
 SAME_LEAST = 0.95  # of the instances; honest 0.985
-COLOUR_DROP = 0.15  # below the median of a flight; honest 0.08
+COLOUR_DROP = 0.15  # below the median of a flight's frames of one zoom; honest 0.08
 COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
     0.82,
     0.65,
@@ -132,13 +132,14 @@ def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Fin
             return
         limit, least = max(limit, TIMES_ROUGH * usual), AGREE_LEAST
     colours = np.array([pair.correlation for pair in pairs.found])
-    usual_colour, drop = usual_correlation(colours, COLOUR_DROP)
+    usuals, drops = usual_correlations(colours, flight.intrinsics[pairs.rows, 0], COLOUR_DROP)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
     least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
-    if usual_colour < least_colour and np.isfinite(colours).sum() >= 4 and not flight.is_foreign:
-        findings.error("scene_colour", flight.name, f"colours that agree by {usual_colour:.2f} from frame to frame", "pictures of this flight")  # fmt: skip
-    for i, gap, pair, elsewhere in zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, strict=True):
+    if np.isfinite(usuals).any() and not flight.is_foreign and np.nanmedian(usuals) < least_colour:
+        findings.error("scene_colour", flight.name, f"colours that agree by {np.nanmedian(usuals):.2f} from frame to frame", "pictures of this flight")  # fmt: skip
+    told = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, usuals, drops, strict=True)
+    for i, gap, pair, elsewhere, usual_colour, drop in told:
         if pair.seen < LEAST_SEEN:
             continue
         share, through = pair.agree / pair.seen, pair.through / pair.seen
