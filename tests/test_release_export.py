@@ -544,12 +544,19 @@ def test_a_unit_that_failed_is_done_again_alone(broken, dataset, tmp_path):
     assert all_bytes(product) == all_bytes(export(config("webdataset"), dataset, tmp_path / "other"))
 
 
-@pytest.mark.parametrize("change", [lambda rows: rows[3].update(pose=None), lambda rows: rows[3].update(width_px=97)])
-def test_a_flight_of_two_cameras_or_without_a_pose_is_no_tree(broken, tmp_path, change):
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows[3].update(pose=None), "1 sizes, 1 of"),
+        (lambda rows: rows[3].update(width_px=97), "2 sizes, 0 of"),
+    ],
+)
+def test_a_flight_of_two_sizes_or_without_a_pose_is_no_tree(broken, tmp_path, change, words):
     rewrite(broken, change)
     with pytest.raises(InputError, match="could not be exported"):
         export(config("tree"), broken, tmp_path / "out")
-    assert "one camera, and every frame a pose" in (tmp_path / "out/failures.jsonl").read_text()
+    told = (tmp_path / "out/failures.jsonl").read_text()
+    assert f"pictures of one size, and every frame a pose and intrinsics; got {words}" in told
 
 
 def test_a_shard_of_another_version_is_refused(broken, tmp_path):

@@ -143,9 +143,11 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
         InputError: a row has no pose or intrinsics, or the pictures' size changes on the way.
     """
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
-    if len(sizes) != 1 or any(r["pose"] is None or r["intrinsics"] is None for r in rows):
+    without = sum(row["pose"] is None or row["intrinsics"] is None for row in rows)
+    if len(sizes) != 1 or without:
         raise InputError(
-            "a flight has pictures of one size, and every frame a pose and intrinsics", where=placed.name, got=f"{len(sizes)} sizes"
+            "a flight has pictures of one size, and every frame a pose and intrinsics", where=placed.name,
+            got=f"{len(sizes)} sizes, {without} of {len(rows)} frames without a pose or intrinsics",
         )  # fmt: skip
     intrinsics = matrices_of(_vectors(rows, "intrinsics", INTRINSICS))
     poses = _vectors(rows, "pose", POSE)
