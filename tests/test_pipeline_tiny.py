@@ -473,7 +473,7 @@ def test_bench_measures_a_stage_and_leaves_the_run_alone(base, tmp_path):
     assert undisturbed.attempted == undisturbed.successful == read_json(base / "render/manifest.json")["num_frames"]
     assert (killed.planted, killed.failed, killed.same_products) == (killed.noticed, 0, True)
     assert sorted(path.name for path in (tmp_path / "bench").iterdir()) == [
-        "bench.json", "kill.events.jsonl", "kill.png", "workers_2.events.jsonl", "workers_2.png",
+        "bench.json", "bench.md", "bench.png", "kill.events.jsonl", "kill.png", "workers_2.events.jsonl", "workers_2.png",
     ]  # fmt: skip
     assert {path: path.stat().st_mtime_ns for path in base.rglob("*")} == before
 
