@@ -6,6 +6,7 @@ Nothing heavy is imported before a command runs, so that `cosfly --help` is inst
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -87,12 +88,23 @@ def main() -> None:
     except CosflyError as error:
         _fail(str(error), 1)
     except SystemExit as end:
-        if end.code not in ENDED:
-            raise
-        _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
+        if end.code in ENDED:
+            _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
+        _end(end.code)
 
 
 def _fail(message: str, status: int) -> None:
     typer.echo(f"error: {message}", err=True)
+    _end(status)
+
+
+def _end(status: int | str | None) -> None:
+    """End the process. One of several, as a launcher starts them, ends at once: threads that the libraries of such a group leave behind
+    abort the interpreter's own end now and then (2 of some 200), which a launcher takes for a failure of the whole training.
+    """
+    sys.stdout.flush()
     sys.stderr.flush()
+    if os.environ.get("WORLD_SIZE", "1") != "1" and (status is None or isinstance(status, int)):
+        logging.shutdown()
+        os._exit(status or 0)
     sys.exit(status)
