@@ -15,6 +15,7 @@ from cosfly.compiled import njit
 COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M = 0.3
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
+LEAST_CONTRAST = 4.0  # grey levels: less is a wall or a fog
 LEAST_PAIRS = 4  # of frames, for one to be unusual among them
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
@@ -65,12 +66,18 @@ def is_zoomed(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def compare_views(
-    one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray | None = None
+    one: View,
+    other: View,
+    intrinsics: np.ndarray,
+    others_intrinsics: np.ndarray | None = None,
+    *,
+    least_contrast: float = LEAST_CONTRAST,
 ) -> Agreement:
     """Carry the grid's points of one frame into another.
 
     Args:
         intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between them.
+        least_contrast: deviation of brightness, grey levels, below which nothing is said of the colours' correlation.
     """
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
@@ -89,7 +96,7 @@ def compare_views(
             hue = (there - pairs[:, 1:]) - (here - pairs[:, :1])
             tint = float(np.median(np.abs(hue).max(axis=1)))
     correlation = np.nan
-    if len(pairs) >= 60 and (pairs.std(axis=0) > 4.0).all():  # grey levels: less is a wall or a fog
+    if len(pairs) >= 60 and (pairs.std(axis=0) > least_contrast).all():
         correlation = float(np.corrcoef(pairs.T)[0, 1])
     error = float(np.median(errors)) if len(errors) >= 30 else np.nan
     seen, agree, hidden, through, same = (int(n) for n in counts)

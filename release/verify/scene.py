@@ -33,6 +33,8 @@ COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
     0.65,
     160,
 )  # that median itself, honest 0.92; of pictures narrower than so much 0.70
+# Grey levels: of a pale square the grain alone, 4 from frame to frame, leaves honest frames a correlation of 0.7.
+CONTRAST = 10.0
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
 # How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
 # before as usual in the flight, and of others.
@@ -105,7 +107,9 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
     k, previous = before[-1]
     pairs.rows.append(i)
     pairs.gaps.append(int(flight.index[i] - flight.index[k]))
-    pairs.found.append(compare_views(previous, view, flight.intrinsics[k], flight.intrinsics[i]))
+    pairs.found.append(
+        compare_views(previous, view, flight.intrinsics[k], flight.intrinsics[i], least_contrast=CONTRAST)
+    )
     pairs.elsewhere.append(np.nan)
     if is_zoomed(
         flight.intrinsics[k], flight.intrinsics[i]
@@ -114,7 +118,7 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
     if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
         moved = replace(view, colours=previous.colours)
         pairs.elsewhere[-2] = compare_views(
-            before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i]
+            before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i], least_contrast=CONTRAST
         ).correlation
 
 
