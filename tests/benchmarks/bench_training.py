@@ -5,6 +5,8 @@
     python tests/benchmarks/bench_training.py --shape 2b --batch 8 --way plain   plain transformers and peft, for comparison
     torchrun --nproc-per-node 4 tests/benchmarks/bench_training.py --shape 2b --batch 64 --micro 16
     python tests/benchmarks/bench_training.py --shape 2b --check                 loss and gradients against plain, in float32
+    python tests/benchmarks/bench_training.py --shape 2b --check --dtype bfloat16 --kept FILE   the same of bfloat16 and the fast kernels,
+                                                 against plain float32, of which `--check --kept FILE` left the numbers
 
 `--way ours` takes the project's own steps: features of pictures kept, logits for a few answer tokens at a time, rows by length; pictures
 are noise in memory, so what it takes to read them is not in these figures: `cosfly distill train` on a playback tree tells that
@@ -20,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import load_file, save_file
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from distill.student.encoding import Encoded, padded
@@ -171,7 +174,7 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     for step in range(WARM_UP + arguments.steps):
         rows = make_rows(shape, arguments.batch, 0 if arguments.same else step)
         rows = sorted(rows, key=lambda row: -len(row[0]))[ranks.rank :: ranks.size]
-        ranks.wait_for_all()
+        ranks.total([0.0])  # all begin a step together
         begun_s = time.perf_counter()
         for start in range(0, len(rows), cfg.batch_size):
             backward(student, arguments.way, rows[start : start + cfg.batch_size], features, cfg)
@@ -194,22 +197,48 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
 
 
 def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
-    """Hold our loss and gradients against plain transformers, in float32 on the same weights and samples."""
-    cfg = TrainConfig(logit_chunk=arguments.chunk)
-    student = add_adapter(make_student(SHAPES[arguments.shape], ranks.device, torch.float32), cfg, 0)
+    """Hold our loss and gradients against plain transformers on the same weights and samples.
+
+    Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either PyTorch's functions
+    or the fast kernels.
+    """
+    cfg, dtype = TrainConfig(logit_chunk=arguments.chunk), compute_dtype(arguments.dtype, ranks.device)
+    if arguments.dtype == "auto":
+        dtype = torch.float32
+    student = add_adapter(make_student(SHAPES[arguments.shape], ranks.device, dtype), cfg, 0)
+    learned = {name: parameter for name, parameter in student.model.named_parameters() if parameter.requires_grad}
+    rows = make_rows(SHAPES[arguments.shape], 2, 0)
+
+    def gradients_of(way: str) -> dict[str, torch.Tensor]:
+        loss = backward(student, way, rows, VisionFeatures(student), cfg)
+        gradients = {name: parameter.grad.float().cpu() for name, parameter in learned.items()}
+        student.model.zero_grad(set_to_none=True)
+        return {"loss": torch.tensor(loss)} | gradients
+
+    def both(kept: dict[str, torch.Tensor], ours: dict[str, torch.Tensor]) -> dict[str, float]:
+        a, b = (torch.cat([tensors[name].reshape(-1) for name in learned]) for tensors in (kept, ours))
+        return {
+            "loss_plain": float(kept["loss"]), "loss_ours": float(ours["loss"]),
+            "relative_difference_of_gradients": float((a - b).norm() / a.norm()),
+        }  # fmt: skip
+
+    if dtype != torch.float32:
+        kept = load_file(arguments.kept)
+        with torch.no_grad():
+            for name, parameter in learned.items():
+                parameter.copy_(kept[f"value {name}"])
+        fuse_norms(student.core)
+        return both(kept, gradients_of("ours"))
     with torch.no_grad():
-        for name, parameter in student.model.named_parameters():
+        for name, parameter in learned.items():
             if "lora_B" in name:
                 parameter.normal_(0, 0.02)
-    rows, losses, gradients = make_rows(SHAPES[arguments.shape], 2, 0), [], []
-    for way in ("plain", "ours"):
-        if way == "ours":
-            fuse_norms(student.core)
-        losses.append(backward(student, way, rows, VisionFeatures(student), cfg))
-        gradients.append(torch.cat([p.grad.reshape(-1) for p in student.model.parameters() if p.grad is not None]))
-        student.model.zero_grad(set_to_none=True)
-    difference = (gradients[0] - gradients[1]).norm() / gradients[0].norm()
-    return {"loss_plain": losses[0], "loss_ours": losses[1], "relative_difference_of_gradients": float(difference)}
+    found = gradients_of("plain")
+    if arguments.kept:
+        values = {f"value {name}": parameter.detach().cpu().contiguous() for name, parameter in learned.items()}
+        save_file(found | values, arguments.kept)
+    fuse_norms(student.core)
+    return both(found, gradients_of("ours"))
 
 
 def main() -> None:
@@ -227,6 +256,7 @@ def main() -> None:
     )
     parser.add_argument("--norms", choices=("fused", "library"), default="fused", help="of ours, who computes norms")
     parser.add_argument("--check", action="store_true")
+    parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
     arguments = parser.parse_args()
     with joined("auto") as ranks:
         found = (check if arguments.check else measure)(arguments, ranks)
