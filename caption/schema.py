@@ -264,6 +264,10 @@ class CaptionConfig(Config):
         description="how a teacher writes. slots: it names facts, their values are filled in; claims: plain text beside a list of "
         "what it states; prose: plain text, read afterwards",
     )
+    prompts: Path | None = Field(
+        None,
+        description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export DIR` writes one to begin with",
+    )
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
@@ -340,5 +344,5 @@ class CaptionConfig(Config):
         return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
-        """Where a teacher is asked does not decide what it says, so its kind is put on record."""
-        return super().recorded() | {"teacher": self.teacher_kind}
+        """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their digests stand beside."""
+        return super().recorded() | {"teacher": self.teacher_kind, "prompts": "own" if self.prompts else None}

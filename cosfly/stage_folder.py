@@ -357,7 +357,7 @@ def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
             changed.append(f"the input {name} ({new.path if new else 'none'}) has changed")
     both = found.package_files.keys() & wanted.package_files.keys()
     changed += [
-        f"cosfly's {name} changed" for name in sorted(both) if found.package_files[name] != wanted.package_files[name]
+        f"the {name} changed" for name in sorted(both) if found.package_files[name] != wanted.package_files[name]
     ]
     return changed
 

@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
@@ -24,6 +24,7 @@ from typing import Any
 from cosfly.console import set_levels
 from cosfly.errors import CosflyError
 from cosfly.items import Item, Work, attempt, counted_steps
+from cosfly.own import put_in_place
 from cosfly.reading.limits import Limits, use_limits
 from cosfly.stage_folder import ItemRecord
 
@@ -61,10 +62,12 @@ class Manner:
 
 @dataclass(frozen=True)
 class Start:
-    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function."""
+    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what stands in the place of
+    files that ship (cosfly/own.py)."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
+    own_files: dict[str, Any] = field(default_factory=dict)
 
 
 @contextlib.contextmanager
@@ -91,6 +94,8 @@ def work_through(connection: Connection, manner: Manner) -> None:
     threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:
         start: Start | None = _received(connection)
+        if start:
+            put_in_place(start.own_files)
         work = start.make_worker(*start.worker_args) if start else None
         while work and (item := _received(connection)):
             voice.begin(item)

@@ -17,6 +17,7 @@ from typing import get_args
 
 from rich.table import Table
 
+from caption.own_files import own_files
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
 from caption.schema import CaptionConfig, Strategy, Window
@@ -81,7 +82,8 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         raise ConfigError("captions of a file cannot be asked for again", where="--teacher", got=cfg.teacher)
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
-    num_windows, trials = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
+    with own_files(cfg):
+        num_windows, trials = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
     comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from caption.own_files import own_files
 from caption.run.asking import ANSWERS
 from caption.run.flights import Allotted, allot, named_flights
 from caption.run.progress import duration
@@ -91,7 +92,11 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     """
     if cfg.teacher_kind != "endpoint":
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
-    cfg = as_taught(cfg)
+    with own_files(cfg):
+        return _forecast(as_taught(cfg), data, out, seed, resume)
+
+
+def _forecast(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> Forecast:
     stage = open_stage(cfg, data, out, seed, resume)
     allotted, _ = allot(named_flights(data), cfg)
     left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]

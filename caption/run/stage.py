@@ -12,13 +12,13 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from caption.own_files import keep_own_files, own_files, package_files
 from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
 from caption.run.report import write_page
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import given_samples
-from caption.teachers.prompts import PROMPTS
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth import actions
@@ -37,8 +37,8 @@ from cosfly.student_chat import student_files
 log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
-# One folder never holds captions of two prompts, glossaries or tables of actions.
-PACKAGE_FILES = {"prompts": PROMPTS, "glossary": GLOSSARY_FILE, "action table": Path(actions.__file__)}
+# One folder never holds captions of two glossaries or tables of actions, nor of two prompts (own_files.py).
+PACKAGE_FILES = {"glossary": GLOSSARY_FILE, "action table": Path(actions.__file__)}
 
 
 def run(
@@ -70,7 +70,13 @@ def run(
         raise ConfigError(
             "this teacher never fails to answer", where="--retry-failed", got=cfg.teacher_kind, fix="leave it out"
         )
-    cfg = as_taught(cfg)
+    with own_files(cfg):
+        return _run(as_taught(cfg), data, out, seed, workers, watch, resume, retry_failed)
+
+
+def _run(
+    cfg: CaptionConfig, data: Path, out: Path, seed: int, workers: int, watch: Watch, resume: Resume, retry_failed: bool
+) -> Path:
     foreign = None if cfg.caption_file is None else given_samples(cfg, cfg.caption_file)
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)
@@ -101,7 +107,7 @@ def run(
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
-    outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
+    outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl")), *keep_own_files(out)]
     stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
@@ -121,7 +127,13 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
     return StageFolder.open(
-        out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=PACKAGE_FILES
+        out,
+        "caption",
+        config=cfg,
+        inputs=inputs,
+        seed=seed,
+        resume=resume,
+        package_files=PACKAGE_FILES | package_files(cfg),
     )
 
 

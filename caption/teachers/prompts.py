@@ -1,29 +1,25 @@
-"""Prompts: versioned text files filled with the facts of one observed window, and the pictures that go with them.
+"""Prompts: versioned text files (prompt_files.py) filled with the facts of one observed window, and the pictures that go with them.
 
-Nothing here takes the future. The files are `prompts/*.txt`; their first line is a version, and every caption records the
-hash of what was asked.
+Nothing here takes the future. Every caption records the hash of what was asked.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from pathlib import Path
-from string import Template
+from functools import lru_cache
 
 from caption.schema import ImageConfig, ObservedFrame, ObservedWindow
 from caption.teachers.images import FrameSource, pictures_of
+from caption.teachers.prompt_files import prompt_format, read_prompt
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.writing.contract import Draft, way_of
+from cosfly import own
 from cosfly.frame_views import Pictures, frame_label
 from cosfly.products.captions import ACTIONS, PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
-from cosfly.reading.files import read_text
 from cosfly.store import dump_json, sha256_bytes
 
-PROMPTS = Path(__file__).with_name("prompts")
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it
 
 
@@ -67,21 +63,12 @@ class Question:
         return {language: prompt.told(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
 
 
-@cache
-def read_prompt(name: str) -> Template:
-    """Read `prompts/<name>.txt` without its version line."""
-    text = read_text(PROMPTS / f"{name}.txt")
-    version, _, body = text.partition("\n")
-    assert version.startswith("# version: "), f"{name}.txt lacks its version line"
-    return Template(body.rstrip("\n"))
-
-
-@cache
+@own.kept()
 def system_prompt(language: Language) -> str:
     return read_prompt(f"system_{language}").substitute(actions=", ".join(ACTIONS))
 
 
-@cache
+@own.kept()
 def way_prompt(writing: Writing, decision: str | None = None) -> str:
     """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of sec:appendix_e)."""
     prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(ACTIONS))
@@ -138,7 +125,7 @@ def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, 
         "visibility": ", ".join([words[word][language] for word in facts.visibility]),
         "target": "; ".join([_target_text(frame) or unknown for frame in window.frames]),
     }
-    told = _filled(f"user_{language}") % (numbers | own)
+    told = prompt_format(f"user_{language}") % (numbers | own)
     return told if window.mission is None else f"{told}\n{_MISSION[language][window.mission]}"
 
 
@@ -187,13 +174,6 @@ def _target_text(frame: ObservedFrame) -> str:
     """Give the target's position, "" where it is not known."""
     x, y, z = frame.target_m
     return "" if x != x else f"({x:z.2f}, {y:z.2f}, {z:z.2f})"
-
-
-@cache
-def _filled(name: str) -> str:
-    """Give a prompt file as a format for `%`, which is ten times faster than a template."""
-    body = read_prompt(name).template.replace("%", "%%")
-    return re.sub(r"\$(\w+)", r"%(\1)s", body)
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ import numpy as np
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
 from caption.teachers.images import EncodedImage
-from caption.teachers.prompts import Question, decision_words, read_prompt, system_prompt
+from caption.teachers.prompt_files import read_prompt
+from caption.teachers.prompts import Question, decision_words, system_prompt
 from caption.writing.contract import Draft
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
@@ -81,7 +82,7 @@ def check_prompts(taught: Taught, folder: Path) -> None:
         if prompt.system != system_prompt(language) or not _is_of_template(prompt.user, language, taught):
             raise ConfigError(
                 "the student was taught another version of the prompt", where=f"{folder}: {language}", got=prompt.user[:80],
-                fix="ask it with the version of cosfly that captioned its training set, or train it anew",
+                fix="ask it with the prompts (caption.prompts) and the version of cosfly that captioned its training set, or train it anew",
             )  # fmt: skip
 
 
@@ -89,10 +90,14 @@ def _is_of_template(user: str, language: Language, taught: Taught) -> bool:
     told = {"num_frames": re.escape(str(taught.num_frames)), "pictures": "|".join(
         re.escape(Pictures(look.views, look.size_px, "separate", look.depth_range_m).sentence(language)) for look in taught.looks
     )}  # fmt: skip
-    pieces = re.split(r"\$(\w+)", read_prompt(f"user_{language}").template)
-    pattern = "".join(
-        f"(?:{told.get(piece, '.+?')})" if number % 2 else re.escape(piece) for number, piece in enumerate(pieces)
-    )
+    pattern, end = "", 0
+    template = read_prompt(f"user_{language}")
+    for match in template.pattern.finditer(template.template):
+        name = match["named"] or match["braced"]
+        pattern += re.escape(template.template[end : match.start()])
+        pattern += f"(?:{told.get(name, '.+?')})" if name else r"\$"
+        end = match.end()
+    pattern += re.escape(template.template[end:])
     return re.fullmatch(pattern + r"(\n.+)?", user) is not None  # a mission's line may follow
 
 

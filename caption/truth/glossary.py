@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 from pydantic import Field
 
+from cosfly import own
 from cosfly.config import Config, build, read_yaml
 from cosfly.errors import ConfigError
 from cosfly.products.captions import ACTIONS, Language
@@ -188,7 +188,7 @@ def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], langu
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
 
-@cache
+@own.kept()
 def load_glossary(path: Path | None = None) -> Glossary:
     """Read a glossary, by default the one that ships.
 

@@ -16,7 +16,7 @@ from typing import get_args
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.teachers.prompts import read_prompt
+from caption.teachers.prompt_files import read_prompt
 from caption.truth.gold import GoldCaption, read_gold_prose
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget

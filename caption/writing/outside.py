@@ -7,13 +7,13 @@ hypotheses. Patterns are wide where a slot could have said it and narrow where t
 from __future__ import annotations
 
 import re
-from functools import cache
 
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
 from caption.truth.prose.numerals import masked
 from caption.truth.prose.reading import read_form
 from caption.writing.contract import Refused
+from cosfly import own
 from cosfly.products.captions import ACTIONS, Language
 
 SLOT_MARK = "¤"
@@ -111,7 +111,7 @@ def decisions_named(text: str) -> tuple[str, ...]:
     return tuple((match["words"] or match["token"]).lower() for match in _named().finditer(text))
 
 
-@cache
+@own.kept()
 def _named() -> re.Pattern[str]:
     words = "|".join(re.escape(pair["en"]) for pair in load_glossary().actions.values())
     tokens = "|".join(token for token in ACTIONS if "_" in token)

@@ -114,10 +114,36 @@ def caption_doctor(
 
 def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
+    from caption.own_files import own_files
     from caption.teachers.doctor import examine_endpoint
     from cosfly.console import console
 
-    options.tell_checks(examine_endpoint(url, cfg, ways), console, "What the endpoint can do")
+    with own_files(cfg):
+        findings = examine_endpoint(url, cfg, ways)
+    options.tell_checks(findings, console, "What the endpoint can do")
+
+
+@app.command("prompts")
+def caption_prompts(
+    export: Annotated[Path | None, typer.Option(help="Folder to write the prompts in use to, to begin with.")] = None,
+    check: Annotated[
+        Path | None, typer.Option(help="Folder with prompts of yours: say what is missing or unknown, a line each.")
+    ] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
+    """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
+    from caption.own_files import own_files
+    from caption.teachers.prompt_files import export_prompts, own_prompts
+
+    if (export is None) == (check is None):
+        raise typer.BadParameter("give --export DIR or --check DIR")
+    cfg = options.resolve(config, overrides)
+    if check is not None:
+        typer.echo(f"{check}: {len(own_prompts(check) or {})} prompts, nothing wrong")
+    elif export is not None:
+        with own_files(cfg.caption):
+            typer.echo(f"{export}: {len(export_prompts(export))} prompts")
 
 
 @app.command("judge-check")
@@ -130,11 +156,13 @@ def caption_judge_check(
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
+    from caption.own_files import own_files
     from caption.truth.judge import check_judge, judge_check_table, read_gold
     from cosfly.console import console
 
     cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
-    console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, read_gold(), cfg.seed))))
+    with own_files(cfg.caption):
+        console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, read_gold(), cfg.seed))))
 
 
 @app.command("compare-strategies")

@@ -209,6 +209,7 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------
 
 
+OWN_PROMPTS = "prompts"  # beside `captions.jsonl`: the prompts of whoever made them, where these do not ship
 PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says what pictures are given
 
 

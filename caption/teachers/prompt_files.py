@@ -1,0 +1,132 @@
+"""The prompt files: those that ship, or a folder of somebody's own (`caption.prompts`), which is held against them.
+
+Each file begins with a line `# version: ...`; the rest is the prompt, with `$slots` for what is filled in and `$$` for a dollar sign.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from string import Template
+
+from cosfly import own
+from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.reading.files import read_text
+from cosfly.store import refuse_links, write_bytes
+
+log = logging.getLogger(__name__)
+
+PROMPTS = Path(__file__).with_name("prompts")
+SUFFIX, VERSION = ".txt", "# version: "
+
+
+@own.kept()
+def shipped_prompts() -> dict[str, str]:
+    """Give the files that ship, name without suffix -> text with its version line."""
+    return {path.stem: read_text(path) for path in sorted(PROMPTS.glob(f"*{SUFFIX}"))}
+
+
+def own_prompts(folder: Path | None) -> dict[str, str] | None:
+    """Read a folder of prompts, in the place of those that ship; None for None.
+
+    Raises:
+        ConfigError: something is wrong with them; each thing is told in a line of the log, with its file and line.
+    """
+    if folder is None:
+        return None
+    if not folder.is_dir():
+        raise ConfigError(
+            "no such folder of prompts",
+            where=folder,
+            fix="cosfly caption prompts --export DIR writes one to begin with",
+        )
+    found, problems = dict[str, str](), list[str]()
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        try:
+            found[path.stem] = read_text(path, what="prompt", tree=folder)
+        except InputError as error:
+            problems.append(str(error))
+            found[path.stem] = ""
+            continue
+        problems += _problems(path, found[path.stem])
+    problems += [f"{folder / name}{SUFFIX}: the file is missing" for name in shipped_prompts() if name not in found]
+    for problem in problems:
+        log.error("%s", problem)
+    if problems:
+        raise ConfigError(
+            "these prompts cannot be used", where=folder, got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
+            expected="the files and slots of those that ship", fix=f"{len(problems)} to mend; cosfly caption prompts --export DIR writes those that ship",
+        )  # fmt: skip
+    return found
+
+
+def _problems(path: Path, text: str) -> Iterator[str]:
+    """Say what is wrong with a file of somebody's own, a line each."""
+    shipped = shipped_prompts().get(path.stem)
+    if shipped is None:
+        yield f"{path}: no prompt has this name{nearest(path.stem, shipped_prompts())}"
+        return
+    version, _, body = text.partition("\n")
+    if not version.startswith(VERSION):
+        yield f"{path}:1: the first line must be {VERSION!r} and a version of yours"
+        body = text
+    if not body.strip():
+        yield f"{path}:2: the prompt is empty"
+    known, seen = set(slots_of(shipped)), set[str]()
+    for match in Template.pattern.finditer(text):
+        place, name = f"{path}:{text.count(chr(10), 0, match.start()) + 1}", match["named"] or match["braced"]
+        if match["invalid"] is not None:
+            yield f"{place}: a $ that begins no slot; write $$ for a dollar sign"
+        elif name is not None and name not in known:
+            yield f"{place}: unknown slot ${name}{nearest(name, known)}"
+        elif name is not None:
+            seen.add(name)
+    last = text.rstrip("\n").count("\n") + 1
+    for name in sorted(known - seen):
+        yield f"{path}:{last}: the slot ${name} is missing"
+
+
+def slots_of(text: str) -> list[str]:
+    """Name the slots of a prompt, each once."""
+    return Template(text).get_identifiers()
+
+
+@own.kept()
+def read_prompt(name: str) -> Template:
+    """Give a prompt in use, without its version line."""
+    texts: Mapping[str, str] = own.in_place("prompts") or {}
+    text = texts[name] if name in texts else shipped_prompts()[name]
+    return Template(text.partition("\n")[2].rstrip("\n"))
+
+
+@own.kept()
+def prompt_format(name: str) -> str:
+    """Give a prompt in use as a format for `%`, which is ten times faster than a template."""
+    template, pieces, end = read_prompt(name).template, list[str](), 0
+    for match in Template.pattern.finditer(template):
+        pieces.append(template[end : match.start()].replace("%", "%%"))
+        slot = match["named"] or match["braced"]
+        pieces.append(f"%({slot})s" if slot else "$")
+        end = match.end()
+    return "".join([*pieces, template[end:].replace("%", "%%")])
+
+
+def export_prompts(folder: Path) -> list[Path]:
+    """Write the prompts in use into a folder, to begin with; files that stand there already stay.
+
+    Raises:
+        ConfigError: a file of these names is there.
+    """
+    texts = own.in_place("prompts") or shipped_prompts()
+    folder.mkdir(parents=True, exist_ok=True)
+    refuse_links(folder)
+    there = [name for name in texts if (folder / f"{name}{SUFFIX}").exists()]
+    if there:
+        raise ConfigError(
+            "prompts are there already", where=folder, got=f"{len(there)} of them: {there[0]}{SUFFIX}", fix="choose another folder"
+        )  # fmt: skip
+    paths = [folder / f"{name}{SUFFIX}" for name in texts]
+    for path, text in zip(paths, texts.values(), strict=True):
+        write_bytes(path, text.encode())
+    return paths
