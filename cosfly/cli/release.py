@@ -89,6 +89,7 @@ def release_verify(
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.truth.released import read_released
+    from cosfly.settings import manner_of_work
     from cosfly.store import write_json
     from release.verify.repair import plan_of
     from release.verify.verify import LEVELS, verify
@@ -96,8 +97,7 @@ def release_verify(
     if level not in LEVELS:
         raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
     cfg = options.resolve(config, overrides, {"workers": workers})
-    num_workers = options.manner(cfg, "never")["workers"]
-    report = verify(folder, level=level, workers=num_workers, reader=read_released)
+    report = verify(folder, level=level, reader=read_released, **manner_of_work(cfg))
     typer.echo(str(report))
     for line in plan_of(report) if repair_plan else []:
         typer.echo(f"repair plan: {line}")

@@ -1,16 +1,26 @@
-"""Relations between flights: one row a frame, splits that share no walk, pairs, pictures that stand in one place alone."""
+"""Relations between flights: one row a frame, splits that share no walk, pairs, pictures that stand in one place alone.
+
+Of each row 64 bytes are compared with those of all other rows. They wait in files (`RowFiles`), and as many of them as memory has room for
+are looked at in one pass: those whose key leaves the same rest. So memory is the same for a thousand rows and for a million.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cosfly.geometry import wrap_deg
+from cosfly.issues import Severity
+from cosfly.reading.files import read_bytes
 from cosfly.splits import town_family
+from cosfly.store import write_bytes
 from release.verify.findings import Findings
 from release.verify.motion import clean_positions
 from release.verify.rows import FlightRows
@@ -22,67 +32,137 @@ LEAST_SECONDS, WALK_SHARE = (
 )  # of the seconds that two flights know, in one cell: they follow one walk; half is enough to build
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
+ROWS_AT_ONCE = 100_000
+NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
+# What is kept of a row. sample_id, image, depth: digests, 0 where there is none; cell: second, x, y of the clean person; pose: as POSE.
+COMPARED = np.dtype([("sample_id", "u8"), ("image", "u8"), ("depth", "u8"), ("cell", "i8", 3), ("pose", "f4", 6)])
+FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 
 
 @dataclass
 class Summary:
-    """What is kept of a flight to compare it with others. cells: (second, x, y) of the clean person; pictures: key, row, pose a row."""
+    """What is kept of a flight to compare it with others. rows_file: of its rows. frames_digest: of the indices of its frames, the first three
+    of which are first_frames; way_digest: of its poses, "" where these do not move."""
 
     name: str
-    split: str | None = None
-    walk: str | None = None
-    pair: str | None = None
-    track: str | None = None
-    town: str = ""
-    is_foreign: bool = False
-    num_rows: int = 0
-    ids: list[str] = field(default_factory=list)
-    cells: list[tuple[int, int, int]] = field(default_factory=list)
-    poses: list[list[float]] = field(default_factory=list)
-    colours: list[int] = field(default_factory=list)
-    depths: list[int] = field(default_factory=list)
+    rows_file: str
+    split: str | None
+    walk: str | None
+    pair: str | None
+    track: str | None
+    town: str
+    is_foreign: bool
+    num_rows: int
+    first_frames: list[int]
+    frames_digest: str
+    way_digest: str
 
     def dumped(self) -> dict[str, Any]:
         return dict(vars(self))
 
 
-def summary_of(flight: FlightRows, keys: list[tuple[int, int]]) -> Summary:
+def summary_of(flight: FlightRows, keys: list[tuple[int, int]], rows: RowFiles, rows_file: str) -> Summary:
+    """Summarize a flight, and write what is compared of its rows.
+
+    Args:
+        keys: of each row a number that tells its colour picture from others, and one for its depth; none, or one pair a row.
+    """
     first = flight.rows[0]
     _, target, _ = clean_positions(flight)
     whole = np.abs(flight.time_s - np.round(flight.time_s)) < 1e-3
     known = whole & ~np.isnan(target).any(axis=1)
-    cells = np.column_stack([np.round(flight.time_s[known]), np.floor(target[known, :2] / CELL_M)]).astype(int)
+    pose = np.nan_to_num(flight.pose)
+    found = np.zeros(len(flight), COMPARED)
+    found["sample_id"] = [_digest(str(row.get("sample_id")).encode()) for row in flight.rows]
+    found["cell"] = NO_SECOND
+    found["cell"][known] = np.column_stack([np.round(flight.time_s[known]), np.floor(target[known, :2] / CELL_M)])
+    found["pose"] = pose
+    if keys:
+        found["image"][: len(keys)], found["depth"][: len(keys)] = np.array(keys, np.uint64).T
+    rows.write(rows_file, found)
+    way = np.round(pose, 4) + 0.0
     return Summary(
-        name=flight.name, split=first.get("split"), walk=first.get("walk"), pair=first.get("pair"), track=first.get("track"),
-        town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight), ids=[str(row.get("sample_id")) for row in flight.rows],
-        cells=[(int(s), int(x), int(y)) for s, x, y in cells],
-        poses=[[round(float(v), 4) for v in pose] for pose in np.nan_to_num(flight.pose)],
-        colours=[colour for colour, _ in keys], depths=[depth for _, depth in keys],
+        name=flight.name, rows_file=rows_file, split=first.get("split"), walk=first.get("walk"), pair=first.get("pair"),
+        track=first.get("track"), town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight),
+        first_frames=flight.index[:3].tolist(), frames_digest=frames_digest(flight.index),
+        way_digest=hashlib.sha256(way.tobytes()).hexdigest() if (way != way[0]).any() else "",
     )  # fmt: skip
 
 
-def check_across(flights: list[Summary], *, by_town: bool, both: bool, findings: Findings) -> None:
+def frames_digest(indices: np.ndarray) -> str:
+    return hashlib.sha256(indices.astype(np.int64).tobytes()).hexdigest()
+
+
+def _digest(data: bytes) -> int:
+    return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")
+
+
+@dataclass(frozen=True)
+class RowFiles:
+    """Files of COMPARED, one a flight, in a folder that is thrown away."""
+
+    folder: Path
+
+    def write(self, name: str, rows: np.ndarray) -> None:
+        write_bytes(self.folder / name, rows.tobytes())
+
+    def read(self, name: str) -> np.ndarray:
+        return np.frombuffer(read_bytes(self.folder / name, tree=self.folder), COMPARED)
+
+    def groups(self, flights: list[Summary], column: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the rows that have one value of a column, two or more, in the order of flights and rows; zero and NO_SECOND are no values.
+
+        Yields:
+            their COMPARED, and FLIGHT: the number of the flight in `flights` and that of the row in it.
+        """
+        num_passes = -(-sum(flight.num_rows for flight in flights) // ROWS_AT_ONCE)
+        for number in range(num_passes):
+            parts, places = [], []
+            for k, flight in enumerate(flights):
+                rows = self.read(flight.rows_file)
+                values = np.atleast_2d(rows[column].T)
+                is_value = values[0] != (NO_SECOND if column == "cell" else 0)
+                own = np.flatnonzero(is_value & (values.sum(axis=0).astype(np.uint64) % num_passes == number))
+                place = np.zeros(len(own), FLIGHT)
+                place["flight"], place["row"] = k, own
+                parts.append(rows[own])
+                places.append(place)
+            rows, place = np.concatenate(parts), np.concatenate(places)
+            values = np.atleast_2d(rows[column].T)
+            order = np.lexsort(values)  # stable: flights and rows stay in their order
+            values = values[:, order]
+            is_first = np.ones(len(order), np.bool_)
+            is_first[1:] = (values[:, 1:] != values[:, :-1]).any(axis=0)
+            for group in np.split(order, np.flatnonzero(is_first)[1:]):
+                if len(group) > 1:
+                    yield rows[group], place[group]
+
+
+def check_across(flights: list[Summary], rows: RowFiles, *, by_town: bool, both: bool, findings: Findings) -> None:
     """Compare flights with each other.
 
     Args:
         by_town: splits share no town either. both: every flight's twin is released too.
     """
-    _check_ids(flights, findings)
-    _check_splits(flights, by_town, findings)
+    _check_ids(flights, rows, findings)
+    _check_splits(flights, rows, by_town, findings)
     _check_pairs({flight.name: flight for flight in flights}, both, findings)
     _check_copies(flights, findings)
-    for name in ("colours", "depths"):
-        _check_pictures(flights, name, findings)
+    for column in ("image", "depth"):
+        _check_pictures(flights, rows, column, findings)
 
 
-def _check_ids(flights: Iterable[Summary], findings: Findings) -> None:
-    counts = Counter(own for flight in flights for own in flight.ids)
-    for own, count in counts.items():
-        if count > 1:
-            findings.error("duplicate", own, f"{count} rows", "one row a frame")
+def _where(flights: list[Summary], place: np.ndarray) -> str:
+    return f"{flights[place['flight']].name} row {place['row']}"
 
 
-def _check_splits(flights: list[Summary], by_town: bool, findings: Findings) -> None:
+def _check_ids(flights: list[Summary], rows: RowFiles, findings: Findings) -> None:
+    for _, places in rows.groups(flights, "sample_id"):
+        shown = " and ".join(_where(flights, place) for place in places[:2])
+        findings.error("duplicate", f"{shown}: sample_id", f"{len(places)} rows of one id", "one row a frame")
+
+
+def _check_splits(flights: list[Summary], rows: RowFiles, by_town: bool, findings: Findings) -> None:
     """No walk, trajectory or, where splits are by town, town family stands in two splits, whatever the rows call it."""
     groups: dict[tuple[str, str], set[str]] = defaultdict(set)
     for flight in flights:
@@ -96,7 +176,7 @@ def _check_splits(flights: list[Summary], by_town: bool, findings: Findings) -> 
         if len(splits) > 1:
             findings.error("leak", f"{kind} {name}", f"in {', '.join(sorted(splits))}", "each walk in one split")
     known = [flight for flight in flights if flight.split is not None]
-    for one, other, share in same_walks(known):
+    for one, other, share in same_walks(known, rows):
         if one.split != other.split:
             got = f"{one.split} and {other.split}: the person at the same place in {share:.0%} of the seconds"
             findings.error("leak", f"{one.name} and {other.name}", got, "one walk in one split")
@@ -106,21 +186,27 @@ def _check_splits(flights: list[Summary], by_town: bool, findings: Findings) -> 
             )
 
 
-def same_walks(flights: list[Summary]) -> Iterable[tuple[Summary, Summary, float]]:
-    """Yield flights of one town family whose person is at the same places at the same seconds."""
-    at: dict[tuple[str, int, int, int], list[int]] = defaultdict(list)
-    for k, flight in enumerate(flights):
-        for cell in set(flight.cells):
-            at[town_family(flight.town), *cell].append(k)
+def same_walks(flights: list[Summary], rows: RowFiles) -> Iterator[tuple[Summary, Summary, float]]:
+    """Yield flights of one town family whose person is at the same places at the same seconds, and in which share of these."""
+    families = [town_family(flight.town) for flight in flights]
     together: Counter[tuple[int, int]] = Counter()
-    for group in at.values():
-        for a, one in enumerate(group[:MOST_SHARED]):
-            together.update((one, other) for other in group[a + 1 : MOST_SHARED])
-    for (a, b), count in together.items():
-        first, second = flights[a], flights[b]
-        common = len({cell[0] for cell in first.cells} & {cell[0] for cell in second.cells})
+    for _, places in rows.groups(flights, "cell"):
+        in_family: dict[str, list[int]] = defaultdict(list)
+        for k in np.unique(places["flight"]).tolist():
+            in_family[families[k]].append(k)
+        for group in in_family.values():
+            together.update(itertools.combinations(group[:MOST_SHARED], 2))
+    for (a, b), count in sorted(together.items()):
+        if count < WALK_SHARE * LEAST_SECONDS:
+            continue
+        common = len(_seconds(rows, flights[a]) & _seconds(rows, flights[b]))
         if common >= LEAST_SECONDS and count >= WALK_SHARE * common:
-            yield first, second, count / common
+            yield flights[a], flights[b], count / common
+
+
+def _seconds(rows: RowFiles, flight: Summary) -> set[int]:
+    """Give the whole seconds at which a flight knows where the person is."""
+    return set(rows.read(flight.rows_file)["cell"][:, 0].tolist()) - {NO_SECOND}
 
 
 def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings) -> None:
@@ -149,12 +235,11 @@ def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings)
 
 def _check_copies(flights: list[Summary], findings: Findings) -> None:
     """Two flights of two trajectories of a run never have one way through the air."""
-    ways: dict[tuple, Summary] = {}
+    ways: dict[str, Summary] = {}
     for flight in flights:
-        way = tuple(tuple(pose) for pose in flight.poses)
-        if len(way) < 2 or len(set(way)) < 2:
+        if not flight.way_digest:
             continue
-        other = ways.setdefault(way, flight)
+        other = ways.setdefault(flight.way_digest, flight)
         if other is flight or other.name.rpartition("/")[0] == flight.name.rpartition("/")[0]:
             continue
         # Another run may fly the same way on purpose, in other weather.
@@ -163,20 +248,14 @@ def _check_copies(flights: list[Summary], findings: Findings) -> None:
         findings.add("error" if is_of_run else "warning", "copy", flight.name, got, "a flight of its own")
 
 
-def _check_pictures(flights: list[Summary], column: str, findings: Findings) -> None:
+def _check_pictures(flights: list[Summary], rows: RowFiles, column: str, findings: Findings) -> None:
     """The same picture from two places is a copy."""
-    first: dict[int, tuple[str, list[float]]] = {}
-    for flight in flights:
-        for own, key, pose in zip(flight.ids, getattr(flight, column), flight.poses, strict=False):
-            if not key:
-                continue
-            known, place = first.setdefault(key, (own, pose))
-            if known == own:
-                continue
-            shift = float(np.linalg.norm(np.subtract(place[:3], pose[:3])))
-            turn = float(np.abs(np.asarray(wrap_deg(np.subtract(place[3:], pose[3:])))).max())
-            if shift > MOVED_M or turn > TURNED_DEG:
-                what = {"colours": "image", "depths": "depth"}[column]
-                got, expected = f"that of {known}, {shift:.1f} m and {turn:.1f} degrees away", "a picture of its own"
-                # Somebody else's pictures may be drawn, blank or of a town that repeats itself.
-                findings.add("warning" if flight.is_foreign else "error", "copy", f"{own}: {what}", got, expected)
+    for found, places in rows.groups(flights, column):
+        away = found["pose"][1:].astype(np.float64) - found["pose"][0]
+        shifts = np.linalg.norm(away[:, :3], axis=1)
+        turns = np.abs(wrap_deg(away[:, 3:])).max(axis=1)
+        for k in np.flatnonzero((shifts > MOVED_M) | (turns > TURNED_DEG)):
+            got = f"that of {_where(flights, places[0])}, {shifts[k]:.1f} m and {turns[k]:.1f} degrees away"
+            # Somebody else's pictures may be drawn, blank or of a town that repeats itself.
+            severity: Severity = "warning" if flights[places[k + 1]["flight"]].is_foreign else "error"
+            findings.add(severity, "copy", f"{_where(flights, places[k + 1])}: {column}", got, "a picture of its own")

@@ -11,7 +11,7 @@ from cosfly.items import Item, Outcome
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
 from release.record import DepthCoding
-from release.verify.across import summary_of
+from release.verify.across import RowFiles, summary_of
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
 from release.verify.identity import check_identity
@@ -33,11 +33,14 @@ LOSSLESS = DepthCoding(
 
 @dataclass(frozen=True)
 class Told:
-    """What the record says that the checks of a flight need. settings: of stages, by run and stage."""
+    """What the record says that the checks of flights need. settings: of stages, by run and stage. by_town: splits share no town
+    either. both: every flight's twin is released too."""
 
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
     settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    by_town: bool = False
+    both: bool = False
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
         run = flight.name.split("/")[0]
@@ -50,28 +53,30 @@ class Told:
 
 @dataclass(frozen=True)
 class Job:
-    """One flight to check, and the clean flight beside a perturbed one."""
+    """One flight to check, and the clean flight beside a perturbed one. rows_file: the name of what is kept of its rows."""
 
     entry: Entry
+    rows_file: str
     twin: Entry | None = None
 
 
 def make_worker(
-    source: FlightSource, level: Level, told: Told, reader: CaptionReader | None
+    source: FlightSource, level: Level, told: Told, reader: CaptionReader | None, rows: RowFiles
 ) -> Callable[[Item], Outcome]:
     """Worker factory: give the function that checks one flight."""
 
     def work(item: Item) -> Outcome:
         findings = Findings()
-        summary = check_flight(source, item.payload, level, told, reader, findings)
+        summary = check_flight(source, item.payload, level, told, reader, rows, findings)
         return Outcome({"findings": findings.dumped(), "summary": summary})
 
     return work
 
 
 def check_flight(
-    source: FlightSource, job: Job, level: Level, told: Told, reader: CaptionReader | None, findings: Findings
-) -> dict[str, Any] | None:
+    source: FlightSource, job: Job, level: Level, told: Told, reader: CaptionReader | None, rows: RowFiles,
+    findings: Findings,
+) -> dict[str, Any] | None:  # fmt: skip
     """Check one flight; gives what is compared with other flights, None where its rows cannot be read."""
     name = job.entry.name
     try:
@@ -104,7 +109,7 @@ def check_flight(
                 raise
             findings.error("not_checked", name, f"pictures: {type(error).__name__}: {error}", "rows of sense")
     try:
-        return summary_of(flight, keys).dumped()
+        return summary_of(flight, keys, rows, job.rows_file).dumped()
     except SENSELESS as error:
         findings.error("not_checked", name, f"{type(error).__name__}: {error}", "rows of sense")
         return None

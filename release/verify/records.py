@@ -19,7 +19,7 @@ from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.record import ReleaseRecord, content_digest, shard_path
 from release.subsample import RULE, select_frames
-from release.verify.across import Summary
+from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
 
 Numbers = dict[str, Any]
@@ -239,12 +239,11 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
         for key in ("split", "walk", "pair"):
             if getattr(entry, key) != getattr(flight, key):
                 findings.error("flight", f"{name}: {key}", getattr(flight, key), f"{getattr(entry, key)}, as in release.json")  # fmt: skip
-        indices = [int(own.rpartition("_frame_")[2]) for own in flight.ids if own.rpartition("_frame_")[2].isdigit()]
         try:
             rule = select_frames(entry.frames_available, record.settings.num_frames, record.settings.window_frames)
         except ValueError as error:
             findings.error("frames", name, str(error), "a number of frames")
             continue
-        if indices != rule.tolist() or len(indices) != entry.frames:
-            got = f"{len(indices)} frames, first {indices[:3]}"
+        if flight.frames_digest != frames_digest(rule) or flight.num_rows != entry.frames:
+            got = f"{flight.num_rows} frames, first {flight.first_frames}"
             findings.error("frames", name, got, f"{len(rule)} frames by the rule of release.json")

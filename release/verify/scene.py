@@ -7,7 +7,7 @@ flights of six runs showed at worst and what the smallest exchange, that of two 
 
 from __future__ import annotations
 
-import zlib
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -84,12 +84,12 @@ def check_pictures(
 
 
 def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
-    """Numbers that are the same for the same pictures: the checksum of a PNG's pixels, and one of the depth's samples."""
+    """Numbers that are the same for the same pictures: the checksums of a PNG's pixels, and a digest of the depth's samples."""
     colour, depth = files.get("rgb") or b"", files.get("depth") or b""
     # The last bytes before the IEND chunk (12): the stream's own checksum and that of its chunk (4 each).
-    return int.from_bytes(colour[-20:-12], "big"), zlib.crc32(
-        bytes(depth[:: max(1, len(depth) // 8192)])
-    ) if decoded else 0
+    told = int.from_bytes(colour[-20:-12], "big")
+    samples = bytes(depth[:: max(1, len(depth) // 8192)]) if decoded else b""
+    return told, int.from_bytes(hashlib.blake2b(samples, digest_size=8).digest(), "big") if samples else 0
 
 
 def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: dict[int, int], findings: Findings) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.config import Config
@@ -18,7 +19,7 @@ from cosfly.errors import InputError
 from cosfly.items import Item
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
-from cosfly.runner import run_items
+from cosfly.runner import Watch, run_items
 from cosfly.stage_folder import Failed, Kept, StageFolder
 from cosfly.store import CHECKSUMS
 from release.card.croissant import CROISSANT
@@ -26,7 +27,7 @@ from release.export.contract import FORMATS
 from release.export.manifest import read_export
 from release.record import ReleaseRecord, read_record
 from release.verify import by_rule, records
-from release.verify.across import Summary, check_across
+from release.verify.across import RowFiles, Summary, check_across
 from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
@@ -38,28 +39,46 @@ RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
 LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
 
 
-def verify(folder: Path, *, level: Level = "pixels", workers: int = 0, reader: CaptionReader | None = None) -> Verified:
+@dataclass(frozen=True)
+class _How:
+    """What `verify` was asked for."""
+
+    level: Level
+    reader: CaptionReader | None
+    workers: int
+    watch: Watch
+
+
+def verify(
+    folder: Path,
+    *,
+    level: Level = "pixels",
+    workers: int = 0,
+    reader: CaptionReader | None = None,
+    watch: Watch = Watch(),
+) -> Verified:
     """Check a folder (or the `dataset` folder inside a release stage's, or the format's inside an export's).
 
     Args:
         level: how far to go; each level does what the ones before it do.
         workers: processes; 0 works in this one.
         reader: tells what the words of captions say; None: they are not read, which the report says.
+        watch: when a worker counts as stalled; its flight is then an error.
     Returns:
         the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
     """
-    findings = Findings()
+    findings, how = Findings(), _How(level, reader, workers, watch)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
         inner = (folder / "dataset" / RECORD, *(folder / name / EXPORT for name in FORMATS))  # in the stage's folder
         folder = next((path.parent for path in inner if path.is_file()), folder)
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
     elif (folder / EXPORT).is_file():
-        _verify_export(folder, level, workers, reader, findings)
+        _verify_export(folder, how, findings)
     elif (folder / RECORD).is_file() or ((folder / CHECKSUMS).is_file() and not _is_tree(folder)):
-        _verify_release(folder, level, workers, reader, findings)
+        _verify_release(folder, how, findings)
     else:
-        _verify_tree(folder, level, workers, findings)
+        _verify_tree(folder, how, findings)
     report = findings.report()
     report.level = level
     return report
@@ -72,7 +91,7 @@ def _is_tree(folder: Path) -> bool:
 # --- a release --------------------------------------------------------------------------------------------------------
 
 
-def _verify_release(folder: Path, level: Level, workers: int, reader: CaptionReader | None, findings: Findings) -> None:
+def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
     try:
         record = read_record(folder / RECORD)
     except InputError as error:
@@ -91,16 +110,13 @@ def _verify_release(folder: Path, level: Level, workers: int, reader: CaptionRea
     records.check_card(folder, record, findings)
     shards = [shard.path for shard in record.shards]
     findings.facts.append(f"structure: {len(shards):,} shards, {record.numbers.frames:,} frames by their record")
-    if level != "structure":
-        _verify_rows(folder, record, readable == shards, level, workers, reader, findings)
-    if level == "pixels":
+    if how.level != "structure":
+        _verify_rows(folder, record, readable == shards, how, findings)
+    if how.level == "pixels":
         check_digests(folder, digests, [name for name in good if name not in small], findings)
 
 
-def _verify_rows(
-    folder: Path, record: ReleaseRecord, is_readable: bool, level: Level, workers: int, reader: CaptionReader | None,
-    findings: Findings,
-) -> None:  # fmt: skip
+def _verify_rows(folder: Path, record: ReleaseRecord, is_readable: bool, how: _How, findings: Findings) -> None:
     """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
     shards = [shard.path for shard in record.shards]
     source = Shards(folder, tuple(record.settings.modalities))
@@ -114,8 +130,7 @@ def _verify_rows(
         return
     available = {flight.flight: flight.frames_available for flight in record.flights}
     entries = [Entry(e.name, e.parts, e.num_rows, e.given_id, available.get(e.name)) for e in entries]
-    flights = check_all(source, entries, level, _told(record), reader, workers, findings)
-    check_across(flights, by_town=record.splits.by == "town", both=_wants_both(record), findings=findings)
+    flights = check_all(source, entries, _told(record), how, findings)
     records.check_flights(record, flights, findings)
     _check_shard_splits(record, entries, flights, findings)
     try:
@@ -123,10 +138,6 @@ def _verify_rows(
         by_rule.check_clock(folder, record, findings)
     except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
         findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
-
-
-def _wants_both(record: ReleaseRecord) -> bool:
-    return record.settings.pairs == "both" and len(record.settings.tracks) == 2
 
 
 def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
@@ -145,7 +156,11 @@ def _told(record: ReleaseRecord) -> Told:
     settings = {
         (source.run, stage.stage): stage.config for source in record.provenance.sources for stage in source.stages
     }
-    return Told(record.settings.window_frames, record.depth or LOSSLESS, settings)
+    asked = record.settings
+    return Told(
+        asked.window_frames, record.depth or LOSSLESS, settings,
+        by_town=record.splits.by == "town", both=asked.pairs == "both" and len(asked.tracks) == 2,
+    )  # fmt: skip
 
 
 def _check_shard_splits(
@@ -164,7 +179,7 @@ def _check_shard_splits(
 # --- an export --------------------------------------------------------------------------------------------------------
 
 
-def _verify_export(folder: Path, level: Level, workers: int, reader: CaptionReader | None, findings: Findings) -> None:
+def _verify_export(folder: Path, how: _How, findings: Findings) -> None:
     """Check an export: its record, its files against its list of checksums, and the rows and pictures of a playback tree or a WebDataset
     as such. LeRobot rounds poses and cuts flights: its rows are those of its release, which is verified where it stands."""
     try:
@@ -182,22 +197,17 @@ def _verify_export(folder: Path, level: Level, workers: int, reader: CaptionRead
     good = check_names(folder, dict.fromkeys((*digests, *own, "README.md", CHECKSUMS)), findings)
     if EXPORT not in digests:
         findings.error("checksum", f"{CHECKSUMS}: {EXPORT}", "no line", "one line per file")
-    if level == "pixels":
+    if how.level == "pixels":
         check_digests(folder, digests, good, findings)
     if is_tree:
-        _verify_tree(folder, level, workers, findings)
-    elif record.format == "webdataset" and level != "structure":
-        _verify_tars(
-            folder, [name for name in good if name.endswith(".tar")], record.frames, level, reader, workers, findings
-        )
-    elif level != "structure":
+        _verify_tree(folder, how, findings)
+    elif record.format == "webdataset" and how.level != "structure":
+        _verify_tars(folder, [name for name in good if name.endswith(".tar")], record.frames, how, findings)
+    elif how.level != "structure":
         findings.note("not_checked", EXPORT, "rows of this format", "verify the release that it was made of: its digest stands there")  # fmt: skip
 
 
-def _verify_tars(
-    folder: Path, shards: list[str], num_frames: int, level: Level, reader: CaptionReader | None, workers: int,
-    findings: Findings,
-) -> None:  # fmt: skip
+def _verify_tars(folder: Path, shards: list[str], num_frames: int, how: _How, findings: Findings) -> None:
     """Check rows and pictures of a WebDataset as those of a release."""
     try:
         source, entries, coding = found_tars(folder, shards, findings)
@@ -205,8 +215,7 @@ def _verify_tars(
         findings.error("unreadable", error.where, error.got or error.what, error.expected or "rows of all shards")
         return
     told = Told(depth=coding or LOSSLESS)
-    flights = check_all(source, entries, level, told, reader, workers, findings)
-    check_across(flights, by_town=False, both=False, findings=findings)
+    check_all(source, entries, told, how, findings)
     num_rows = sum(entry.num_rows for entry in entries)
     if num_rows != num_frames:
         findings.error("rows", EXPORT, f"{num_rows:,} frames", f"{num_frames:,}, as {EXPORT} says")
@@ -215,7 +224,7 @@ def _verify_tars(
 # --- a playback tree --------------------------------------------------------------------------------------------------
 
 
-def _verify_tree(folder: Path, level: Level, workers: int, findings: Findings) -> None:
+def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
     try:
         source, entries = Tree.found(folder)
     except InputError as error:
@@ -224,11 +233,10 @@ def _verify_tree(folder: Path, level: Level, workers: int, findings: Findings) -
         return
     findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
     digests = _tree_digests(folder, entries, findings)
-    if level == "structure":
+    if how.level == "structure":
         return
-    flights = check_all(source, entries, level, Told(), None, workers, findings)
-    check_across(flights, by_town=False, both=False, findings=findings)
-    if level == "pixels":
+    check_all(source, entries, Told(), replace(how, reader=None), findings)
+    if how.level == "pixels":
         for flight, own in digests.items():
             check_digests(folder / flight, own, list(own), findings)
 
@@ -253,30 +261,30 @@ class _Settings(Config):
     """A verification has no settings that a product would depend on."""
 
 
-def check_all(
-    source: FlightSource, entries: list[Entry], level: Level, told: Told, reader: CaptionReader | None, workers: int,
-    findings: Findings,
-) -> list[Summary]:  # fmt: skip
-    """Check every flight, by several processes; gives what is kept of each to compare them."""
+def check_all(source: FlightSource, entries: list[Entry], told: Told, how: _How, findings: Findings) -> list[Summary]:
+    """Check every flight, by several processes, and all of them against each other; gives what was kept of each."""
     clean = {e.name.rpartition("/")[0]: e for e in entries if e.name.rpartition("/")[2] == ORIGINAL}
     items = []
-    for entry in entries:
+    for number, entry in enumerate(entries):
         twin = clean.get(entry.name.rpartition("/")[0])
-        job = Job(entry, twin if twin is not None and twin is not entry else None)
-        items.append(Item(entry.name, job, entry.num_rows if level == "pixels" and entry.num_rows else None))
+        job = Job(entry, f"{number:07d}.rows", twin if twin is not None and twin is not entry else None)
+        items.append(Item(entry.name, job, entry.num_rows if how.level == "pixels" and entry.num_rows else None))
+    flights = []
     with tempfile.TemporaryDirectory(prefix="cosfly-verify-") as place:
         stage = StageFolder.open(Path(place) / "verify", "verify", config=_Settings(), inputs={}, seed=0)
-        done = run_items(stage, items, make_worker, (source, level, told, reader), workers=workers, label="verify")
-    flights = []
-    for record in done.records:
-        if isinstance(record, Kept):
-            findings.merge(record.result["findings"])
-            if record.result["summary"] is not None:
-                flights.append(Summary(**record.result["summary"]))
-        elif isinstance(record, Failed):
-            findings.error("not_checked", record.id, record.message, "a flight that can be checked")
+        rows = RowFiles(Path(place) / "rows")
+        started = (source, how.level, told, how.reader, rows)
+        done = run_items(stage, items, make_worker, started, workers=how.workers, watch=how.watch, label="verify")
+        for record in done.records:
+            if isinstance(record, Kept):
+                findings.merge(record.result["findings"])
+                if record.result["summary"] is not None:
+                    flights.append(Summary(**record.result["summary"]))
+            elif isinstance(record, Failed):
+                findings.error("not_checked", record.id, record.message, "a flight that can be checked")
+        check_across(flights, rows, by_town=told.by_town, both=told.both, findings=findings)
     num_rows = sum(flight.num_rows for flight in flights)
-    words = "texts of captions read" if reader is not None else "texts of captions not read: no reader was given"
-    pictures = f", all their {', '.join(source.files)} pictures" if level == "pixels" else ""
+    words = "texts of captions read" if how.reader is not None else "texts of captions not read: no reader was given"
+    pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
     findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
     return flights

@@ -1,0 +1,91 @@
+"""Flights against each other: rows wait in files and are looked at in passes, which find what one look at all of them finds."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from release.verify import across
+from release.verify.across import COMPARED, NO_SECOND, RowFiles, Summary, check_across
+from release.verify.findings import Findings
+
+
+def flight(number: int, num_rows: int, **told) -> Summary:
+    values = {
+        "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train", "walk": str(number), "pair": None,
+        "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [], "frames_digest": "",
+        "way_digest": "",
+    }  # fmt: skip
+    return Summary(**(values | told))
+
+
+def stored(folder, flights: list[np.ndarray]) -> tuple[RowFiles, list[Summary]]:
+    rows = RowFiles(folder)
+    for number, own in enumerate(flights):
+        rows.write(f"{number}.rows", own)
+    return rows, [flight(number, len(own)) for number, own in enumerate(flights)]
+
+
+def table(num_rows: int, rng: np.random.Generator, most: int) -> np.ndarray:
+    found = np.zeros(num_rows, COMPARED)
+    for name in ("sample_id", "image", "depth"):
+        found[name] = rng.integers(0, most, num_rows)
+    found["cell"] = rng.integers(-2, 3, (num_rows, 3))
+    found["cell"][rng.random(num_rows) < 0.3] = NO_SECOND
+    return found
+
+
+@pytest.mark.parametrize("column", ["sample_id", "image", "cell"])
+@given(sizes=st.lists(st.integers(0, 12), max_size=6), most=st.integers(1, 30), seed=st.integers(0, 1000), at_once=st.integers(1, 40))  # fmt: skip
+def test_passes_find_what_one_look_finds(tmp_path_factory, column, sizes, most, seed, at_once):
+    rng = np.random.default_rng(seed)
+    tables = [table(size, rng, most) for size in sizes]
+    wanted = defaultdict(list)
+    for k, own in enumerate(tables):
+        for i, value in enumerate(own[column].tolist()):
+            if value not in (0, [NO_SECOND] * 3):
+                wanted[str(value)].append((k, i))
+    rows, flights = stored(tmp_path_factory.mktemp("rows"), tables)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(across, "ROWS_AT_ONCE", at_once)
+        found = [[tuple(place) for place in places.tolist()] for _, places in rows.groups(flights, column)]
+    assert sorted(found) == sorted(places for places in wanted.values() if len(places) > 1)
+
+
+def found_in(folder, flights: list[np.ndarray], **told) -> dict[str, int]:
+    rows, summaries = stored(folder, flights)
+    findings = Findings()
+    check_across([Summary(**(vars(s) | told)) for s in summaries], rows, by_town=False, both=False, findings=findings)
+    return {code: kind.count for (_, code), kind in findings.kinds.items()}
+
+
+def test_copies_and_duplicates_are_counted(tmp_path):
+    one, other = np.zeros(3, COMPARED), np.zeros(3, COMPARED)
+    one["cell"] = other["cell"] = NO_SECOND
+    one["sample_id"], other["sample_id"] = (1, 2, 3), (4, 5, 6)
+    one["image"], other["image"] = (7, 8, 9), (10, 11, 9)
+    assert found_in(tmp_path, [one, other]) == {}  # one picture from one place: a camera that stands still
+    other["pose"][2] = (0.6, 0, 0, 0, 0, 0)
+    assert found_in(tmp_path, [one, other]) == {"copy": 1}
+    other["pose"][2] = (0, 0, 0, 0, 359, 0)
+    assert found_in(tmp_path, [one, other]) == {}
+    other["sample_id"] = (3, 3, 6)
+    assert found_in(tmp_path, [one, other]) == {"duplicate": 1}
+
+
+def test_the_same_way_in_two_splits_is_a_leak(tmp_path):
+    walk = np.zeros(20, COMPARED)
+    walk["cell"] = np.column_stack([np.arange(20), np.arange(20) // 2, np.zeros(20)])
+    late = walk.copy()
+    late["cell"][:, 0] += 40
+    assert found_in(tmp_path, [walk, late]) == {}
+    assert found_in(tmp_path, [walk, walk.copy()]) == {"walk": 1}
+    rows, (one, other) = stored(tmp_path, [walk, walk.copy()])
+    findings = Findings()
+    other.split = "test"
+    check_across([one, other], rows, by_town=False, both=False, findings=findings)
+    assert {code for _, code in findings.kinds} == {"leak"}
