@@ -93,6 +93,7 @@ from distill.student import model as student
 from distill.student.taught import taught_by
 from distill.tracks import RECORD as TRACKS
 from distill.tracks import read_track_samples
+from distill.windows import Windows
 from release.export import stage as export
 from release.export.contract import ExportConfig
 from release.export.manifest import read_export
@@ -555,6 +556,12 @@ def _changed_release(root: Path, scratch: Path) -> Path:
     return dataset
 
 
+def _looked_at(*source: Path) -> None:
+    windows = Windows(*source)
+    for number in range(0, len(windows), 5):
+        windows[number]
+
+
 def _exported(root: Path, scratch: Path, format: str) -> None:
     cfg, dataset = build(ExportConfig, {"format": format}, "x"), _changed_release(root, scratch)
     _stage(lambda: export.run(cfg, dataset, scratch / "export"), scratch / "export")
@@ -620,6 +627,9 @@ READERS: dict[str, Reader] = {
     "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
     "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
     "track_samples": Reader((f"tracks/{TRACKS}", "tracks/train.parquet"), lambda root, _: list(read_track_samples(root / "tracks", "train")), hashes=True),
+    "windows of a tree": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, _: _looked_at(root / "render", root / "captions.jsonl"), share=0.2),
+    "windows, of a record": _one("release/dataset/release.json", lambda path: _looked_at(path.parent)),
+    "windows of a release": Reader(("shard.parquet",), lambda root, scratch: _looked_at(_changed_release(root, scratch)), share=0.3, hashes=True),
     "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
     "evaluate": Reader(("predictions.jsonl", "train/val.parquet", "train/train.parquet"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),

@@ -217,12 +217,16 @@ def test_every_snippet_of_the_card_runs(record, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
     values: dict = {"FOLDER": str(dataset)}
     blocks = re.findall(r"```python\n(.*?)```", render_card(record), re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     for block in blocks:
         exec(block, values)
     assert set(values["splits"]) == set(record.splits.splits)
     assert values["poses"].num_rows == record.splits.splits[first_split(record)].frames
     assert values["poses"].column_names == ["sample_id", "pose"]
+    window = values["window"](0)
+    assert len(window["frames"]) == len(window["facts"]["time_s"]) == record.settings.window_frames
+    assert window["prompt"]
+    assert window["caption"]
     assert len(values["places"]) == min(10, values["poses"].num_rows)
 
 

@@ -91,6 +91,7 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "modalities": "\n".join(f"- {_file_text(record, name)}" for name in settings.modalities),
         "decode": snippets.one_row(record),
         "parts": snippets.parts(record),
+        "windows": snippets.windows(record),
         "columns_table": _columns(settings.modalities),
         "coordinates": claims.coordinates_block(record),
         "licence": for_markdown(record.licence),

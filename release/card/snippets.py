@@ -62,6 +62,33 @@ def parts(record: ReleaseRecord) -> str:
     )
 
 
+def windows(record: ReleaseRecord) -> str:
+    """Give what makes captioned windows of the rows, with `datasets` alone."""
+    has_rgb = "rgb" in record.settings.modalities
+    frames = ['    frames = [row["image"] for row in rows]'] if has_rgb else []
+    given = ['"frames": frames'] if has_rgb else []
+    given += ['"facts": facts', '"prompt": last["prompt_en"]', '"caption": last["caption_en_reasoning_trace"]']
+    return "\n".join(
+        [
+            "from datasets import load_dataset",
+            "",
+            f'data = load_dataset(FOLDER, split="{first_split(record)}")',
+            'flight = ["run", "town", "trajectory", "variant"]',
+            'keys = data.select_columns([*flight, "frame_index"])',
+            "place = {tuple(key.values()): number for number, key in enumerate(keys)}",
+            'captioned = [number for number, has in enumerate(data["has_caption"]) if has]',
+            "",
+            "def window(i):",
+            "    last = data[captioned[i]]",
+            "    name = [last[part] for part in flight]",
+            '    rows = data.select([place[(*name, index)] for index in last["caption_window"]])',
+            *frames,
+            '    facts = rows.select_columns(["time_s", "pose", "target", "target_bbox", "target_visible"])[:]',
+            f"    return {{{', '.join(given)}}}",
+        ]
+    )
+
+
 def first_split(record: ReleaseRecord) -> str:
     """Give the first split that has rows."""
     return next((name for name in SPLIT_NAMES if name in record.splits.splits), SPLIT_NAMES[0])

@@ -1,0 +1,137 @@
+"""Windows for training code of one's own: the same from a tree and from its release, in tensors, with workers."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_release_package import CFG, build, make_caption, make_inspection
+
+from cosfly.errors import ConfigError, InputError
+from cosfly.products.captions import write_captions
+from cosfly.products.frames import frame_name, read_rgb
+from cosfly.products.inspection import write_inspection
+from cosfly.products.playback import find_flights, read_flight
+from distill.windows import FACTS, Windows
+from specimens import make_playback_tree
+
+NUM_POINTS = 9
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """tree/, captions.jsonl and release/dataset/ of three walks; the last caption of each flight was dropped."""
+    root = tmp_path_factory.mktemp("windows")
+    make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54)
+    captions = [
+        make_caption(
+            flight, i, **({"status": "dropped", "drop_reason": "hard_conflict"} if i == NUM_POINTS - 2 else {})
+        )
+        for flight in map(read_flight, find_flights(root / "tree"))
+        for i in range(4, NUM_POINTS - 1)
+    ]
+    write_captions(root / "captions.jsonl", captions)
+    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+    build(root, root / "release", CFG.model_copy(update={"num_frames": None}))
+    return root
+
+
+def by_window(windows: Windows) -> dict[tuple, int]:
+    return {(p.flight[1:], p.window): i for i, p in enumerate(windows._places)}
+
+
+@pytest.mark.parametrize("language", ["en", "zh"])
+def test_a_tree_and_its_release_give_the_same_windows(place, language):
+    tree = Windows(place / "tree", place / "captions.jsonl", language=language)
+    release = Windows(place / "release", language=language)
+    assert len(tree) == len(release) == 6 * (NUM_POINTS - 6)
+    assert tree.left_out == {"dropped_hard_conflict": 6}
+    numbers = by_window(release)
+    for i, found in enumerate(tree._places):
+        ours, theirs = tree[i], release[numbers[found.flight[1:], found.window]]
+        assert np.array_equal(ours["frames"], theirs["frames"])
+        assert ours["prompt"] == theirs["prompt"]
+        assert ours["caption"] == theirs["caption"]
+        assert ours["facts"].keys() == theirs["facts"].keys() == FACTS.keys()
+        for name, values in ours["facts"].items():
+            assert np.allclose(values, theirs["facts"][name], rtol=0, atol=1e-9, equal_nan=True), name
+            assert values.dtype == theirs["facts"][name].dtype
+
+
+def test_a_window_is_what_stands_in_the_files(place):
+    windows = Windows(place / "tree", place / "captions.jsonl", max_side_px=96)
+    window, found = windows[1], windows._places[1]
+    flight = read_flight(place.joinpath("tree", *found.flight[1:]))
+    assert window["window"].tolist() == [1, 2, 3, 4, 5]
+    assert window["frames"].shape == (5, 3, 54, 96)
+    for k, index in enumerate(window["window"]):
+        assert np.array_equal(window["frames"][k].transpose(1, 2, 0), read_rgb(flight.folder / frame_name(index)))
+    assert np.array_equal(window["facts"]["pose"][:, :3], flight.positions_m[1:6])
+    assert np.array_equal(window["facts"]["pose"][:, 3:], flight.rotations_deg[1:6])
+    assert "<pictures>" not in window["prompt"]["user"]
+    assert window["caption"]["flight_decision"]
+
+
+def test_splits_of_a_release_share_no_walk_and_make_up_the_whole(place):
+    record = json.loads((place / "release/dataset/release.json").read_text())
+    names = sorted({shard["split"] for shard in record["shards"]})
+    parts = [Windows(place / "release/dataset", split=name) for name in names]
+    assert sum(map(len, parts)) == len(Windows(place / "release/dataset"))
+    trajectories = [{found.flight[2] for found in part._places} for part in parts]
+    assert sum(map(len, trajectories)) == len(set().union(*trajectories))
+
+
+@pytest.mark.parametrize("source", ["tree", "release"])
+def test_pytorch_loads_them_with_two_workers(place, source):
+    torch = pytest.importorskip("torch")
+    from distill.windows import WindowDataset
+
+    given = (place / "tree", place / "captions.jsonl") if source == "tree" else (place / "release",)
+    windows = WindowDataset(*given, max_side_px=48)
+    assert isinstance(windows, torch.utils.data.Dataset)
+    assert len(pickle.loads(pickle.dumps(windows))) == len(windows)
+    loader = torch.utils.data.DataLoader(windows, batch_size=4, num_workers=2)
+    seen = []
+    for batch in loader:
+        assert batch["frames"].shape[1:] == (5, 3, 27, 48)
+        assert batch["frames"].dtype == torch.uint8
+        assert batch["facts"]["target"].shape[1:] == (5, 3)
+        seen += batch["sample_id"]
+    assert seen == [windows[i]["sample_id"] for i in range(len(windows))]
+
+
+def test_without_torch_nothing_of_it_is_loaded():
+    import subprocess
+    import sys
+
+    code = "import sys, distill.windows; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "error", "words"),
+    [
+        ("release", {"split": "trian"}, ConfigError, "did you mean 'train'"),
+        ("release", {"language": "de"}, ConfigError, "en, zh"),
+        ("release", {"max_side_px": 0}, ConfigError, "max_side_px"),
+        ("tree", {}, InputError, "Windows(tree, captions)"),
+        ("tree", {"split": "train"}, ConfigError, "release build"),
+        ("nowhere", {}, InputError, "neither a release nor a run folder"),
+    ],
+)
+def test_what_cannot_be_opened_says_why(place, source, options, error, words):
+    with pytest.raises(error) as caught:
+        Windows(place / source, **options)
+    assert words in str(caught.value)
+
+
+def test_a_missing_picture_leaves_its_windows_out(place, tmp_path):
+    import shutil
+
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    folder = find_flights(tree)[0]
+    (folder / frame_name(4) / "rgb.png").unlink()
+    windows = Windows(tree, place / "captions.jsonl")
+    assert windows.left_out["missing_frame"] == NUM_POINTS - 6
+    assert len(windows) == 5 * (NUM_POINTS - 6)
