@@ -16,6 +16,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import scenes
@@ -80,11 +81,12 @@ def seconds(work: Callable[[], Any], device: str, repeats: int) -> float:
 
 def measure(student: Student, shape: dict[str, Any], count: int, options: argparse.Namespace) -> list[list[Any]]:
     rows, features = make_batch(student, shape, count)
+    seen = [replace(row, pixel_values=None) for row in rows]  # as `infer` gives them, whose pictures were looked at
     ways: dict[str, Callable[[int], Any]] = {
         "generate": lambda tokens: generate(student, rows, tokens),
         "decode": lambda tokens: decode(student, rows, max_tokens=tokens),
-        "features": lambda tokens: decode(student, rows, max_tokens=tokens, features=features),
-        "plain": lambda tokens: decode(student, rows, max_tokens=tokens, features=features, is_recorded=False),
+        "features": lambda tokens: decode(student, seen, max_tokens=tokens, features=features),
+        "plain": lambda tokens: decode(student, seen, max_tokens=tokens, features=features, is_recorded=False),
     }
     table = []
     for name in options.ways:
@@ -99,22 +101,32 @@ def measure(student: Student, shape: dict[str, Any], count: int, options: argpar
 
 
 def check(student: Student, shape: dict[str, Any], count: int, num_tokens: int) -> None:
+    """Say how far the answers of all ways agree. In float32 they must.
+
+    In bfloat16 a matrix product that is recorded may add in another order, and of random weights the two best tokens are often one
+    rounding apart, after which answers go their own ways: how long they agree is told, no more.
+    """
     rows, features = make_batch(student, shape, count)
-    plain = [
-        answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=features, is_recorded=False)
-    ]
+
+    def answers(given: Any, is_recorded: bool = True) -> list[str]:
+        found = decode(student, rows, max_tokens=num_tokens, features=given, is_recorded=is_recorded)
+        return [answer.text for answer in found]
+
+    plain = answers(features, is_recorded=False)
     expected, whose = plain, "plain steps"
     if student.dtype == torch.float32:
         expected, whose = generate(student, rows, num_tokens), "generate"
-    ways = {"plain": plain}
-    for name, given in (("decode", None), ("features", features)):
-        ways[name] = [answer.text for answer in decode(student, rows, max_tokens=num_tokens, features=given)]
+    ways = {"plain": answers(features, is_recorded=False), "decode": answers(None), "features": answers(features)}
     for name, found in ways.items():
-        num_equal = sum(a == b for a, b in zip(found, expected, strict=True))
-        print(f"{name}: {num_equal} of {count} answers of {num_tokens} tokens are those of {whose}", flush=True)
-    # Pictures looked at one after the other, not together, are others in the last bit: of bfloat16 that may be seen.
-    assert ways["features"] == expected
-    assert student.dtype != torch.float32 or ways["decode"] == ways["plain"] == expected
+        pairs = [(a.split(), b.split()) for a, b in zip(found, expected, strict=True)]
+        num_equal = sum(a == b for a, b in pairs)
+        agreed = sum(len(list(takewhile(lambda two: two[0] == two[1], zip(a, b, strict=False)))) for a, b in pairs)
+        print(
+            f"{name}: {num_equal} of {count} answers of {num_tokens} tokens are those of {whose}; "
+            f"they agree for {agreed / count:.1f} tokens",
+            flush=True,
+        )
+    assert student.dtype != torch.float32 or all(found == expected for found in ways.values())
 
 
 def main() -> None:
