@@ -50,6 +50,8 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or the new."""
     partial = _partial(path)
     refuse_link(path)
+    if path.is_dir():
+        raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.unlink(missing_ok=True)  # a kill left it, or somebody put a link there

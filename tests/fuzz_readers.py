@@ -95,6 +95,7 @@ from distill.tracks import RECORD as TRACKS
 from distill.tracks import read_track_samples
 from distill.windows import Windows
 from release.export import stage as export
+from release.export.captions import export as export_captions
 from release.export.contract import ExportConfig
 from release.export.manifest import read_export
 from release.get import stage as get
@@ -653,6 +654,7 @@ READERS: dict[str, Reader] = {
         f"release, export to {name}": Reader(("shard.parquet",), lambda root, scratch, name=name: _exported(root, scratch, name), share=0.1, hashes=True)
         for name in ("tree", "webdataset", "lerobot")
     },
+    "release, captions": Reader(("shard.parquet",), lambda root, scratch: export_captions(_changed_release(root, scratch), scratch / "c.csv", "csv"), share=0.2, hashes=True),
     "release, get": Reader(("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"), lambda root, scratch: _fetched(root / "release/dataset", scratch), share=0.2, hashes=True),
     "release, get a part": Reader(("shard.parquet",), lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]), share=0.1, hashes=True),
     "export record": _one("export/webdataset/export.json", read_export),

@@ -19,6 +19,7 @@ from cosfly import __version__
 from cosfly.cli.bench import app as bench_app
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
+from cosfly.cli.export import app as export_app
 from cosfly.cli.release import app as release_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.stages import app as stages_app
@@ -40,7 +41,12 @@ app = typer.Typer(
 )
 for group in (run_app, stages_app, bench_app, studies_app):
     app.add_typer(group)  # without a name: its commands stand at the top
-for name, named_group in (("caption", caption_app), ("distill", distill_app), ("release", release_app)):
+for name, named_group in (
+    ("caption", caption_app),
+    ("distill", distill_app),
+    ("export", export_app),
+    ("release", release_app),
+):
     app.add_typer(named_group, name=name)
 
 

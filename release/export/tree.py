@@ -59,9 +59,14 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     units = []
     for flight in flights:
         number = numbers.setdefault((flight.run, flight.town, flight.trajectory), len(numbers))
-        folder = Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
+        folder = tree_folder(flight, has_runs)
         units.append(Unit(flight.name, len(flight), flights=(flight,), extra=(folder.as_posix(), number)))
     return units
+
+
+def tree_folder(flight: ReleasedRows, has_runs: bool) -> Path:
+    """Give the folder of a flight, relative to the tree; has_runs: the release is of several runs."""
+    return Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
 
 
 def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
