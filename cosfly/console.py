@@ -85,7 +85,8 @@ def set_up_logging(level: int, file: Path | None = None) -> None:
 def set_levels(level: int) -> None:
     """Let our own log lines of a level through; of libraries, which log how they work, warnings only."""
     logging.getLogger().setLevel(level)
-    for noisy in ("httpx", "httpcore", "numba", "PIL", "asyncio", "urllib3"):
+    # Of those that speak to servers some log requests whole, with the key in them.
+    for noisy in ("httpx", "httpcore", "httpx2", "httpcore2", "huggingface_hub", "urllib3", "numba", "PIL", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 

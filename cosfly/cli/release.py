@@ -242,3 +242,41 @@ def release_get(
     choice = build(Choice, {name: value for name, value in asked.items() if value}, "the options")
     product = get.run(choice, source, out, **options.manner(cfg, resume), findings=findings)
     options.tell_product(product, out, cfg)
+
+
+@app.command("push")
+def release_push(
+    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    repo: Annotated[str, typer.Option(help="Repository of data on the hub: OWNER/NAME; made if there is none.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Send it. Without: only say what would go.")] = False,
+    public: Annotated[
+        bool, typer.Option("--public", help="A repository that is made is public; else private.")
+    ] = False,
+    level: Annotated[
+        Literal["structure", "rows", "pixels"], typer.Option(help="How far the release is verified before.")
+    ] = "pixels",
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    workers: options.Workers = None,
+) -> None:
+    """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
+    from caption.truth.released import read_released
+    from cosfly.console import answer_console
+    from release import push
+
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    push.check_name(repo)
+    parcel = push.pack(folder)
+    rows = [(name, f"{size:>15,}") for name, size in parcel.files.items()]
+    answer_console.print(options.plain_table(f"{len(rows)} files, {parcel.num_bytes / 1e6:,.1f} MB, to {repo}", rows))
+    for name in parcel.stays:
+        answer_console.print(f"stays here, as it is not of the release: {name}", soft_wrap=True)
+    num_workers = options.manner(cfg, "never")["workers"]
+    report = push.verified(parcel, level, workers=num_workers, reader=read_released)
+    typer.echo(str(report))
+    if yes:
+        typer.echo(push.push(parcel, repo, private=not public))
+    else:
+        typer.echo(
+            f"dry run: nothing was sent; with --yes it goes to {repo}, {'public' if public else 'private'} if it is made"
+        )
