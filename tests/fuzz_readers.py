@@ -60,6 +60,7 @@ from cosfly.products.frames import read_depth, read_instance, read_meta, read_rg
 from cosfly.products.inspection import read_inspection
 from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids
 from cosfly.products.kinds import KINDS
+from cosfly.products.meshes import write_meshes
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
 from cosfly.products.playback import find_flights, read_flight, read_twin
 from cosfly.products.predictions import read_predictions
@@ -69,6 +70,7 @@ from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
+from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render import older_trees
 from cosfly.render.stage import RenderConfig
 from cosfly.render.weather import read_pools
@@ -211,7 +213,26 @@ METRICS = dict.fromkeys((*(name for name, *_ in compare.FIGURES), "collision_fra
 RELEASE = package.ReleaseConfig(num_frames=6, shard_mb=1, row_group_mb=1, licence="cc-by-4.0", unbound="accept")
 
 
+def _meshes(root: Path) -> None:
+    corners = np.array([[(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 0, 1), (1, 0, 1), (0, 1, 2)]], dtype=float)
+    write_meshes(
+        root / "mesh.glb",
+        {"a": Mesh(corners, np.array([[0.5, 0.25, 0.0], [np.nan] * 3])), "b": Mesh(corners, corners[:, 0])},
+    )
+    data = (root / "mesh.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + size])
+    document["buffers"][0]["uri"] = "mesh.bin"
+    write_json(root / "mesh.gltf", document)
+    (root / "mesh.bin").write_bytes(data[28 + size :])
+    (root / "mesh.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl wood\nKd 1 1 1\nmap_Kd wood.png\n")
+    (root / "mesh.obj").write_text(
+        "mtllib mesh.mtl\no a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf 1 2 3\nf 1/1/1 -1 2 3\n"
+    )
+
+
 def _maps(root: Path) -> None:
+    _meshes(root)
     write_boxes(root / "boxes_3d.json", _street())
     walk = walk_along("p0", [(-20, 0), (20, 0), (20, 2)])
     write_paths(root / "path.json", [walk], {"map": "hand", "seed": 0})
@@ -585,6 +606,9 @@ FLIGHT = (f"{TREE}/ORI/trajectory.json",)
 PICTURES = tuple(f"{TREE}/ORI/{FRAME}/{name}" for name in ("rgb.png", "depth.npy", "instance.png"))
 READERS: dict[str, Reader] = {
     "boxes": _one("boxes_3d.json", read_boxes),
+    "meshes, glTF": _one("mesh.glb", lambda path: read_meshes(path, tree=path.parent)),
+    "meshes, glTF as text": Reader(("mesh.gltf", "mesh.bin"), lambda root, _: read_meshes(root / "mesh.gltf", tree=root)),
+    "meshes, OBJ": Reader(("mesh.obj", "mesh.mtl"), lambda root, _: read_meshes(root / "mesh.obj", tree=root)),
     "region of interest": _one("roi.json", read_roi),
     "region of interest, GeoJSON": _one("roi.geojson", read_roi),
     "table of boxes": _one("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),

@@ -9,6 +9,7 @@ flat is made so; ground that slopes is kept as a grid of heights (terrain.py), a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +23,12 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover, polygons_of, rectangle_polygon, united
+from cosfly.maps.solids import solid_mesh, top_within
 from cosfly.maps.terrain import ground_of
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.ground import Ground, GroundGrid
+from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef
+from cosfly.reading.meshes import Mesh
 
 SLAB_M = 0.3
 SLOPED_WALL_M, SLOPED_WALL_DEPTH_M = 6.0, 1.0  # on a slope walls are cut into steps of this length, founded this deep
@@ -46,6 +50,10 @@ class CityJsonConfig(Config):
     )
     credits: str = Field("", description="who must be named: the model's makers, one sentence or more")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
+    solids: bool = Field(
+        True,
+        description="draw solids with their own roofs and walls (meshes.glb); planners keep to the boxes either way",
+    )
     solid_fill: float = Field(
         0.9, gt=0.0, le=1.0, description="share of each box of a building that its footprint fills"
     )
@@ -106,13 +114,18 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
     boxes, standing = BoxList(), set[int]()  # rows of solids, whose heights are the source's
+    refs, made = dict[int, MeshRef](), dict[str, Mesh]()
     footprint_m2 = boxes_m2 = covered_m2 = 0.0
     for item in objects:
         footprint = footprints[item.object_id]
         if item.rule.form == "solid":
             first = len(boxes)
-            outline = _add_solid(boxes, cfg, item, footprint, ground)
+            outline, mesh = _add_solid(boxes, cfg, item, footprint, ground)
             standing.update(range(first, len(boxes)))
+            if mesh is not None and len(boxes) > first:
+                made[item.object_id] = mesh
+                ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
+                refs |= {row + 1: ref for row in range(first, len(boxes))}
             if item.rule.kind == "Buildings":
                 footprint_m2, boxes_m2 = footprint_m2 + footprint.area, boxes_m2 + outline.area
                 covered_m2 += shapely.intersection(footprint, outline).area
@@ -138,9 +151,11 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         num_objects=model.num_objects,
         dropped_objects=model.dropped,
     )
+    if not ground.is_flat:
+        header = header.model_copy(update={"ground": GroundGrid.of(ground)})
+    box_map = replace(boxes.box_map(header), meshes=Meshes(refs, made=made))  # ids are rows counted from 1
     if ground.is_flat:
-        return boxes.box_map(header)
-    box_map = boxes.box_map(header.model_copy(update={"ground": GroundGrid.of(ground)}))
+        return box_map
     follows = ~np.isin(np.arange(len(box_map)), list(standing))
     box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return box_map
@@ -167,8 +182,13 @@ def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], n
     ground = np.median(np.concatenate(roads)[:, 2]) if roads else np.percentile(corners[:, 2], 5)
     offset = np.array([*np.round((low + high)[:2] / 2), round(float(ground), 3)])
     return [
-        item._replace(surfaces=[[r - offset for r in rings] for rings in item.surfaces]) for item in objects
+        item._replace(surfaces=_moved(item.surfaces, offset), detailed=_moved(item.detailed, offset))
+        for item in objects
     ], offset
+
+
+def _moved(surfaces: list[list[np.ndarray]], offset: np.ndarray) -> list[list[np.ndarray]]:
+    return [[ring - offset for ring in rings] for rings in surfaces]
 
 
 def _facets(item: CityObject) -> list[Facet]:
@@ -193,18 +213,25 @@ def _facets(item: CityObject) -> list[Facet]:
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
 
-def _add_solid(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, ground: Ground) -> Any:
-    """Add a building as upright boxes from its lowest ground (or below it) to its top; gives the union of their outlines."""
+def _add_solid(
+    boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, ground: Ground
+) -> tuple[Any, Mesh | None]:
+    """Add a building as upright boxes from its lowest ground (or below it) to its top; gives the union of their outlines, and what is drawn.
+
+    A box is as high as what is drawn in it: nothing of a spire, which the plainer geometry leaves out, stands out of what planners know.
+    """
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
     high = max(float(z.max()), float(z.min()) + 0.1)
+    mesh = solid_mesh(item.detailed, low) if cfg.solids else None
     outlines = []
     for polygon in polygons_of(footprint):
         outline = polygon.simplify(0.05)
         for rectangle in cover(outline, min_fill=cfg.solid_fill, min_size_m=cfg.solid_piece_m, shares=CUT_SHARES):
-            boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
+            top = high if mesh is None else top_within(mesh, rectangle, high)
+            boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, max(top, low + 0.1), rectangle.yaw_deg)
             outlines.append(rectangle_polygon(rectangle))
-    return united(outlines)
+    return united(outlines), mesh
 
 
 def _add_wall(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, *, is_flat: bool) -> None:

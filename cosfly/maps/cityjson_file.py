@@ -63,11 +63,15 @@ RULES = (
 
 
 class CityObject(NamedTuple):
-    """One object: its surfaces as rings of world vertices; ring 0 of a surface is its outline, others are holes."""
+    """One object: its surfaces as rings of world vertices; ring 0 of a surface is its outline, others are holes.
+
+    surfaces: of the plainest geometry with a height, which boxes are made of; detailed: of the most detailed one of a solid, which is drawn.
+    """
 
     object_id: str
     rule: Rule
     surfaces: list[list[np.ndarray]]
+    detailed: list[list[np.ndarray]]
 
     def corners(self) -> np.ndarray:
         """All vertices, (n, 3) m."""
@@ -139,14 +143,14 @@ def _city_object(object_id: str, value: Any, part: _Part, templates: _Templates)
     if rule is None:
         log.warning("%s: no rule for the type %s; left out", object_id, value["type"])
         return "unmapped_type"
-    surfaces, level = _surfaces(value.get("geometry", []), part.vertices, templates, f"{where}.geometry")
+    surfaces, detailed, level = _surfaces(value.get("geometry", []), part.vertices, templates, f"{where}.geometry")
     if not surfaces:
         return "no_geometry"
     if level < 1 and rule.form == "solid" and _has_parts(value, part):
         return (
             "outline_of_parts"  # a building whose parts stand in the file with a height; it would hide their courtyards
         )
-    return CityObject(object_id, rule, surfaces)
+    return CityObject(object_id, rule, surfaces, detailed if rule.form == "solid" else [])
 
 
 def _has_parts(value: dict, part: _Part) -> bool:
@@ -265,24 +269,29 @@ def _templates(model: dict, path: Path) -> _Templates:
 
 def _surfaces(
     geometries: Any, vertices: np.ndarray, templates: _Templates, where: str
-) -> tuple[list[list[np.ndarray]], float]:
-    """The surfaces of the geometry with the lowest level of detail from 1 up, as boxes need no more, and its level."""
+) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]], float]:
+    """The surfaces of the geometry with the lowest level of detail from 1 up, as boxes need no more; of the one with the highest; the former's level."""
     if not isinstance(geometries, list) or not all(isinstance(g, dict) for g in geometries):
         raise InputError("not a list of geometries", where=where, got=type(geometries).__name__)
     placed = [_placed(g, vertices, templates, f"{where}[{k}]") for k, g in enumerate(geometries)]
     usable = [(_level(g), number) for number, (g, _) in enumerate(placed) if str(g.get("type")) in NESTING]
     if not usable:
-        return [], 0.0
+        return [], [], 0.0
     level, number = min(usable, key=lambda pair: (pair[0] < 1, pair[0]))
-    geometry, corners = placed[number]
+    _, finest = max(usable, key=lambda pair: pair[0])
+    plain = _surfaces_of(*placed[number], f"{where}[{number}].boundaries")
+    return plain, plain if finest == number else _surfaces_of(*placed[finest], f"{where}[{finest}].boundaries"), level
+
+
+def _surfaces_of(geometry: dict, corners: np.ndarray, where: str) -> list[list[np.ndarray]]:
+    """The surfaces of one geometry; of a solid those of its outer shell."""
     lists, nesting = geometry.get("boundaries"), NESTING[geometry["type"]]
-    where = f"{where}[{number}].boundaries"
     solids = lists if nesting == 2 else [lists] if nesting == 1 else [[lists]]
     found: list = []
     for solid in _list(solids, where):
         for shell in _list(solid, where)[:1]:  # the outer shell
             found += _list(shell, where)
-    return [_rings(surface, corners, f"{where} surface {k}") for k, surface in enumerate(found)], level
+    return [_rings(surface, corners, f"{where} surface {k}") for k, surface in enumerate(found)]
 
 
 def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: str) -> tuple[dict, np.ndarray]:

@@ -17,6 +17,7 @@ from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.meshes import MESHES_FILE
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes
 from cosfly.topview import TopView, draw_map, png_bytes
@@ -72,5 +73,6 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     log.info("%d boxes of %d objects", len(box_map), num_objects)
-    stage.finish([product, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
+    meshes = [out / MESHES_FILE] if box_map.meshes.refs else []
+    stage.finish([product, *meshes, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

@@ -17,6 +17,7 @@ from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.products.meshes import Meshes, MeshRef
 from cosfly.reading.documents import check_schema, read_json, validation_errors
 from cosfly.store import dump_json, write_bytes
 
@@ -101,7 +102,8 @@ class BoxMap:
     """A map of boxes, the product of stages 1 and 2.
 
     centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. `header`: what the map says about itself.
+    ids: (n,) uint64, unique and stable. `header`: what the map says about itself. `meshes`: what some boxes are drawn as; in maps as
+    sources and files give them, not in simplified ones, whose boxes nobody draws.
     """
 
     centers: np.ndarray
@@ -110,6 +112,7 @@ class BoxMap:
     kinds: np.ndarray
     ids: np.ndarray
     header: MapHeader = field(default_factory=MapHeader)
+    meshes: Meshes = field(default_factory=Meshes)
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -210,6 +213,7 @@ class _Box(BaseModel):
     color: str | None = None
     min: Vector | None = None
     max: Vector | None = None
+    mesh: MeshRef | None = None
 
     @field_validator("type")
     @classmethod
@@ -224,8 +228,9 @@ class _Boxes(BaseModel):
 
 
 def write_boxes(path: Path, box_map: BoxMap) -> None:
-    """Write boxes in the paper's fields (tab:boxes_schema), one box a line."""
+    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; what some are drawn as, in `meshes.glb` beside them."""
     check_boxes(box_map, path)
+    refs = box_map.meshes.beside(path.parent).refs
     columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
     box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
     mins, maxs = box_map.mins, box_map.maxs
@@ -257,6 +262,8 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
             "min": rounded(mins[i]),
             "max": rounded(maxs[i]),
         }
+        if mesh := refs.get(int(box_map.ids[i])):
+            box["mesh"] = mesh.model_dump(exclude_none=True)
         lines.append(dump_json(box))
     ground = f',\n "ground": {dump_json(heights)}' if heights else ""
     text = dump_json(header, indent=1)[:-2] + ground + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
@@ -284,7 +291,9 @@ def read_boxes(path: Path) -> BoxMap:
         boxes = _Boxes.model_validate({"boxes": records}).boxes
     centers, extents, rotations = ([getattr(box, name) for box in boxes] for name in ("center", "extent", "rotation"))
     kinds, ids = [KINDS[box.type] for box in boxes], [box.id for box in boxes]
+    refs = {box.id: box.mesh for box in boxes if box.mesh is not None}
     box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
+    box_map = replace(box_map, meshes=Meshes(refs, path.parent))
     check_boxes(box_map, path)
     _check_told(value if isinstance(value, dict) else {}, boxes, box_map, path)
     return box_map

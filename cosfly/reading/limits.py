@@ -29,6 +29,10 @@ class Limits(BaseModel):
     )
     line_mb: int = Field(64, ge=1, description="longest line of a JSON-lines file, MB")
     picture_mpx: int = Field(50, ge=1, description="largest picture or depth image, million pixels; 8K has 33")
+    mesh_mb: int = Field(512, ge=1, description="largest file of meshes, and of what it names beside it, MB")
+    mesh_triangles: int = Field(
+        2_000_000, ge=1, description="most triangles of a file of meshes, and of all that a map draws of them"
+    )
     polygon_vertices: int = Field(100_000, ge=3, description="most vertices of one polygon, its holes included")
     polygon_crossings: int = Field(
         500,

@@ -26,6 +26,7 @@ from cosfly.products.weather import WeatherParams
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped
+from cosfly.render.solids import are_solids, solids_of
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
@@ -188,11 +189,12 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np
     middle, radius = (1.0 + low) / 2.0, contract.stem_radius_m(halves)
     crowns = halves * np.column_stack([np.ones((len(low), 2)), (1.0 - low) / 2.0])
     stems = np.column_stack([radius, radius, halves[:, 2] * (1.0 + middle) / 2.0])
+    is_box = np.append(~are_solids(box_map), True)
     box, ball = trimesh.creation.box(extents=(2.0, 2.0, 2.0)), trimesh.creation.icosphere(subdivisions=1)
     solids = [
-        (box, ~is_round & ~np.append(is_draped(box_map), False), halves, 0.0 * low, table[kinds]),
-        (ball, is_round, crowns, middle, table[kinds]),
-        (box, low > -1.0, stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
+        (box, is_box & ~is_round & ~np.append(is_draped(box_map), False), halves, 0.0 * low, table[kinds]),
+        (ball, is_box & is_round, crowns, middle, table[kinds]),
+        (box, is_box & (low > -1.0), stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
     ]
     triangles, colors, tagged = [], [], []
     for mesh, rows, size, lift, paint in solids:  # lift: of the middle over the box's, in half heights
@@ -201,6 +203,12 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np
         triangles.append(corners[:, mesh.faces].reshape(-1, 3, 3))
         colors.append(np.repeat(paint[rows], len(mesh.faces), axis=0))
         tagged.append(np.repeat(tags[rows], len(mesh.faces), axis=0))
+    meshes = solids_of(box_map)
+    paint = np.where(np.isnan(meshes.colors), table[kinds][meshes.rows], meshes.colors)
+    for sides in (meshes.corners_m, meshes.corners_m[:, ::-1]):  # seen from both
+        triangles.append(sides - origin)
+        colors.append(paint)
+        tagged.append(tags[meshes.rows])
     if not box_map.ground.is_flat:
         draped = drape(box_map)
         triangles.append(draped.corners_m - origin)

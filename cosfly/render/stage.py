@@ -223,10 +223,11 @@ def run(
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
     read_pools(cfg)  # presets that cannot be are told before anything is written
     inputs |= cfg.pool_files()
+    box_map = read_boxes(boxes)
+    inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
-    box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)

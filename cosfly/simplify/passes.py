@@ -24,6 +24,7 @@ from cosfly.config import Config
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.boxes import BoxMap, SimplifyPass
 from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.meshes import Meshes
 from cosfly.simplify.merge import MergeRule, merge
 
 VEGETATION, WATER = KINDS["Vegetation"], KINDS["Water"]
@@ -124,7 +125,8 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
         "passes": [SimplifyPass(name=name, counts=counts) for name, counts in passes],
         "simplify": cfg.model_dump(mode="json", exclude={"picture_px"}),
     }
-    return Simplified(replace(result, header=box_map.header.model_copy(update=told)), passes)
+    header = box_map.header.model_copy(update=told)
+    return Simplified(replace(result, header=header, meshes=Meshes()), passes)
 
 
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:

@@ -23,8 +23,9 @@ from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedO
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import Body, make_body
+from cosfly.render.gl.loose import LooseTriangles, attributes
 from cosfly.render.gl.moving import MOST_CAPSULES, capsules_of, draw_others, placed
-from cosfly.render.gl.parts import LOOSE_VERTEX, PART
+from cosfly.render.gl.parts import PART
 from cosfly.render.gl.scene import Scene, build_scene
 from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import View
@@ -71,13 +72,12 @@ def _sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "
 
 @dataclass(frozen=True)
 class _Look:
-    """What fair weather, or any other, is drawn with: programs, and vertex arrays of loose triangles by material and program."""
+    """What fair weather, or any other, is drawn with."""
 
     materials: list[Any]
     near_movers: list[Any]
     sky_program: Any
     sky: Any
-    loose: dict[int, dict[int, Any]]
     weather: WeatherPass | None
 
 
@@ -107,7 +107,7 @@ class GlRenderer:
         if define not in self._looks:
             self._looks[define] = self._make_look(define)
         look = self._looks[define]
-        self._materials, self._near_movers, self._loose = look.materials, look.near_movers, look.loose
+        self._materials, self._near_movers = look.materials, look.near_movers
         self._sky_program, self._sky, self._weather = look.sky_program, look.sky, look.weather
 
     def _make_look(self, define: str | None) -> _Look:
@@ -123,16 +123,12 @@ class GlRenderer:
             for near in ("false", "true")
         )
         sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define or ""))
-        loose = {
-            material: self._loose_arrays((materials[material], near_movers[material]), buffer)
-            for material, buffer in self._loose_buffers.items()
-        }
         weather = None
         if define is not None:
             rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl")))
             weather = WeatherPass(self.context, self._color, self._depth, rain, self.num_others)
         sky = self.context.vertex_array(sky_program, [])
-        return _Look(materials, near_movers, sky_program, sky, loose, weather)
+        return _Look(materials, near_movers, sky_program, sky, weather)
 
     def _make_targets(self) -> None:
         size, context = (self.width_px, self.height_px), self.context
@@ -155,25 +151,8 @@ class GlRenderer:
             for mesh in meshes.all_meshes()
         ]
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
-        self._loose_buffers = {
-            material: self.context.buffer(reserve=rows.nbytes) for material, rows in self.scene.loose.items()
-        }
-
-    def _fill_loose(self) -> None:
-        """Hand over the loose triangles, counted from the origin of now."""
-        for material, buffer in self._loose_buffers.items():
-            vertices = self.scene.loose[material].copy()
-            vertices["center"] -= (self.origin_m - self.scene.origin_m).astype(np.float32)
-            buffer.write(vertices.tobytes())
-
-    def _loose_arrays(self, programs: tuple[Any, Any], buffer: Any) -> dict[int, Any]:
-        """Vertex arrays, one a program, of triangles that are no instances: every vertex brings its part along."""
-        names = [f"in_{name}" for name in LOOSE_VERTEX.names or ()]
-        arrays = {}
-        for program in programs:
-            content = _attributes(program, buffer, "3f 3f 3f 3f 4f 4f 1u 1f", tuple(names))
-            arrays[program.glo] = self.context.vertex_array(program, [content])
-        return arrays
+        self._solids = LooseTriangles(self.context, self.scene.solids)
+        self._loose = LooseTriangles(self.context, self.scene.draped), self._solids
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Vertex array and instance buffer of a program on a mesh."""
@@ -181,8 +160,8 @@ class GlRenderer:
             vertices, triangles = self._meshes[mesh]
             instances = self.context.buffer(reserve=PART.itemsize, dynamic=True)
             content = [
-                _attributes(program, vertices, "3f 3f", ("in_position", "in_normal")),
-                _attributes(
+                attributes(program, vertices, "3f 3f", ("in_position", "in_normal")),
+                attributes(
                     program, instances, "3f 3f 4f 4f 1u 1f /i",
                     ("in_center", "in_half", "in_quaternion", "in_color", "in_tag", "in_bias"),
                 ),
@@ -204,12 +183,19 @@ class GlRenderer:
         casting = np.flatnonzero(near & (parts.max_px > 1e8))
         with self.context:
             self._use_look(None if weather is None else defines(weather))
-            self._fill_loose()
+            for loose in self._loose:
+                loose.place(self.origin_m - self.scene.origin_m)
             if self._weather is not None and weather is not None:
                 self._weather.prepare(weather, parts, middle, half)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
-            self._prepare_shadow(casting, middle, half)
-            self._prepare_openness(casting, middle, half)
+            centers, radii = self._solids.centers, self._solids.radii
+            beside = (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
+            centers = np.concatenate([parts.object_centers[casting], centers[beside]])
+            radii = np.concatenate([parts.object_radii[casting], radii[beside]])
+            self._solids.see(None)
+            self._prepare_shadow(casting, centers, radii, middle, half)
+            top = float((centers[:, 2] + radii).max(initial=self.scene.plane_z_m - self.origin_m[2])) + 1.0
+            self._prepare_openness(casting, top, middle, half)
 
     def _settle(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
         """Keep the parts that a camera within these corners can see, counted from near it.
@@ -225,13 +211,16 @@ class GlRenderer:
         self._parts = parts.select(away_m < FAR_M).about(steps * ORIGIN_STEP_M)
         self._groups = _groups(self._parts.records, self._parts.mesh)
 
-    def _prepare_shadow(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
+    def _prepare_shadow(
+        self, casting: np.ndarray, centers: np.ndarray, radii: np.ndarray, middle: np.ndarray, half: float
+    ) -> None:
+        """Draw what casts shadows, rows of the parts and all solids, from the sun; centers, radii: of all of it near the middle."""
         sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
-        away = np.abs((self._parts.object_centers[casting] - middle) @ sun)
-        depth_half = float((away + self._parts.object_radii[casting]).max(initial=half))  # towers cast from afar
+        away = np.abs((centers - middle) @ sun)
+        depth_half = float((away + radii).max(initial=half))  # towers cast from afar
         clip_from_world = np.eye(4)
         clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
         clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
@@ -242,11 +231,9 @@ class GlRenderer:
             _set(program, "shadow_from_world", to_texture @ clip_from_world)
             _set(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
 
-    def _prepare_openness(self, casting: np.ndarray, middle: np.ndarray, half: float) -> None:
-        """A height map from above, blurred: what stands higher than a point darkens it."""
-        parts = self._parts
+    def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
+        """A height map from above, blurred: what stands higher than a point darkens it. top: no caster is higher."""
         ground_z = self.scene.plane_z_m - self.origin_m[2]
-        top = float((parts.object_centers[casting, 2] + parts.object_radii[casting]).max(initial=ground_z)) + 1.0
         depth_m = top - ground_z + 10.0
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
         clip_from_world[:3, 3] = -middle[0] / half, -middle[1] / half, 2.0 * top / depth_m - 1.0
@@ -281,6 +268,7 @@ class GlRenderer:
         _set(self._depth_program, "clip_from_world", clip_from_world)
         for mesh in range(len(self._meshes)):
             self._draw(self._depth_program, mesh, self._parts.records[rows[self._parts.mesh[rows] == mesh]])
+        self._solids.draw_all(self._depth_program)
 
     # --- one frame ---
 
@@ -305,6 +293,7 @@ class GlRenderer:
         with self.context:
             self._set_camera(self._materials, view, frame_values)
             rows = view.rows(self._parts)
+            self._solids.see(view)
             self._image.use()
             self._image.clear(depth=1.0)
             self.context.enable_only(self.context.DEPTH_TEST | self.context.CULL_FACE)
@@ -398,8 +387,8 @@ class GlRenderer:
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 self._draw(programs[material], mesh, records[groups == material * MESH_STRIDE + mesh])
-            if material in self._loose:
-                self._loose[material][programs[material].glo].render()
+            for loose in self._loose:
+                loose.draw(programs[material], material)
 
     def _draw(self, program: Any, mesh: int, records: np.ndarray) -> None:
         if len(records) == 0:
@@ -439,16 +428,8 @@ def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 
 def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     centers = scene.parts.object_centers[:-1] if len(scene.parts) > 1 else scene.parts.object_centers
+    centers = np.concatenate([centers, scene.solids.centers])
     return centers.min(axis=0) + scene.origin_m, centers.max(axis=0) + scene.origin_m
-
-
-def _attributes(program: Any, buffer: Any, layout: str, names: tuple[str, ...]) -> tuple:
-    """Buffer layout for a program: attributes that its compiler left out become padding."""
-    kinds = layout.split()
-    suffix = kinds.pop() if kinds[-1].startswith("/") else ""
-    used = [name in program for name in names]
-    padded = [kind if use else f"{4 * int(kind[:-1])}x" for kind, use in zip(kinds, used, strict=True)]
-    return (buffer, " ".join(padded) + suffix, *(name for name, use in zip(names, used, strict=True) if use))
 
 
 def _set(program: Any, name: str, value: Any) -> None:

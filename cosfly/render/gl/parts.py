@@ -14,9 +14,9 @@ from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, chance
 # Materials, the same numbers as in scene.frag.glsl.
 (
     PLAIN, FACADE, ROAD, SIDEWALK, GRASS, LEAVES, BARK, CAR_PAINT, CABIN, RUBBER, METAL, BRICK, WATER, FENCE, ROAD_LINE,
-    LAMP, GRAVEL, SIGNAL, BUS, CLOTH, CONCRETE,
-) = range(21)  # fmt: skip
-NUM_MATERIALS = 21
+    LAMP, GRAVEL, SIGNAL, BUS, CLOTH, CONCRETE, TILES,
+) = range(22)  # fmt: skip
+NUM_MATERIALS = 22
 GROUND_MATERIALS = (SIDEWALK, ROAD_LINE, ROAD, GRAVEL, WATER, GRASS)
 DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *GROUND_MATERIALS)
 

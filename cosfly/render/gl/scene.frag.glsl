@@ -29,7 +29,7 @@ layout(location = 2) out uint out_tag;
 // every branch, and one program for all materials costs five times as much.
 const int PLAIN = 0, FACADE = 1, ROAD = 2, SIDEWALK = 3, GRASS = 4, LEAVES = 5, BARK = 6, CAR_PAINT = 7, CABIN = 8, RUBBER = 9,
     METAL = 10, BRICK = 11, WATER = 12, FENCE = 13, ROAD_LINE = 14, LAMP = 15, GRAVEL = 16, SIGNAL = 17, BUS = 18, CLOTH = 19,
-    CONCRETE = 20;
+    CONCRETE = 20, TILES = 21;
 const int material = MATERIAL;
 const bool near_movers = NEAR_MOVERS;   // whether this text is for pixels that somebody who moves may darken: two loops that every pixel pays for
 
@@ -305,6 +305,12 @@ void main() {
         if (is_top) s.albedo = vec3(0.42, 0.40, 0.38); else s.albedo = brick_pattern(q, vec2(along_y ? footprint.y : footprint.x, footprint.z), s.albedo);
         s.albedo = mix(s.albedo, vec3(0.43, 0.41, 0.38), stripe(f_half.z - v_local.z, -1.0, 0.1, footprint.z));
         s.albedo *= 0.8 + 0.3 * noise2(q * 0.8) - 0.2 * exp(-3.0 * q.y);
+    } else if (material == TILES) {                                              // courses along the eaves, every second one shifted
+        float row = floor(v_local.z / 0.32);
+        float x = v_local.x / 0.26 + 0.5 * mod(row, 2.0);
+        float near = clamp(1.4 - 6.0 * w, 0.0, 1.0);
+        s.albedo *= 0.78 + 0.22 * noise2(v_local.xz * 0.5 + 40.0 * fract(f_color.a)) + 0.3 * near * (hash21(vec2(floor(x), row)) - 0.5);
+        s.albedo *= 1.0 - 0.42 * max(stripes(v_local.z / 0.32, 0.16, footprint.z / 0.32), 0.6 * stripes(x, 0.12, footprint.x / 0.26));
     } else if (material == FENCE) {
         bool along_y = abs(n.x) > abs(n.y);
         float u = along_y ? v_local.y : v_local.x, wu = along_y ? footprint.y : footprint.x;

@@ -1,4 +1,4 @@
-"""A map ready to be drawn: the parts of every box, a ground plane under everything, and the surfaces on ground that slopes."""
+"""A map ready to be drawn: the parts of every box, a ground plane under everything, the surfaces on ground that slopes, and meshes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from cosfly.products.kinds import KINDS
 from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin, seeds_of
 from cosfly.render.draping import Draped, drape, is_draped
 from cosfly.render.gl import meshes
+from cosfly.render.gl.loose import Loose
 from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, plain
+from cosfly.render.gl.solids import loose_solids
+from cosfly.render.solids import are_solids, solids_of
 
 HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the shader draws none on it
 
@@ -24,27 +27,29 @@ HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the sh
 class Scene:
     """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world.
 
-    loose: material -> (3 k,) LOOSE_VERTEX, three to a triangle, of the surfaces on `ground`; empty where that is flat.
+    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes.
     """
 
     parts: Parts
     origin_m: np.ndarray
     plane_z_m: float
     ground: Ground
-    loose: dict[int, np.ndarray]
+    draped: Loose
+    solids: Loose
 
 
 def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     """Turn a map into drawable parts, with a ground plane under everything; the ids of others stay free."""
     origin, all_ids = scene_origin(box_map), instance_ids(box_map, num_others)
-    builder, lies = PartBuilder(), is_draped(box_map)
+    solids, are_meshes = solids_of(box_map), are_solids(box_map)
+    builder, lies = PartBuilder(), is_draped(box_map) & ~are_meshes
     # Surfaces on a slope are made as on a plain, so that they know their neighbours, and lifted afterwards.
     centers = box_map.centers - origin
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map), PART)
     has_paint = bool((box_map.kinds == KINDS["RoadLines"]).any())
-    for kind in np.unique(box_map.kinds):
-        rows = np.flatnonzero(box_map.kinds == kind)
+    for kind in np.unique(box_map.kinds[~are_meshes]):
+        rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
         boxes = Boxes(
             centers[rows],
             np.maximum(box_map.half_extents[rows], 1e-3),
@@ -72,7 +77,8 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     bare = plane.finish()
     builder.add_parts(bare)
     loose = {} if box_map.ground.is_flat else _loose(drape(box_map), origin, np.append(lying, bare.records))
-    return Scene(builder.finish(), origin, plane_z_m(box_map), box_map.ground, loose)
+    standing = loose_solids(box_map, solids, origin, all_ids)
+    return Scene(builder.finish(), origin, plane_z_m(box_map), box_map.ground, Loose.all_of(loose), standing)
 
 
 def _loose(draped: Draped, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:

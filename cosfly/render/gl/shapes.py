@@ -21,6 +21,12 @@ BUILDING_COLORS = np.array([
     [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58], [0.42, 0.40, 0.38],
     [0.70, 0.54, 0.36], [0.50, 0.45, 0.40], [0.62, 0.46, 0.36], [0.78, 0.75, 0.69], [0.38, 0.43, 0.47], [0.52, 0.28, 0.20],
 ])  # fmt: skip
+TILE_COLORS = np.array([
+    [0.34, 0.12, 0.065], [0.28, 0.11, 0.07], [0.10, 0.105, 0.115], [0.30, 0.15, 0.09], [0.15, 0.14, 0.135], [0.38, 0.16, 0.08],
+])  # fmt: skip
+PLAIN_COLORS = np.array(
+    [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
+)
 BARK_COLOR = (0.16, 0.11, 0.075)
 CAR_COLORS = np.array([
     [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26], [0.23, 0.25, 0.27],
@@ -75,10 +81,7 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
 
 
 def plain(builder: PartBuilder, boxes: Boxes) -> None:
-    shades = np.array(
-        [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
-    )
-    builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(shades))
+    builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))
 
 
 def _buildings(builder: PartBuilder, boxes: Boxes) -> None:

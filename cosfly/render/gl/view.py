@@ -32,10 +32,15 @@ class View:
         rows = np.flatnonzero(inside)
         return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
 
+    def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """Which of some spheres may be seen, the nearest first; centers: (n, 3), radii (n,) float32, relative to the scene's origin."""
+        in_camera = self._in_camera(centers)
+        seen = np.flatnonzero(self._is_inside(in_camera, radii) & (self._size_px(in_camera, radii) >= SMALLEST_PX))
+        return seen[np.argsort((in_camera[:, 2] - radii)[seen], kind="stable")]
+
     def can_show(self, center: np.ndarray, radius: float) -> bool:
         """Tell whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
-        in_camera, radii = self._in_camera(center[None]), np.array([radius], np.float32)
-        return bool(self._is_inside(in_camera, radii)[0] and self._size_px(in_camera, radii)[0] >= SMALLEST_PX)
+        return len(self.shown(center[None], np.array([radius], np.float32))) > 0
 
     def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
         """Pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None where it is out of the picture."""

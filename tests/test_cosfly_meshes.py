@@ -1,0 +1,460 @@
+"""Meshes: read as trimesh reads them, drawn where trimesh's rays meet them, refused where they are hostile; CityJSON solids as they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly.config import build
+from cosfly.errors import InputError
+from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
+from cosfly.maps import cityjson
+from cosfly.maps.cityjson import CityJsonConfig
+from cosfly.maps.footprints import Rectangle
+from cosfly.maps.solids import solid_mesh, top_within, triangles_of
+from cosfly.maps.stage import MapsConfig
+from cosfly.maps.stage import run as make_map
+from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.products.frames import Look
+from cosfly.products.kinds import KINDS
+from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
+from cosfly.reading.limits import Limits, use_limits
+from cosfly.reading.meshes import Mesh, read_meshes
+from cosfly.render.contract import (
+    GROUND_PLANE_DROP_M,
+    GROUND_PLANE_HALF_M,
+    NEAR_M,
+    NO_INSTANCE,
+    plane_z_m,
+    scene_origin,
+)
+from cosfly.render.solids import solids_of
+from cosfly.render.stage import RENDERERS, open_renderer
+from cosfly.simplify.passes import SimplifyConfig, simplify
+
+SIZE = (320, 180)
+UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
+
+
+def sorted_rows(corners: np.ndarray) -> np.ndarray:
+    """Triangles in an order that does not depend on who wrote them; each begins at its smallest corner."""
+    corners = np.round(corners, 5) + 0.0
+    first = np.array([min(range(3), key=lambda k, t=t: tuple(t[k])) for t in corners])
+    turned = np.array([np.roll(t, -k, axis=0) for t, k in zip(corners, first, strict=True)])
+    return turned[np.lexsort(turned.reshape(len(turned), -1).T[::-1])]
+
+
+def two_things() -> trimesh.Scene:
+    """A turned, stretched ball below a node that is itself moved, and a mirrored red box."""
+    scene = trimesh.Scene()
+    turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3), (0.5, 0, 0))
+    ball, box = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((1.0, 2.0, 3.0))
+    box.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(baseColorFactor=(255, 0, 0, 255))
+    )
+    scene.add_geometry(ball, node_name="ball", transform=turn @ np.diag([1.0, 2.0, 0.5, 1.0]))
+    scene.add_geometry(box, node_name="box", transform=np.diag([-1.0, 1.0, 1.0, 1.0]))
+    return scene
+
+
+# --- reading and writing ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_gltf_is_read_as_trimesh_reads_it(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"things.{suffix}"
+    two_things().export(path)
+    assert suffix == "glb" or list(tmp_path.glob("*.bin")), "the case of a file beside it"
+    found = read_meshes(path, tree=tmp_path)
+    theirs = trimesh.load_scene(path)
+    assert set(found) == {"ball", "box"}
+    for name, mesh in found.items():
+        transform, geometry = theirs.graph[name]
+        corners = trimesh.transform_points(theirs.geometry[geometry].triangles.reshape(-1, 3), transform) @ UP.T
+        expected = corners.reshape(-1, 3, 3)
+        assert mesh.corners_m.shape == expected.shape
+        if name == "box":  # mirrored: turned round to face out again
+            expected = expected[:, ::-1]
+            assert trimesh.Trimesh(**trimesh.triangles.to_kwargs(mesh.corners_m)).volume > 0
+        np.testing.assert_allclose(sorted_rows(mesh.corners_m), sorted_rows(expected), atol=2e-5)
+    np.testing.assert_allclose(found["box"].colors, [[1.0, 0.0, 0.0]] * 12)
+    assert np.isnan(found["ball"].colors).all()
+
+
+def test_obj_is_read_as_trimesh_reads_it_with_its_colours(tmp_path: Path) -> None:
+    (tmp_path / "paint.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl wood\nKd 1 1 1\nmap_Kd wood.png\n")
+    text = "mtllib paint.mtl\no shed\nv 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n# a comment\nv 1 1 4\nusemtl red\nf 1 4 3 2\n"
+    text += "usemtl wood\nf 1//1 2//1 5\nf -4/2 3/1 5/2\no lid\nusemtl red\nf 3 4 5\nf 4 1 5\n"
+    (tmp_path / "shed.obj").write_text(text)
+    found = read_meshes(tmp_path / "shed.obj", tree=tmp_path)
+    assert {name: len(mesh) for name, mesh in found.items()} == {"shed": 4, "lid": 2}
+    ours = np.concatenate([mesh.corners_m for mesh in found.values()])
+    theirs = trimesh.load_mesh(tmp_path / "shed.obj", skip_materials=True, process=False)
+    np.testing.assert_allclose(sorted_rows(ours), sorted_rows(np.asarray(theirs.triangles)))
+    np.testing.assert_allclose(found["shed"].colors[:2], [[1, 0, 0]] * 2)
+    assert np.isnan(found["shed"].colors[2:]).all(), "a picture has the colours of the wood"
+
+
+def test_what_is_written_trimesh_opens_and_we_read_again(tmp_path: Path) -> None:
+    far = np.array([4_000.25, -9_000.5, 12.0])  # single precision alone would be worth a millimetre here
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=2).triangles) + far
+    colors = np.where(np.arange(len(ball))[:, None] < 10, [0.1, 0.2, 0.3], np.nan)
+    write_meshes(tmp_path / "m.glb", {"ball": Mesh(ball, colors)})
+    (mesh,) = read_meshes(tmp_path / "m.glb", tree=tmp_path).values()
+    np.testing.assert_allclose(sorted_rows(mesh.corners_m), sorted_rows(ball), atol=1e-5)
+    assert int((~np.isnan(mesh.colors)).all(axis=1).sum()) == 10
+    theirs = trimesh.load_scene(tmp_path / "m.glb").to_mesh()
+    np.testing.assert_allclose(
+        np.sort((theirs.bounds @ UP.T), axis=0), np.stack([ball.min((0, 1)), ball.max((0, 1))]), atol=1e-2
+    )
+    write_meshes(tmp_path / "n.glb", {"ball": Mesh(ball, colors)})
+    assert (tmp_path / "m.glb").read_bytes() == (tmp_path / "n.glb").read_bytes()
+
+
+def glb(document: dict, binary: bytes = b"") -> bytes:
+    text = json.dumps({"asset": {"version": "2.0"}, **document}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def one_triangle(places: list[float], **changes) -> bytes:
+    document = {
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36}],
+    }
+    return glb(document | changes, struct.pack("<9f", *places))
+
+
+FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+ONE_ACCESSOR = {"bufferView": 0, "componentType": 5126, "type": "VEC3"}
+HOSTILE = {
+    "no_numbers.glb": (one_triangle([float("nan"), *FLAT[1:]]), "not finite"),
+    "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or too far"),
+    "count.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]), "more numbers than bytes"),
+    "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
+    "sparse.glb": (one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}]), "sparse"),
+    "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
+    "draco.glb": (one_triangle(FLAT, extensionsRequired=["KHR_draco_mesh_compression"]), "plain glTF"),
+    "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "outside of its folder"),
+    "encoded.glb": (
+        one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "%2e%2e/secret.bin"}]),
+        "outside of its folder",
+    ),
+    "web.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "http://host/x.bin"}]), "outside of its folder"),
+    "index.glb": (one_triangle(FLAT, nodes=[{"mesh": 7}]), "no such member"),
+    "short.glb": (one_triangle(FLAT)[:-10], "cut short"),
+    "other.glb": (b"not a mesh at all, whatever its name says", "not a binary glTF"),
+    "deep.gltf": (b'{"asset": {}, "nodes": ' + b"[" * 90 + b"]" * 90 + b"}", "deep"),
+    "nan.obj": (b"v 0 0 nan\n", "finite"),
+    "corner.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 9\n", "no such vertex"),
+    "library.obj": (b"mtllib ../secret.mtl\n", "outside of its folder"),
+    "absolute.obj": (b"mtllib /etc/passwd\n", "outside of its folder"),
+    "nothing.obj": (b"# nothing\n", "no triangles"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(HOSTILE))
+def test_a_hostile_mesh_is_a_clear_error(tmp_path: Path, name: str) -> None:
+    data, words = HOSTILE[name]
+    (tmp_path / "secret.bin").write_bytes(struct.pack("<9f", *FLAT))
+    (tmp_path / "secret.mtl").write_text("newmtl x\n")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / name).write_bytes(data)
+    with pytest.raises(InputError, match=words) as caught:
+        read_meshes(tmp_path / "maps" / name, tree=tmp_path / "maps")
+    assert name in str(caught.value)
+
+
+def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None:
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "ball.glb").write_bytes(one_triangle(FLAT))
+    os.symlink(tmp_path / "ball.glb", tmp_path / "maps/link.glb")
+    for name, words in (("link.glb", "out of its folder"), ("none.glb", "cannot read")):
+        with pytest.raises(InputError, match=words):
+            read_meshes(tmp_path / "maps" / name, tree=tmp_path / "maps")
+    trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "maps/fine.glb")
+    try:
+        for limits, words in ((Limits(mesh_triangles=500), "mesh_triangles"), (Limits(mesh_mb=1), None)):
+            use_limits(limits)
+            if words is None:
+                (tmp_path / "maps/fine.glb").write_bytes(b"\0" * 1_100_000)
+            with pytest.raises(InputError, match=words or "mesh_mb"):
+                read_meshes(tmp_path / "maps/fine.glb", tree=tmp_path / "maps")
+    finally:
+        use_limits(Limits())
+
+
+@pytest.mark.parametrize("name", ["../m.glb", "/m.glb", "a/../../m.glb", "m.fbx", "", "m.glb\0"])
+def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path, name: str) -> None:
+    write_boxes(tmp_path / "boxes_3d.json", make_box_map([(0, 0, 1)], [(1, 1, 1)], [(0, 0, 0)], [KINDS["Static"]]))
+    value = json.loads((tmp_path / "boxes_3d.json").read_text())
+    value["boxes"][0]["mesh"] = {"file": name}
+    (tmp_path / "boxes_3d.json").write_text(json.dumps(value))
+    with pytest.raises(InputError, match=r"mesh\.file"):
+        read_boxes(tmp_path / "boxes_3d.json")
+
+
+# --- triangles of polygons --------------------------------------------------------------------------------------------
+
+
+def area_of(triangles: np.ndarray) -> float:
+    return float(
+        np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1).sum() / 2
+    )
+
+
+SQUARE = np.array([(0, 0, 0), (4, 0, 0), (4, 4, 0), (0, 4, 0)], dtype=float)
+HOLE = np.array([(1, 1, 0), (1, 2, 0), (2, 2, 0), (2, 1, 0)], dtype=float)
+ELL = np.array([(0, 0, 0), (4, 0, 0), (4, 1, 0), (1, 1, 0), (1, 3, 0), (0, 3, 0)], dtype=float)
+BOW = np.array([(0, 0, 0), (2, 2, 0), (2, 0, 0), (0, 2.5, 0)], dtype=float)
+
+
+@pytest.mark.parametrize(
+    ("rings", "count", "area"),
+    [
+        ([SQUARE], 2, 16.0),
+        ([SQUARE, HOLE], 8, 15.0),
+        ([ELL], 4, 6.0),
+        ([SQUARE[:3]], 1, 8.0),
+        ([SQUARE[[0, 1, 0]]], 0, 0.0),
+    ],
+)
+@given(angle=st.floats(0.0, 3.0), shift=st.floats(-500.0, 500.0))
+@settings(max_examples=10, deadline=None)
+def test_polygons_become_triangles_that_face_as_they_do(
+    rings, count: int, area: float, angle: float, shift: float
+) -> None:
+    turn = trimesh.transformations.rotation_matrix(angle, (1.0, 0.3, -0.7))[:3, :3]
+    triangles = triangles_of([ring @ turn.T + shift for ring in rings])
+    assert len(triangles) == count
+    if count:
+        assert area_of(triangles) == pytest.approx(area, rel=1e-9)
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        assert (normals @ turn[:, 2] > 0).all()
+
+
+def test_an_outline_that_crosses_itself_keeps_its_valid_parts() -> None:
+    triangles = triangles_of([BOW])
+    assert len(triangles) > 0
+    assert np.isfinite(triangles).all()
+
+
+# --- CityJSON ---------------------------------------------------------------------------------------------------------
+
+ROOF = [  # a house of 10 x 8 m, eaves at 4 m, ridge at 7 m
+    (0, 0, 1), (10, 0, 1), (10, 8, 1), (0, 8, 1), (0, 0, 4), (10, 0, 4), (10, 8, 4), (0, 8, 4), (0, 4, 7), (10, 4, 7),
+]  # fmt: skip
+FACES = [
+    [[0, 3, 2, 1]],
+    [[0, 1, 5, 4]],
+    [[2, 3, 7, 6]],
+    [[1, 2, 6, 9, 5]],
+    [[3, 0, 4, 8, 7]],
+    [[4, 5, 9, 8]],
+    [[6, 7, 8, 9]],
+]
+BLOCK = [[[0, 3, 2, 1]], [[0, 1, 5, 4]], [[2, 3, 7, 6]], [[1, 2, 6, 5]], [[3, 0, 4, 7]], [[4, 5, 6, 7]]]
+
+
+def city_file(path: Path) -> Path:
+    """One house in two levels of detail, a block and one with a roof, beside a road."""
+    road = [(-20, -10, 0), (40, -10, 0), (40, -4, 0), (-20, -4, 0)]
+    house = [{"type": "Solid", "lod": lod, "boundaries": [faces]} for lod, faces in (("1.2", BLOCK), ("2.2", FACES))]
+    path.write_text(json.dumps({
+        "type": "CityJSON", "version": "2.0", "transform": {"scale": [1, 1, 1], "translate": [85_000, 447_000, 0]},
+        "vertices": [list(v) for v in (*ROOF, *road)],
+        "CityObjects": {
+            "house": {"type": "Building", "geometry": house},
+            "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[10, 11, 12, 13]]]}]},
+        },
+    }))  # fmt: skip
+    return path
+
+
+def test_a_solid_is_drawn_as_its_finest_surfaces_and_kept_out_of_as_boxes(tmp_path: Path) -> None:
+    box_map = cityjson.load(CityJsonConfig(path=city_file(tmp_path / "city.json")))
+    houses = np.flatnonzero(box_map.kinds == KINDS["Buildings"])
+    assert set(box_map.meshes.refs) == set(box_map.ids[houses].tolist())
+    solids = solids_of(box_map)
+    as_mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(solids.corners_m))
+    as_mesh.merge_vertices()
+    assert as_mesh.is_watertight
+    assert as_mesh.volume == pytest.approx(10 * 8 * 4 + 0.5 * 8 * 3 * 10)  # its foot comes down to the road, at 0
+    assert box_map.maxs[houses, 2].max() == pytest.approx(7.0), (
+        "the ridge stands in no planner's way unless the box holds it"
+    )
+    assert (solids.rows == houses[0]).all()
+    write_boxes(tmp_path / "boxes_3d.json", box_map)
+    again = solids_of(read_boxes(tmp_path / "boxes_3d.json"))
+    np.testing.assert_allclose(sorted_rows(again.corners_m), sorted_rows(solids.corners_m), atol=1e-5)
+    plain = cityjson.load(CityJsonConfig(path=tmp_path / "city.json", solids=False))
+    assert not plain.meshes.refs
+    assert len(plain) == len(box_map)
+    assert not simplify(box_map, SimplifyConfig()).box_map.meshes.refs
+
+
+def test_a_spire_makes_only_the_boxes_below_it_higher() -> None:
+    low, spire = (trimesh.creation.box((s, 4.0, h)) for s, h in ((20.0, 5.0), (2.0, 30.0)))
+    spire.apply_translation((9.0, 0.0, 15.0))
+    rings = [[corners] for solid in (low, spire) for corners in solid.triangles]
+    mesh = solid_mesh(rings, -2.5)
+    assert mesh is not None
+    assert top_within(mesh, Rectangle((-5.0, 0.0), (10.0, 4.0), 0.0), 99.0) == 2.5
+    assert top_within(mesh, Rectangle((9.0, 0.0), (2.0, 4.0), 0.0), 99.0) == 30.0
+    assert top_within(mesh, Rectangle((500.0, 0.0), (2.0, 4.0), 0.0), 99.0) == 99.0
+
+
+# --- drawing ----------------------------------------------------------------------------------------------------------
+
+
+def scene_map(folder: Path) -> BoxMap:
+    """A ball in a turned box and another that tells colours, a house for two boxes, a road, a plain wall."""
+    trimesh.creation.icosphere(subdivisions=2).export(folder / "ball.obj")
+    red = trimesh.creation.cone(1.0, 2.0, sections=8)
+    red.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(baseColorFactor=(200, 10, 10, 255))
+    )
+    (folder / "models").mkdir(exist_ok=True)
+    red.export(folder / "models/cone.glb")
+    house = solid_mesh([[np.array([ROOF[i] for i in ring], dtype=float)] for (ring,) in FACES], 0.0)
+    assert house is not None
+    write_meshes(folder / "house.glb", {"house": house, "unused": house})
+    rows = [
+        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0, None),
+        ("Buildings", (5, 10, 3.5), (5, 4, 3.5), 0.0, None),
+        ("Buildings", (5, 15, 3.5), (5, 1, 3.5), 0.0, None),
+        ("Static", (-6, 6, 2.0), (3, 1, 2.0), 30.0, None),
+        ("Static", (14, 3, 1.0), (1, 1, 1.0), 0.0, None),
+        ("Walls", (-4, 14, 1), (6, 0.2, 1.0), 5.0, None),
+    ]
+    box_map = make_box_map(
+        [row[1] for row in rows], [row[2] for row in rows], [(0.0, row[3], 0.0) for row in rows],
+        [KINDS[row[0]] for row in rows], [7, 40, 41, 9, 300, 12],
+    )  # fmt: skip
+    world = MeshRef(file="house.glb", node="house", fit="world")
+    refs = {40: world, 41: world, 9: MeshRef(file="ball.obj"), 300: MeshRef(file="models/cone.glb")}
+    return replace(box_map, meshes=Meshes(refs, folder))
+
+
+def rays_of(pose: np.ndarray, intrinsic: np.ndarray) -> np.ndarray:
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+    return np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(intrinsic).T @ pose[:3, :3].T
+
+
+def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray, intrinsic: np.ndarray):
+    """Every pixel's ray against every triangle, by trimesh's geometry: z-depth and owner."""
+    rays = rays_of(pose, intrinsic)
+    depth, ids = np.full(len(rays), np.inf), np.full(len(rays), NO_INSTANCE)
+    normals, is_valid = trimesh.triangles.normals(triangles)
+    assert is_valid.all()
+    eyes = np.broadcast_to(pose[:3, 3], rays.shape)
+    for triangle, normal, owner in zip(triangles, normals, owners, strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = ((triangle[0] - pose[:3, 3]) @ normal) / (rays @ normal)
+        ahead = np.isfinite(z) & (z > NEAR_M) & (z < depth)
+        if not ahead.any():
+            continue
+        points = eyes[ahead] + rays[ahead] * z[ahead, None]
+        inside = (trimesh.triangles.points_to_barycentric(np.tile(triangle, (len(points), 1, 1)), points) >= 0).all(
+            axis=1
+        )
+        rows = np.flatnonzero(ahead)[inside]
+        depth[rows], ids[rows] = z[rows], owner
+    return depth.reshape(SIZE[::-1]), ids.reshape(SIZE[::-1])
+
+
+@pytest.mark.parametrize("name", sorted(RENDERERS))
+def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> None:
+    box_map = scene_map(tmp_path)
+    solids = solids_of(box_map)
+    boxes = [
+        trimesh.creation.box(2 * box_map.half_extents[row], trimesh.transformations.translation_matrix(box_map.centers[row])
+        @ trimesh.transformations.rotation_matrix(np.radians(box_map.rotations_deg[row, 1]), (0, 0, 1)))
+        for row in (0, 5)
+    ]  # fmt: skip
+    x, y, z = [*scene_origin(box_map)[:2], plane_z_m(box_map) - GROUND_PLANE_DROP_M]
+    plane = SQUARE / 2.0 * GROUND_PLANE_HALF_M - GROUND_PLANE_HALF_M * np.array([1, 1, 0]) + (x, y, z)
+    boxes.append(trimesh.Trimesh(plane, [(0, 1, 2), (0, 2, 3)]))
+    triangles = np.concatenate([solids.corners_m, *(np.asarray(box.triangles) for box in boxes)])
+    owners = np.concatenate([box_map.ids[solids.rows].astype(int), np.full(12, 7), np.full(12, 12), [NO_INSTANCE] * 2])
+    renderer = open_renderer(name, box_map, *SIZE, Look())
+    intrinsic, shown = intrinsic_matrix(*SIZE, 70.0), set[int]()
+    for eye, target in (((-18, -14, 12), (2, 8, 1)), ((22, -4, 3), (4, 10, 2)), ((4, 11, 30), (4, 12, 0))):
+        pitch, yaw = look_at(np.array(eye, float), np.array(target, float))
+        pose = world_from_camera(np.array(eye, float), np.degrees([pitch, yaw, 0.0]))
+        renderer.prepare(np.array([-20.0, -20.0, 0.0]), np.array([25.0, 25.0, 30.0]))
+        frame = renderer.render(pose, intrinsic, None)
+        again = renderer.render(pose, intrinsic, None)
+        assert all(
+            np.array_equal(getattr(frame, part), getattr(again, part)) for part in ("rgb", "depth", "kinds", "ids")
+        )
+        depth, ids = traced(triangles, owners, pose, intrinsic)
+        known = np.isfinite(depth)
+        same = known & (ids == frame.ids)
+        differ = known & ~same
+        border = np.zeros_like(known)
+        border[1:-1, 1:-1] = (
+            np.stack([ids[y : y + SIZE[1] - 2, x : x + SIZE[0] - 2] for y in range(3) for x in range(3)])
+            != ids[1:-1, 1:-1]
+        ).any(axis=0)
+        assert not (differ & ~border).any(), "a wrong id that is not on a silhouette"
+        error = np.abs(frame.depth - depth)[same & ~border & (depth < 60.0)]
+        assert len(error) > 3000
+        assert np.median(error) < 1e-4
+        assert error.max() < 1e-3
+        shown |= set(np.unique(frame.ids).tolist())
+        assert 41 not in frame.ids, "a thing of several boxes has the id of the first"
+        assert (frame.kinds[frame.ids == 40] == KINDS["Buildings"]).all()
+    assert {40, 9, 300, 7, 12} <= shown
+    renderer.close()
+
+
+def test_colours_of_a_file_are_seen_and_both_sides_of_a_sheet(tmp_path: Path) -> None:
+    (tmp_path / "green.mtl").write_text("newmtl g\nKd 0 1 0\n")
+    (tmp_path / "sheet.obj").write_text("mtllib green.mtl\nusemtl g\nv 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
+    sheet = make_box_map([(0, 0, 2)], [(2, 0.1, 2)], [(0, 0, 0)], [KINDS["Static"]], [5])
+    sheet = replace(sheet, meshes=Meshes({5: MeshRef(file="sheet.obj")}, tmp_path))
+    renderer = open_renderer("gl", sheet, *SIZE, Look())
+    for side in (-1.0, 1.0):
+        eye = np.array([0.5, 8.0 * side, 3.0])
+        pitch, yaw = look_at(eye, np.array([0.0, 0.0, 2.0]))
+        pose = world_from_camera(eye, np.degrees([pitch, yaw, 0.0]))
+        frame = renderer.render(pose, intrinsic_matrix(*SIZE, 60.0), None)
+        seen = frame.rgb[frame.ids == 5].astype(int)
+        assert len(seen) > 1000
+        assert (seen[:, 1] > seen[:, 0] + 20).all()
+        assert (seen[:, 1] > seen[:, 2] + 20).all()
+    renderer.close()
+
+
+def test_boxes_of_ones_own_bring_their_meshes_along(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    write_boxes(tmp_path / "mine/boxes_3d.json", scene_map(tmp_path / "mine"))
+    cfg = build(MapsConfig, {"source": "boxes", "boxes": {"path": str(tmp_path / "mine/boxes_3d.json")}}, "test")
+    product = make_map(cfg, tmp_path / "maps")
+    ours, theirs = (solids_of(read_boxes(path)) for path in (product, tmp_path / "mine/boxes_3d.json"))
+    np.testing.assert_allclose(ours.corners_m, theirs.corners_m, atol=1e-5)
+    assert np.array_equal(ours.rows, theirs.rows)
+    assert [path.name for path in read_boxes(product).meshes.files().values()] == [MESHES_FILE]
+    assert MESHES_FILE in (tmp_path / "maps/manifest.json").read_text()
+    (tmp_path / "mine/models/cone.glb").unlink()
+    with pytest.raises(InputError, match=r"cone\.glb: cannot read the mesh"):
+        solids_of(read_boxes(tmp_path / "mine/boxes_3d.json"))
+    wrong = replace(
+        scene_map(tmp_path / "mine"), meshes=Meshes({9: MeshRef(file="house.glb", node="roof")}, tmp_path / "mine")
+    )
+    with pytest.raises(InputError, match=r"box 9 names: the mesh has no such node; got roof"):
+        solids_of(wrong)
