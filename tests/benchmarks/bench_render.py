@@ -273,7 +273,7 @@ def memory(num_frames: int) -> list[list[Any]]:
             done += len(render_flight(renderer, script, Path(scratch), writing))
         if not rows or done - rows[-1][0] >= num_frames // 10:
             rows.append([done, resident_mib()])
-    return [[count, mib, mib / rows[1][1] - 1.0] for count, mib in rows]
+    return [[count, mib, 100.0 * (mib / rows[1][1] - 1.0)] for count, mib in rows]
 
 
 def main() -> None:
@@ -290,7 +290,7 @@ def main() -> None:
         scenes.print_table("A large map", names, tiles(given.frames or 40))
         return
     if given.what == "memory":
-        scenes.print_table("Memory", ["frames", "MiB", "against the second row"], memory(given.frames or 5000))
+        scenes.print_table("Memory", ["frames", "MiB", "% over the second row"], memory(given.frames or 5000))
         return
     with tempfile.TemporaryDirectory() as root:
         folders = make_inputs(Path(root), max(given.workers))

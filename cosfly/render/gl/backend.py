@@ -37,6 +37,9 @@ LARGEST_SHADOW_AREA_M = 420.0
 MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
+# Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full while the last is still being
+# drawn, and keeps every list for good: without this a process grows by a seventh over thousands of frames, on a loaded machine.
+MOST_WAITING = 30_000
 PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
 ORIGIN_STEP_M = 2.0 * PATTERN_M  # a flight farther off than half of this has an origin of its own
 
@@ -88,6 +91,7 @@ class GlRenderer:
         self.context = open_context()
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
+        self._is_software = "llvmpipe" in self.device
         self.scene, self.look, self.num_others = build_scene(box_map, num_others), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
@@ -150,6 +154,8 @@ class GlRenderer:
             (self.context.buffer(mesh.vertices.tobytes()), self.context.buffer(mesh.triangles.tobytes()))
             for mesh in meshes.all_meshes()
         ]
+        self._num_triangles = [len(mesh.triangles) for mesh in meshes.all_meshes()]
+        self._num_waiting = 0
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
         self._solids = LooseTriangles(self.context, self.scene.solids)
         self._loose = LooseTriangles(self.context, self.scene.draped), self._solids
@@ -397,6 +403,10 @@ class GlRenderer:
         instances.orphan(2 * records.nbytes if instances.size < records.nbytes else -1)  # -1: as it was
         instances.write(records.tobytes())
         array.render(instances=len(records))
+        self._num_waiting += len(records) * self._num_triangles[mesh]
+        if self._is_software and self._num_waiting > MOST_WAITING:
+            self.context.finish()
+            self._num_waiting = 0
 
     def _read(self) -> Frame:
         shape = (self.height_px, self.width_px)
