@@ -57,7 +57,7 @@ def decode(
     Args:
         max_tokens: longest answer, the end token included.
         features: (image tokens of all rows, width), where the vision tower has seen the pictures before; else it looks now.
-        is_recorded: on an accelerator, play steps from a recording; the same kernels on the same numbers, so the same tokens.
+        is_recorded: on an accelerator, play steps from a recording: the same tokens in float32; in bfloat16 a recorded product may round otherwise.
     Returns:
         One for each row, in their order.
     """
