@@ -24,7 +24,8 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly.errors import InputError
+from cosfly import estimate
+from cosfly.errors import CosflyError, InputError
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.planners.ahead import compiled_ahead
@@ -99,11 +100,10 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     and `summary.json` in the run folder, in that of each town where there are several.
     """
     use_limits(cfg.reading)
-    towns = {name: cfg.of_town(name) for name in cfg.towns}
-    maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
-    choose_licence(cfg.release.licence, maps)  # the last stage would ask for it
+    towns = check(cfg)
+    left = _TimeLeft(cfg, out)
     if not towns:
-        return _run_town(cfg, out, stages(cfg, out, resume=resume))
+        return _run_town(cfg, out, stages(cfg, out, resume=resume), left)
     for name in (*towns, "release"):
         refuse_link(out / name)
     with _run_folder(cfg, out):
@@ -111,10 +111,10 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
             own = stages(town, out / name, resume=resume)[:-1]  # the release is made of all
-            made = _run_town(town, out / name, own)
+            made = _run_town(town, out / name, own, left)
             results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
         joint = _release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
-        results.append(_do(joint, out, "all towns"))
+        results.append(_do(joint, out, "all towns", left))
         _save_summary(results, out)
     return results
 
@@ -131,7 +131,36 @@ def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
             _save_run(cfg, out)
 
 
-def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
+def check(cfg: RunConfig) -> dict[str, RunConfig]:
+    """Check what the last stage would ask for, before the first; gives the settings of each town, none of a run without towns.
+
+    Raises:
+        ConfigError: nobody says under which licence the release goes out.
+    """
+    towns = {name: cfg.of_town(name) for name in cfg.towns}
+    maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
+    choose_licence(cfg.release.licence, maps)
+    return towns
+
+
+class _TimeLeft:
+    """How long a run will still take, in words, by the figures of runs before it."""
+
+    def __init__(self, cfg: RunConfig, out: Path) -> None:
+        self._cfg, self._out, self._rates = cfg, out, estimate.rates_near(out)
+
+    def told(self, place: str, folder: Path) -> str:
+        """Say of a stage what it will take, and all that is not done: `[5/8] render: about 1 min; about 3 min with all that follows`."""
+        try:
+            rows = estimate.estimate(self._cfg, self._out, self._rates)
+        except CosflyError as error:  # the stage itself will say so, and what to do
+            log.debug("no estimate: %s", error)
+            return f"[{place}] {folder.name}"
+        own = [row for row in rows if row.name == folder.relative_to(self._out).as_posix()]
+        return f"[{place}] {folder.name}: about {estimate.time_left(own)}; with all that follows about {estimate.time_left(rows)}"
+
+
+def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> list[StageResult]:
     """Do the stages of one town."""
     for stage in todo:
         refuse_link(out / stage.name)
@@ -142,7 +171,7 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]
             for number, stage in enumerate(todo, 1):
                 if stage.name == "plan" and to_plan:
                     wait_for_compiled()
-                results.append(_do(stage, out, f"{number}/{len(todo)}"))
+                results.append(_do(stage, out, f"{number}/{len(todo)}", left))
         tree = out / "render"
         if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
             contact_sheet(tree, out / "contact_sheet.png")
@@ -151,11 +180,11 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]
     return results
 
 
-def _do(stage: Stage, out: Path, place: str) -> StageResult:
+def _do(stage: Stage, out: Path, place: str, left: _TimeLeft) -> StageResult:
     """Do a stage that is not complete; one that is refuses other settings."""
     was_complete = (out / stage.name / "manifest.json").exists()
     if not was_complete:
-        log.info("[%s] %s", place, stage.name)
+        log.info("%s", left.told(place, out / stage.name))
     stage.work()
     if was_complete:
         log.info("[%s] %s: already complete", place, stage.name)

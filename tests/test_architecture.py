@@ -25,7 +25,19 @@ SHARED = (
     "coverage_page",
 )  # what several stages use; knows products
 # What may know all stages and siblings.
-ASSEMBLY = ("cli", "pipeline", "settings", "runs", "library", "doctor", "gallery", "bench", "depth_study", "__main__")
+ASSEMBLY = (
+    "cli",
+    "pipeline",
+    "settings",
+    "runs",
+    "estimate",
+    "library",
+    "doctor",
+    "gallery",
+    "bench",
+    "depth_study",
+    "__main__",
+)
 HEAVY = {
     "torch",
     "transformers",

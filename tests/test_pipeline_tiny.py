@@ -19,6 +19,7 @@ from cosfly.bench import measure
 from cosfly.cli import app
 from cosfly.config import load
 from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
+from cosfly.estimate import estimate, rates_near, time_left
 from cosfly.folder_lock import hold_folder
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
@@ -150,6 +151,47 @@ def test_a_run_goes_on_by_its_folder_or_its_own_settings(base, tmp_path, monkeyp
     assert CliRunner().invoke(app, ["run", str(run / config)]).exit_code == 0
     assert CliRunner().invoke(app, ["run", str(run / config), "--out", str(tmp_path / "new")]).exit_code == 0
     assert asked == [(2, run), (2, tmp_path / "new")]
+
+
+def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_path):
+    beside = base.parent / "other"
+    rates = rates_near(beside)
+    rows = {row.name: row for row in estimate(tiny(**{"pedestrians.num_paths": 6}), beside, rates)}
+    frames = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
+    assert rows["render"].count == pytest.approx(3 * frames, abs=6)  # as many frames a walk; rounded once a flight
+    assert rows["caption"].count == pytest.approx(
+        3 * read_json(base / "caption/manifest.json")["counts"]["input"], abs=12
+    )
+    size = sum(path.stat().st_size for path in (base / "render").rglob("*") if path.is_file())
+    assert rows["render"].bytes == pytest.approx(3 * size, rel=0.1)
+    assert str(base) in rows["render"].basis
+    larger = tiny(**{"render.width_px": 320, "render.height_px": 180})
+    assert {r.name: r for r in estimate(larger, beside, rates)}["render"].seconds == pytest.approx(
+        4 / 3 * rows["render"].seconds, rel=0.05
+    )
+    shown = CliRunner().invoke(app, ["run", str(base), "--out", str(beside), "--dry-run"])
+    assert shown.exit_code == 0, shown.output
+    assert "in all about" in shown.output
+    assert not beside.exists()
+
+
+def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base, tmp_path):
+    assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), base, rates_near(base)))
+    half = begin(base, tmp_path / "run", "inspect")
+    rows = estimate(tiny(), half, rates_near(half))
+    assert [row.name for row in rows if not row.is_done] == ["inspect", "caption", "release"]
+    exact = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
+    assert rows[-1].count == exact
+    assert "quickstart" in rows[-1].basis  # nothing beside it is finished
+
+
+def test_what_a_teacher_will_take_is_not_made_up(base, tmp_path):
+    rows = {
+        r.name: r for r in estimate(tiny(**{"caption.teacher": "http://localhost:1"}), tmp_path / "x", rates_near(base))
+    }
+    assert rows["caption"].tokens is None
+    assert rows["caption"].seconds is None
+    assert "whose time depends on its teacher" in time_left(list(rows.values()))
 
 
 def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):

@@ -12,6 +12,7 @@ from cosfly.cli import options
 
 if TYPE_CHECKING:
     from cosfly.pipeline import StageResult
+    from cosfly.settings import RunConfig
 
 app = typer.Typer()
 
@@ -33,6 +34,9 @@ def run(
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
     repair: options.Repair = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what it would take (time, disk, tokens by stage) and write nothing.")
+    ] = False,
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again, or with the run's folder, to continue."""
     from cosfly import pipeline
@@ -43,6 +47,9 @@ def run(
         out = config.parent  # the settings of that run: it goes on
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
+    if dry_run:
+        pipeline.check(cfg)
+        return _tell_estimate(cfg, out)
     options.set_aside(out, repair)
     options.verify_first(
         verify, *sorted(path.parent for depth in ("*", "*/*") for path in out.glob(f"{depth}/manifest.json"))
@@ -50,6 +57,44 @@ def run(
     results = pipeline.run(cfg, out, resume=resume)
     _closing_table(results, out)
     options.check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
+
+
+def _tell_estimate(cfg: RunConfig, out: Path) -> None:
+    from rich.table import Table
+
+    from caption.run.progress import duration
+    from cosfly import estimate
+    from cosfly.console import answer_console
+
+    rows = estimate.estimate(cfg, out, estimate.rates_near(out))
+    table = Table(title=f"What {out} would take; nothing is written", title_justify="left")
+    for column in ("stage", "to do", "time", "disk", "tokens in, out"):
+        table.add_column(column, justify="left" if column == "stage" else "right", overflow="fold")
+    for row in rows:
+        unit = estimate.UNITS[row.name.rpartition("/")[2]]
+        time = "done" if row.is_done else "unknown" if row.seconds is None else duration(row.seconds)
+        tokens = (
+            "unknown"
+            if row.tokens is None
+            else f"{row.tokens[0]:,.0f}, {row.tokens[1]:,.0f}"
+            if any(row.tokens)
+            else "0"
+        )
+        table.add_row(row.name, f"{row.count:,} {unit}", time, _size(row.bytes), tokens)
+    answer_console.print(table)
+    for basis in dict.fromkeys(row.basis for row in rows):
+        by = dict.fromkeys(row.name.rpartition("/")[2] for row in rows if row.basis == basis)
+        answer_console.print(f"figures of {', '.join(by)}: {basis}", soft_wrap=True)
+    needed, free = sum(row.bytes for row in rows), estimate.free_bytes(out)
+    answer_console.print(
+        f"in all about {estimate.time_left(rows)}; {_size(needed)} of disk, {_size(free)} are free", soft_wrap=True
+    )
+    if any(row.tokens is None for row in rows):
+        answer_console.print(f"tokens are {estimate.UNKNOWN_TOKENS}", soft_wrap=True)
+    if needed > free:
+        answer_console.print(
+            "there is not enough space for it: choose another --out, or fewer walks or pixels", soft_wrap=True
+        )
 
 
 def _closing_table(results: list[StageResult], out: Path) -> None:
@@ -146,7 +191,7 @@ def list_runs(root: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where 
         answer_console.print(f"not readable: {error}", soft_wrap=True)
 
 
-def _size(size_bytes: int) -> str:
+def _size(size_bytes: float) -> str:
     return f"{size_bytes / 1e9:.2f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.1f} MB"
 
 

@@ -1,0 +1,224 @@
+"""What a run will take, before and while it runs: time, disk and tokens by stage, from its settings and the figures of runs that are finished.
+
+A figure is never better than its basis, which is told with it: runs that stand beside the run, or else the quickstart on the machine of docs/first-runs.md.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from caption.run.progress import duration
+from cosfly.errors import CosflyError
+from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.products.captions import read_captions
+from cosfly.products.traces import read_traces
+from cosfly.products.walks import read_paths
+from cosfly.runs import STAGES, StageLook, find, look
+from cosfly.settings import RunConfig, manner_of_work
+from cosfly.stage_folder import Failed, StageFolder
+
+UNITS = {
+    "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames", "caption": "windows", "release": "frames",
+}  # fmt: skip
+BY_PIXELS = ("render", "inspect", "release")  # what costs as much as its pictures have pixels
+MOST_RUNS = 3  # looked at, the newest
+UNKNOWN_TOKENS = "not known before asking: cosfly caption --plan"
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What one unit of a stage costs; of BY_PIXELS one of a million pixels. seconds: of the whole stage on its workers."""
+
+    seconds: float
+    bytes: float
+    basis: str
+
+
+@dataclass
+class Rates:
+    """Costs by stage, and how long a walk is. tokens: prompt and completion of a window, by kind of teacher."""
+
+    stages: dict[str, Rate]
+    frames_a_metre: float  # of the way between a walk's ends, as the crow flies, at 1 m/s and one frame a second
+    tokens: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def _rate(seconds: float, size_mb: float, units: float) -> Rate:
+    return Rate(seconds / units, size_mb * 1e6 / units, "the quickstart on a 2-core machine (docs/first-runs.md)")
+
+
+# Of `cosfly run quickstart`: seconds of docs/first-runs.md (2 cores, Xeon 2.5 GHz, idle), sizes of `du` today: 3 walks, 858 frames of 0.9216 Mpx,
+# 804 windows. Ends of a walk are 50 to 100 m apart; at 1.2 m/s and two frames a second 143 frames are 1.14 times the straight way.
+SHIPPED = Rates(
+    {
+        "maps": _rate(0.3, 1.1, 1), "simplify": _rate(5.9, 1.2, 1), "pedestrians": _rate(4.2, 0.3, 3), "plan": _rate(1.6, 0.4, 3),
+        "render": _rate(82, 4383, 858 * 0.9216), "inspect": _rate(18, 0.7, 858 * 0.9216), "caption": _rate(3.6, 7.4, 804),
+        "release": _rate(19, 1842, 858 * 0.9216),
+    },
+    1.14,
+    {"rules": (0.0, 0.0)},
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StageEstimate:
+    """One stage of a run. tokens: in and out, None where nobody knows; is_done: it costs nothing any more."""
+
+    name: str
+    count: int
+    seconds: float | None
+    bytes: float
+    tokens: tuple[float, float] | None
+    is_done: bool
+    basis: str
+
+
+# --- figures of finished runs -----------------------------------------------------------------------------------------
+
+
+def rates_near(out: Path) -> Rates:
+    """Gather the figures of the run itself and of the newest runs beside it; what they lack comes from SHIPPED."""
+    rates = replace(SHIPPED, stages=dict(SHIPPED.stages), tokens=dict(SHIPPED.tokens))
+    try:
+        found = list(find(out.parent, depth=1)) if out.parent.is_dir() else []
+    except (CosflyError, OSError):
+        found = []
+    found = sorted(found, key=lambda run: (run / "run.yaml").stat().st_mtime)[-MOST_RUNS:]
+    for run in found:  # the newest last: it counts
+        _learn(rates, run)
+    return rates
+
+
+def _learn(rates: Rates, run: Path) -> None:
+    try:
+        seen = look(run)
+    except CosflyError:  # of another version
+        return
+    if seen.cfg.towns:
+        return
+    num_walks, frames = _walks_of(run), _frames_of(seen.cfg, run)
+    if not num_walks or not frames:
+        return
+    counts = {"map": 1, "walks": num_walks, "frames": sum(frames), "windows": num_windows(seen.cfg, frames)}
+    workers = manner_of_work(seen.cfg)["workers"]
+    for stage in seen.stages:
+        if stage.state != "complete" or stage.seconds is None or not counts[UNITS[stage.name]]:
+            continue
+        units = counts[UNITS[stage.name]] * (_mpx(seen.cfg) if stage.name in BY_PIXELS else 1)
+        seconds = max(stage.seconds, _seconds_of_items(run / stage.name, stage, workers))
+        rates.stages[stage.name] = Rate(seconds / units, stage.size_bytes / units, f"{run}, {workers} workers")
+        if stage.name == "caption" and seen.cfg.caption.teacher_kind != "rules":
+            rates.tokens[seen.cfg.caption.teacher_kind] = _tokens_of(run / "caption/captions.jsonl")
+    rates.frames_a_metre = sum(frames) / (len(seen.cfg.render.tracks) * num_walks * _steps(seen.cfg.pedestrians))
+
+
+def _seconds_of_items(folder: Path, stage: StageLook, workers: int) -> float:
+    """The manifest of a run that went on later tells the last part of its time; the items tell all of it."""
+    records = StageFolder(folder, stage.name, False).items()
+    return sum(record.seconds for record in records if not isinstance(record, Failed)) / max(1, workers)
+
+
+def _tokens_of(captions: Path) -> tuple[float, float]:
+    usages = [caption.usage for caption in read_captions(captions)]
+    count = max(1, len(usages))
+    return sum(u.prompt_tokens for u in usages) / count, sum(u.completion_tokens for u in usages) / count
+
+
+# --- how much there is to do ------------------------------------------------------------------------------------------
+
+
+def _mpx(cfg: RunConfig) -> float:
+    return cfg.render.width_px * cfg.render.height_px / 1e6
+
+
+def _steps(cfg: PedestriansConfig) -> float:
+    """Steps of time over the mean straight way between a walk's ends."""
+    return (cfg.min_distance_m + cfg.max_distance_m) / 2 / cfg.cruise_speed_mps / cfg.dt_s
+
+
+def _is_complete(folder: Path) -> bool:
+    return (folder / "manifest.json").exists()
+
+
+def _walks_of(run: Path) -> int:
+    return len(read_paths(run / "pedestrians/path.json")) if _is_complete(run / "pedestrians") else 0
+
+
+def _frames_of(cfg: RunConfig, run: Path) -> list[int]:
+    """Frames of each flight that will be drawn, where the plan is finished; else none."""
+    if not _is_complete(run / "plan"):
+        return []
+    traces = read_traces(run / "plan/drone_trace.json")
+    return [len(trace.time_s) for trace in traces if trace.drop_reason is None] * len(cfg.render.tracks)
+
+
+def num_windows(cfg: RunConfig, frames: list[int]) -> int:
+    """Windows of flights of so many frames (`caption.window`)."""
+    window = cfg.caption.window
+    whole = (count - window.num_frames + 1 - window.future_frames for count in frames)
+    return sum(math.ceil(max(0, count) / window.stride) for count in whole)
+
+
+def _amounts(cfg: RunConfig, out: Path, rates: Rates) -> dict[str, int]:
+    walks = cfg.pedestrians.num_paths
+    frames = _frames_of(cfg, out) if _walks_of(out) == walks else []
+    if not frames:
+        each = round(rates.frames_a_metre * _steps(cfg.pedestrians))
+        frames = [each] * (walks * len(cfg.render.tracks))
+    return {"map": 1, "walks": walks, "frames": sum(frames), "windows": num_windows(cfg, frames)}
+
+
+def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
+    """Estimate each stage of a run, of several towns each town's under its name; a stage that is finished costs nothing more.
+
+    Raises:
+        CosflyError: what stands in `out` cannot be read.
+    """
+    if not cfg.towns:
+        return list(_stages(cfg, out, rates, STAGES))
+    rows: list[StageEstimate] = []
+    frames = 0
+    for name in cfg.towns:
+        town = cfg.of_town(name)
+        rows += [replace(row, name=f"{name}/{row.name}") for row in _stages(town, out / name, rates, STAGES[:-1])]
+        frames += rows[-3].count  # of render
+    return [*rows, _stage("release", frames, cfg, out, rates)]
+
+
+def _stages(cfg: RunConfig, out: Path, rates: Rates, names: tuple[str, ...]) -> Iterator[StageEstimate]:
+    amounts = _amounts(cfg, out, rates)
+    return (_stage(name, amounts[UNITS[name]], cfg, out, rates) for name in names)
+
+
+def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates) -> StageEstimate:
+    rate, is_done, tokens = rates.stages[name], _is_complete(out / name), (0.0, 0.0)
+    units = count * (_mpx(cfg) if name in BY_PIXELS else 1)
+    seconds: float | None = rate.seconds * units
+    known: tuple[float, float] | None = tokens
+    if name == "caption":
+        per_window = rates.tokens.get(cfg.caption.teacher_kind)
+        known = None if per_window is None else (per_window[0] * count, per_window[1] * count)
+        seconds = None if per_window is None else seconds
+    if is_done:
+        return StageEstimate(name, count, 0.0, 0.0, tokens, True, rate.basis)
+    return StageEstimate(name, count, seconds, rate.bytes * units, known, False, rate.basis)
+
+
+# --- in words ---------------------------------------------------------------------------------------------------------
+
+
+def time_left(rows: list[StageEstimate]) -> str:
+    """Give the time of all that is not done, in words; what nobody knows is named."""
+    unknown = [row.name for row in rows if row.seconds is None]
+    text = duration(sum(row.seconds or 0.0 for row in rows))
+    return f"{text}, and {', '.join(unknown)}, whose time depends on its teacher" if unknown else text
+
+
+def free_bytes(out: Path) -> int:
+    """Free space where a run will stand."""
+    place = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    return shutil.disk_usage(place).free
