@@ -200,7 +200,8 @@ def make_specimens(root: Path) -> Path:
         root / "inspect.json", flights.model_copy(update={"flights": accepted, "funnel": funnel})
     )
     package.run(RELEASE, [Source("one", tree, captions, root / "inspect.json")], root / "release")
-    export.run(build(ExportConfig, {"format": "webdataset"}, "x"), root / "release", root / "export")
+    for name in EXPORTED:
+        export.run(build(ExportConfig, {"format": name}, "x"), root / "release", root / f"export/{name}")
     shutil.copy(_first_shard(root), root / "shard.parquet")
     _students(root, captions, tree)
     _records(root)
@@ -534,6 +535,24 @@ def _evaluated(root: Path, scratch: Path) -> None:
     evaluate.run(evaluate.EvaluateConfig(), root / "predictions.jsonl", root / "train", scratch / "scores")
 
 
+# Formats, and of the files of each those that a verification reads itself.
+EXPORTED = {
+    "webdataset": ("export.json", "train-00000.tar"),
+    "lerobot": (
+        "meta/info.json",
+        "meta/tasks.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "data/chunk-000/file-000.parquet",
+    ),
+    "lerobot-v2.1": (
+        "meta/info.json",
+        "meta/tasks.jsonl",
+        "meta/episodes.jsonl",
+        "data/chunk-000/episode_000000.parquet",
+    ),
+}
+
+
 def _first_shard(root: Path) -> Path:
     return min((root / "release/dataset/data").iterdir())
 
@@ -681,7 +700,11 @@ READERS: dict[str, Reader] = {
     "release, captions": Reader(("shard.parquet",), lambda root, scratch: export_captions(_changed_release(root, scratch), scratch / "c.csv", "csv"), share=0.2, hashes=True),
     "release, get": Reader(("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"), lambda root, scratch: _fetched(root / "release/dataset", scratch), share=0.2, hashes=True),
     "release, get a part": Reader(("shard.parquet",), lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]), share=0.1, hashes=True),
-    "export record": _one("export/webdataset/export.json", read_export),
+    "export record": _one("export/webdataset/webdataset/export.json", read_export),
+    **{
+        f"release, verify {name}": Reader(tuple(f"export/{name}/{name}/{file}" for file in files), lambda root, _, name=name: verify(root / f"export/{name}/{name}"), share=0.2, hashes=True)
+        for name, files in EXPORTED.items()
+    },
     "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
     "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from caption.truth.released import read_released
 from cosfly.reading.files import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers
@@ -27,6 +28,7 @@ from release.record import (
     read_record,
     shard_path,
 )
+from release.verify.verify import verify
 
 Row = dict[str, Any]
 
@@ -81,6 +83,12 @@ def forge(
     change_record(values)
     finish(out, ReleaseRecord.model_validate_json(json.dumps(values)))
     return out
+
+
+def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]:
+    """Verify a folder as the command does; gives the errors by code."""
+    report = verify(folder, level=level, reader=read_released, **how)
+    return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
 
 
 def finish(out: Path, record: ReleaseRecord) -> None:

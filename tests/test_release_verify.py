@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from release_lies import LIES
-from release_tampering import forge, read_all, set_depth
+from release_tampering import errors_in, forge, read_all, set_depth
 from specimens_foreign import write_foreign_tree
 from typer.testing import CliRunner
 
@@ -59,11 +59,6 @@ def dataset(honest, tmp_path) -> Path:
     return shutil.copytree(honest, tmp_path / "dataset")
 
 
-def errors(folder: Path, level: str = "pixels") -> dict[str, int]:
-    report = verify(folder, level=level, reader=read_released)
-    return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
-
-
 # --- honest -----------------------------------------------------------------------------------------------------------
 
 
@@ -76,7 +71,7 @@ def test_an_honest_release_passes(honest, level):
 
 def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
     """Else every lie below would be found for the kit's own faults."""
-    assert errors(forge(honest, tmp_path / "again")) == {}
+    assert errors_in(forge(honest, tmp_path / "again")) == {}
 
 
 def test_processes_find_what_one_finds(honest, tmp_path):
@@ -95,12 +90,12 @@ def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
         link = snapshot / path.relative_to(honest)
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
-    assert errors(snapshot) == {}
+    assert errors_in(snapshot) == {}
 
 
 def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
-    assert errors(honest_run / "render") == {}
-    assert errors(write_foreign_tree(tmp_path / "public")) == {}
+    assert errors_in(honest_run / "render") == {}
+    assert errors_in(write_foreign_tree(tmp_path / "public")) == {}
 
 
 # --- lies -------------------------------------------------------------------------------------------------------------
@@ -110,7 +105,7 @@ def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
 def test_a_lie_is_found(honest, tmp_path, name):
     lie, is_of_pixels = LIES[name]
     forged = forge(honest, tmp_path / "forged", lie)
-    assert errors(forged, "pixels" if is_of_pixels else "rows"), name
+    assert errors_in(forged, "pixels" if is_of_pixels else "rows"), name
 
 
 RECORD_LIES = {
@@ -166,13 +161,13 @@ def test_rejected_flights_without_a_rejected_trajectory_are_told(honest, tmp_pat
 @pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
-    assert errors(forged, "rows"), name
+    assert errors_in(forged, "rows"), name
 
 
 def test_towns_in_two_splits_are_a_leak_where_splits_are_by_town(honest, tmp_path):
     splits = {flight["split"] for flight in read_json(honest / "release.json")["flights"]}
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES["splits by town"])
-    assert ("leak" in errors(forged, "rows")) == (len(splits) > 1)
+    assert ("leak" in errors_in(forged, "rows")) == (len(splits) > 1)
 
 
 # --- hostile files ----------------------------------------------------------------------------------------------------
@@ -272,7 +267,7 @@ HOSTILE = (
 def test_hostile_files_are_findings_and_no_traceback(dataset, damage):
     damage(dataset)
     for level in ("structure", "pixels"):
-        assert errors(dataset, level)
+        assert errors_in(dataset, level)
 
 
 def _claims(column: str, data: bytes):
@@ -345,7 +340,7 @@ def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
         forged = forge(honest, tmp_path / "forged", ODD_ROWS[name])
     except (InputError, TypeError, KeyError):  # no card comes of it: then the old one stands there, which is found too
         forged = _rows_alone(honest, tmp_path / "forged", ODD_ROWS[name])
-    assert errors(forged)
+    assert errors_in(forged)
 
 
 def _rows_alone(honest: Path, out: Path, change) -> Path:
@@ -398,4 +393,4 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
 def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
     tree = shutil.copytree(honest_run / "render", tmp_path / "tree")
     (find_flights(tree)[0] / "frames_playback/frame_00003/rgb.png").unlink()
-    assert {"missing", "picture"} <= set(errors(tree))
+    assert {"missing", "picture"} <= set(errors_in(tree))

@@ -79,6 +79,10 @@ def release_verify(
             help="structure: names, sizes, records, card. rows: every row too. pixels: checksums and every picture too."
         ),
     ] = "pixels",
+    source: Annotated[
+        Path | None,
+        typer.Option(help="Of an export: the release it was made of; it is made again and every file compared."),
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the findings for machines here.")] = None,
     repair_plan: Annotated[
         bool, typer.Option("--repair-plan", help="Say what could be mended, and how; changes nothing.")
@@ -97,7 +101,7 @@ def release_verify(
     if level not in LEVELS:
         raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
     cfg = options.resolve(config, overrides, {"workers": workers})
-    report = verify(folder, level=level, reader=read_released, **manner_of_work(cfg))
+    report = verify(folder, level=level, reader=read_released, source=source, **manner_of_work(cfg))
     typer.echo(str(report))
     for line in plan_of(report) if repair_plan else []:
         typer.echo(f"repair plan: {line}")

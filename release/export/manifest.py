@@ -13,9 +13,9 @@ from cosfly.reading.documents import read_model
 from cosfly.store import dump_json, sha256_bytes, write_bytes
 from release.export.contract import ExportConfig, Facts
 from release.export.source import Release
-from release.record import ReleasedMap, Strict
+from release.record import DepthCoding, ReleasedMap, Strict
 
-EXPORT_SCHEMA, EXPORT_VERSION = "cosfly.export", "1.0"
+EXPORT_SCHEMA, EXPORT_VERSION = "cosfly.export", "1.1"
 
 
 class CameFrom(Strict):
@@ -28,7 +28,7 @@ class CameFrom(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`."""
+    """`export.json`. depth: how the release codes it; null where it has none."""
 
     format: str
     format_version: str
@@ -40,6 +40,7 @@ class ExportRecord(Strict):
     coordinates: dict[str, Any]
     settings: dict[str, Any]
     codings: dict[str, str]
+    depth: DepthCoding | None
     notes: list[str]
     how_to_open: str
     frames: int
@@ -62,6 +63,7 @@ def describe(release: Release, facts: Facts, cfg: ExportConfig, *, frames: int, 
         coordinates=facts.coordinates or record.coordinates,
         settings=cfg.recorded(),
         codings=facts.codings,
+        depth=record.depth,
         notes=facts.notes,
         how_to_open=facts.how_to_open,
         frames=frames,

@@ -42,7 +42,7 @@ FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 @dataclass
 class Summary:
     """What is kept of a flight to compare it with others. rows_file: of its rows. frames_digest: of the indices of its frames, the first three
-    of which are first_frames; way_digest: of its poses, "" where these do not move."""
+    of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none."""
 
     name: str
     rows_file: str
@@ -82,7 +82,7 @@ def summary_of(flight: FlightRows, keys: list[tuple[int, int]], rows: RowFiles, 
     rows.write(rows_file, found)
     way = np.round(pose, 4) + 0.0
     return Summary(
-        name=flight.name, rows_file=rows_file, split=first.get("split"), walk=first.get("walk"), pair=first.get("pair"),
+        name=flight.name, rows_file=rows_file, split=first.get("split"), walk=str(first["walk"]) if "walk" in first else None, pair=first.get("pair"),
         track=first.get("track"), town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight),
         first_frames=flight.index[:3].tolist(), frames_digest=frames_digest(flight.index),
         way_digest=hashlib.sha256(way.tobytes()).hexdigest() if (way != way[0]).any() else "",
@@ -168,7 +168,8 @@ def _check_splits(flights: list[Summary], rows: RowFiles, by_town: bool, finding
     for flight in flights:
         if flight.split is None:
             continue
-        groups["walk", str(flight.walk)].add(flight.split)
+        if flight.walk is not None:
+            groups["walk", flight.walk].add(flight.split)
         groups["trajectory", flight.name.rpartition("/")[0]].add(flight.split)
         if by_town:
             groups["town", town_family(flight.town)].add(flight.split)
@@ -180,7 +181,7 @@ def _check_splits(flights: list[Summary], rows: RowFiles, by_town: bool, finding
         if one.split != other.split:
             got = f"{one.split} and {other.split}: the person at the same place in {share:.0%} of the seconds"
             findings.error("leak", f"{one.name} and {other.name}", got, "one walk in one split")
-        elif one.walk != other.walk:
+        elif one.walk != other.walk and None not in (one.walk, other.walk):
             findings.error(
                 "walk", f"{one.name} and {other.name}", f"{one.walk} and {other.walk}", "one name for one walk"
             )

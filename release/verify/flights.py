@@ -10,7 +10,7 @@ from cosfly.errors import InputError
 from cosfly.items import Item, Outcome
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
-from release.record import DepthCoding
+from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
@@ -34,13 +34,14 @@ LOSSLESS = DepthCoding(
 @dataclass(frozen=True)
 class Told:
     """What the record says that the checks of flights need. settings: of stages, by run and stage. by_town: splits share no town
-    either. both: every flight's twin is released too."""
+    either. both: every flight's twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as."""
 
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
     settings: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     by_town: bool = False
     both: bool = False
+    rounded_as: DepthCodingName = "float32"
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
         run = flight.name.split("/")[0]
@@ -101,7 +102,7 @@ def check_flight(
     keys: list[tuple[int, int]] = []
     if level == "pixels":
         try:
-            keys = check_pictures(flight, source.pictures(job.entry), told.depth, findings)
+            keys = check_pictures(flight, source.pictures(job.entry), told.depth, told.rounded_as, findings)
         except InputError as error:
             findings.error("unreadable", name, f"{error.what}: {error.got}", "pictures that can be read")
         except SENSELESS as error:

@@ -59,13 +59,14 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
             if present:
                 findings.error("caption", flight.where(i, present[0]), "a value", "null: has_caption is false")
             continue
-        absent = [name for name in NEVER_NULL if not row.get(name)]
+        absent = [name for name in NEVER_NULL if name in row and not row[name]]
         if absent:
             findings.error(
                 "caption", flight.where(i, absent[0]), repr(row.get(absent[0])), "a value: has_caption is true"
             )
             continue
-        _check_window(flight, i, row, released, window_frames, findings)
+        if WINDOW in row:  # a format may have none
+            _check_window(flight, i, row, released, window_frames, findings)
         _check_decision(flight, i, row, findings)
         _check_texts(flight, i, row, findings)
         _check_states(flight, i, row, findings)
@@ -105,7 +106,7 @@ def _check_decision(flight: FlightRows, i: int, row: Row, findings: Findings) ->
         findings.error("verdict", flight.where(i, "verdict"), got, "CONSISTENT exactly where the decision is the label")
     elif (verdict == "ABSTAIN" and label is not None) or (verdict == "SOFT_CONFLICT" and label is None):
         findings.error("verdict", flight.where(i, "verdict"), f"{verdict}, label {label}", "ABSTAIN where there is no label, and else not")  # fmt: skip
-    if (row["label_from"] == "flight") != (row.get("track") == "clean"):
+    if "label_from" in row and (row["label_from"] == "flight") != (row.get("track") == "clean"):
         findings.error("label_from", flight.where(i, "label_from"), f"{row['label_from']} in a {row.get('track')} flight", "flight exactly in a clean one")  # fmt: skip
 
 

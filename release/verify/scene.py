@@ -15,7 +15,7 @@ import numpy as np
 
 from cosfly.items import advance
 from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
-from release.record import DepthCoding
+from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
 from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
 from release.verify.rows import FlightRows
@@ -54,12 +54,16 @@ class _Pairs:
 
 
 def check_pictures(
-    flight: FlightRows, pictures: Iterator[Pictures], coding: DepthCoding, findings: Findings
+    flight: FlightRows,
+    pictures: Iterator[Pictures],
+    coding: DepthCoding,
+    rounded_as: DepthCodingName,
+    findings: Findings,
 ) -> list[tuple[int, int]]:
     """Check all pictures of a flight, one after the other; memory holds three frames.
 
     Args:
-        coding: of the depth.
+        coding: of the depth. rounded_as: the coding whose errors it has.
     Returns:
         of each row a number that tells its colour picture from others, and one for its depth; 0 where it has none.
     """
@@ -79,7 +83,7 @@ def check_pictures(
         if decoded[0].size:
             _compare(flight, i, view, before, pairs)
         before = [*before[-1:], (i, view)]
-    _judge(flight, pairs, coding, findings)
+    _judge(flight, pairs, rounded_as, findings)
     return keys
 
 
@@ -122,13 +126,13 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
         ).correlation
 
 
-def _judge(flight: FlightRows, pairs: _Pairs, coding: DepthCoding, findings: Findings) -> None:
+def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
     """Find the pairs of frames that do not show one world."""
     if not pairs.found:
         return
     errors = np.array([pair.error for pair in pairs.found])
     agree = np.array([pair.agree / max(pair.seen, 1) for pair in pairs.found])
-    limit, least = ERROR_MOST[coding.coding], AGREE_LEAST
+    limit, least = ERROR_MOST[rounded_as], AGREE_LEAST
     if flight.is_foreign:
         usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else np.inf
         if usual > ROUGH_ERROR or np.median(agree) < 0.8:

@@ -109,7 +109,7 @@ class Shards:
             row = 0
             for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
                 for i in range(max(begin - row, 0), min(end - row, len(batch))):
-                    yield {file: _bytes_at(batch.column(name), i) for file, name in names.items()}
+                    yield {file: picture_at(batch.column(name), i) for file, name in names.items()}
                 row += len(batch)
                 if row >= end:
                     break
@@ -134,7 +134,7 @@ def rows_of_table(table: Any, path: Path) -> list[Row]:
         raise InputError("not text", where=path, got=str(error)) from None
 
 
-def _bytes_at(column: Any, row: int) -> memoryview | None:
+def picture_at(column: Any, row: int) -> memoryview | None:
     """Give a picture where it lies in the table's memory."""
     value = column[row]
     if value.is_valid and pa.types.is_struct(value.type):

@@ -17,20 +17,24 @@ from pathlib import Path
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.items import Item
+from cosfly.products.frames import FILE_NAMES
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
+from cosfly.reading.files import read_bytes
 from cosfly.runner import Watch, run_items
 from cosfly.stage_folder import Failed, Kept, StageFolder
 from cosfly.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
-from release.export.manifest import read_export
-from release.record import ReleaseRecord, read_record
+from release.export.manifest import ExportRecord, read_export, render_readme
+from release.record import DepthCoding, ReleaseRecord, read_record
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
+from release.verify.episodes import found_episodes
 from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
+from release.verify.made_again import check_made_again
 from release.verify.sources import Entry, FlightSource, Shards, Tree
 from release.verify.tars import found_tars
 
@@ -47,6 +51,7 @@ class _How:
     reader: CaptionReader | None
     workers: int
     watch: Watch
+    source: Path | None
 
 
 def verify(
@@ -56,6 +61,7 @@ def verify(
     workers: int = 0,
     reader: CaptionReader | None = None,
     watch: Watch = Watch(),
+    source: Path | None = None,
 ) -> Verified:
     """Check a folder (or the `dataset` folder inside a release stage's, or the format's inside an export's).
 
@@ -64,10 +70,11 @@ def verify(
         workers: processes; 0 works in this one.
         reader: tells what the words of captions say; None: they are not read, which the report says.
         watch: when a worker counts as stalled; its flight is then an error.
+        source: of an export the release that it was made of, to make it again and compare.
     Returns:
         the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
     """
-    findings, how = Findings(), _How(level, reader, workers, watch)
+    findings, how = Findings(), _How(level, reader, workers, watch, source)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
         inner = (folder / "dataset" / RECORD, *(folder / name / EXPORT for name in FORMATS))  # in the stage's folder
         folder = next((path.parent for path in inner if path.is_file()), folder)
@@ -156,10 +163,10 @@ def _told(record: ReleaseRecord) -> Told:
     settings = {
         (source.run, stage.stage): stage.config for source in record.provenance.sources for stage in source.stages
     }
-    asked = record.settings
+    asked, coded = record.settings, record.depth or LOSSLESS
     return Told(
-        asked.window_frames, record.depth or LOSSLESS, settings,
-        by_town=record.splits.by == "town", both=asked.pairs == "both" and len(asked.tracks) == 2,
+        asked.window_frames, coded, settings,
+        by_town=record.splits.by == "town", both=asked.pairs == "both" and len(asked.tracks) == 2, rounded_as=coded.coding,
     )  # fmt: skip
 
 
@@ -180,8 +187,7 @@ def _check_shard_splits(
 
 
 def _verify_export(folder: Path, how: _How, findings: Findings) -> None:
-    """Check an export: its record, its files against its list of checksums, and the rows and pictures of a playback tree or a WebDataset
-    as such. LeRobot rounds poses and cuts flights: its rows are those of its release, which is verified where it stands."""
+    """Check an export: its record, its files against its list of checksums, its rows and pictures."""
     try:
         record = read_export(folder / EXPORT)
     except InputError as error:
@@ -197,34 +203,55 @@ def _verify_export(folder: Path, how: _How, findings: Findings) -> None:
     good = check_names(folder, dict.fromkeys((*digests, *own, "README.md", CHECKSUMS)), findings)
     if EXPORT not in digests:
         findings.error("checksum", f"{CHECKSUMS}: {EXPORT}", "no line", "one line per file")
+    _check_readme(folder, record, findings)
     if how.level == "pixels":
         check_digests(folder, digests, good, findings)
+    if how.source is not None:
+        check_made_again(folder, record, how.source, workers=how.workers, watch=how.watch, findings=findings)
     if is_tree:
-        _verify_tree(folder, how, findings)
-    elif record.format == "webdataset" and how.level != "structure":
-        _verify_tars(folder, [name for name in good if name.endswith(".tar")], record.frames, how, findings)
+        _verify_tree(folder, how, findings, record.depth)
     elif how.level != "structure":
-        findings.note("not_checked", EXPORT, "rows of this format", "verify the release that it was made of: its digest stands there")  # fmt: skip
+        _verify_exported_rows(folder, record, good, how, findings)
 
 
-def _verify_tars(folder: Path, shards: list[str], num_frames: int, how: _How, findings: Findings) -> None:
-    """Check rows and pictures of a WebDataset as those of a release."""
+def _check_readme(folder: Path, record: ExportRecord, findings: Findings) -> None:
+    """README.md is what export.json gives, to the letter."""
     try:
-        source, entries, coding = found_tars(folder, shards, findings)
+        found = read_bytes(folder / "README.md", what="README", tree=folder)
     except InputError as error:
-        findings.error("unreadable", error.where, error.got or error.what, error.expected or "rows of all shards")
+        findings.error("card", "README.md", error.got or error.what, "what export.json says, in words")
         return
-    told = Told(depth=coding or LOSSLESS)
+    if found != render_readme(record).encode():
+        findings.error("card", "README.md", "other words", "what export.json says, in words")
+
+
+def _verify_exported_rows(folder: Path, record: ExportRecord, names: list[str], how: _How, findings: Findings) -> None:
+    """Check rows and pictures of a WebDataset or of LeRobot as those of a release, as far as the format has them."""
+    coded = record.depth or LOSSLESS
+    source: FlightSource
+    try:
+        if record.format == "webdataset":
+            tars = [name for name in names if name.endswith(".tar")]
+            files = tuple(file for file in FILE_NAMES if file in record.codings)
+            source, entries = found_tars(folder, tars, files, coded.coding, findings)
+            told = Told(depth=coded, rounded_as=coded.coding)
+        else:  # depth is decoded there, and texts have no prompt that they could be held against
+            source, entries = found_episodes(folder, names, findings)
+            told, how = Told(rounded_as=coded.coding), replace(how, reader=None)
+    except InputError as error:
+        findings.error("unreadable", error.where, error.got or error.what, error.expected or "rows of all files")
+        return
     check_all(source, entries, told, how, findings)
     num_rows = sum(entry.num_rows for entry in entries)
-    if num_rows != num_frames:
-        findings.error("rows", EXPORT, f"{num_rows:,} frames", f"{num_frames:,}, as {EXPORT} says")
+    if num_rows != record.frames:
+        findings.error("rows", EXPORT, f"{num_rows:,} frames", f"{record.frames:,}, as {EXPORT} says")
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
 
 
-def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
+def _verify_tree(folder: Path, how: _How, findings: Findings, coded: DepthCoding | None = None) -> None:
+    """Check a playback tree. coded: how the release that it was made of coded the depth, which is float32 here."""
     try:
         source, entries = Tree.found(folder)
     except InputError as error:
@@ -235,7 +262,8 @@ def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
     digests = _tree_digests(folder, entries, findings)
     if how.level == "structure":
         return
-    check_all(source, entries, Told(), replace(how, reader=None), findings)
+    told = Told(rounded_as=(coded or LOSSLESS).coding)
+    check_all(source, entries, told, replace(how, reader=None), findings)
     if how.level == "pixels":
         for flight, own in digests.items():
             check_digests(folder / flight, own, list(own), findings)
@@ -284,7 +312,7 @@ def check_all(source: FlightSource, entries: list[Entry], told: Told, how: _How,
                 findings.error("not_checked", record.id, record.message, "a flight that can be checked")
         check_across(flights, rows, by_town=told.by_town, both=told.both, findings=findings)
     num_rows = sum(flight.num_rows for flight in flights)
-    words = "texts of captions read" if how.reader is not None else "texts of captions not read: no reader was given"
+    words = f"texts of captions {'read' if how.reader is not None else 'not read against the flight'}"
     pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
     findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
     return flights
