@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from fuzz import Reader
+from safetensors.numpy import save_file
 from specimens_distill import make_captions
 from specimens_planning import walk_along
 
@@ -84,6 +86,7 @@ from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
 from distill.evaluation.scores import read_scores
+from distill.inference import merge
 from distill.inference.outcome import make_prediction
 from distill.prepare import dual_track
 from distill.prepare import stage as prepare
@@ -92,6 +95,7 @@ from distill.prepare.sources import Source as Prepared
 from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
+from distill.student.features import read_features
 from distill.student.taught import taught_by
 from distill.tracks import RECORD as TRACKS
 from distill.tracks import read_track_samples
@@ -352,6 +356,37 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
         },
     )
     write_taught(model, taught_by(samples, 4))
+    _student_files(root)
+
+
+def _student_files(root: Path) -> None:
+    """Write a model of two layers with an adapter of one, and the features of a picture."""
+    base, adapter, rng = root / "base", root / "adapter", np.random.default_rng(0)
+    for folder in (base, adapter):
+        folder.mkdir()
+    write_json(base / "config.json", {"model_type": student.MODEL_TYPE})
+    layers = {f"layers.{k}.weight": rng.standard_normal((6, 4)).astype(np.float32) for k in range(2)}
+    save_file(layers, base / "model-00001-of-00001.safetensors", {"format": "pt"})
+    where = dict.fromkeys(layers, "model-00001-of-00001.safetensors")
+    write_json(base / "model.safetensors.index.json", {"metadata": {"total_size": 192}, "weight_map": where})
+    halves = {"A": np.ones((2, 4), np.float32), "B": np.ones((6, 2), np.float32)}
+    update = {f"{merge.PREFIX}layers.1.lora_{part}.weight": values for part, values in halves.items()}
+    save_file(update, adapter / "adapter_model.safetensors", {"format": "pt"})
+    write_json(adapter / "adapter_config.json", {"peft_type": "LORA", "r": 2, "lora_alpha": 4, "bias": "none"})
+    array = root / "features/ab/abcd.npy"
+    array.parent.mkdir(parents=True)
+    np.save(array, rng.standard_normal((3, 8)).astype(np.float32))
+
+
+def _merged(root: Path, scratch: Path) -> None:
+    """Merge an adapter whose record names whatever base is there, so that changed weights are read."""
+    adapter = scratch / "adapter"
+    adapter.mkdir()
+    for path in (root / "adapter").iterdir():
+        (adapter / path.name).symlink_to(path)
+    facts = {"schema": "cosfly.adapter", "schema_version": "1.0", "base_sha256": checkpoint.base_digests(root / "base")}
+    write_json(adapter / checkpoint.ADAPTER_FACTS, facts | {"max_pixels": 4})
+    merge.run(merge.MergeConfig(), root / "base", adapter, scratch / "merged")
 
 
 def _records(root: Path) -> None:
@@ -679,6 +714,11 @@ READERS: dict[str, Reader] = {
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),
     "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
+    "merge": Reader(
+        ("adapter/adapter_config.json", "adapter/adapter_model.safetensors", "base/config.json",
+         "base/model-00001-of-00001.safetensors", "base/model.safetensors.index.json"), _merged, share=0.5, hashes=True,
+    ),
+    "features": Reader(("features/ab/abcd.npy",), lambda root, _: read_features(root / "features", "abcd", torch.float32)),
     "student's teaching": _one(f"model/{TAUGHT}", lambda path: read_taught(path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),

@@ -134,7 +134,8 @@ class Updates:
                 raise InputError("not a tensor of a LoRA adapter", where=adapter, got=name)
             self._pairs.setdefault(f"{layer}.weight", [None, None])["AB".index(part[0])] = tensor
         for name, (down, up) in self._pairs.items():
-            if down is None or up is None or down.shape[0] != up.shape[1]:
+            whole = down is not None and up is not None and down.ndim == up.ndim == 2
+            if not whole or down.shape[0] != up.shape[1]:
                 raise InputError("half an update", where=adapter, got=name, expected="lora_A (r, n) and lora_B (m, r)")
         self.names = sorted(self._pairs)
         self._used: set[str] = set()
@@ -208,4 +209,7 @@ def _mend_index(folder: Path, num_bytes: int) -> None:
     path = folder / "model.safetensors.index.json"
     if path.is_file():
         index = read_object(path, what="index of weights")
-        write_json(path, index | {"metadata": {**(index.get("metadata") or {}), "total_size": num_bytes}})
+        metadata = index.get("metadata") or {}
+        if not isinstance(metadata, dict):
+            raise InputError("not an object", where=f"{path}: metadata", got=str(metadata)[:80])
+        write_json(path, index | {"metadata": {**metadata, "total_size": num_bytes}})
