@@ -15,7 +15,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from retold import misread
-from specimens_prose import CASES, FOLLOW, FOURTH_SET, HOLD, SECOND_SET, THIRD_SET, WINDOWS, Case
+from specimens_prose import CASES, FIFTH_SET, FOLLOW, FOURTH_SET, HOLD, SECOND_SET, THIRD_SET, WINDOWS, Case
 
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
@@ -77,12 +77,13 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
 @pytest.mark.parametrize(
     ("path", "of_all", "numbers", "sides"),
     [
-        (GOLD_PROSE, 0.815, 0.89, 0.86),
-        (SECOND_SET, 0.795, 0.88, 0.78),
-        (THIRD_SET, 0.66, 0.69, 0.7),
-        (FOURTH_SET, 0.79, 0.77, 0.89),
+        (GOLD_PROSE, 0.845, 0.95, 0.87),
+        (SECOND_SET, 0.815, 0.91, 0.8),
+        (THIRD_SET, 0.68, 0.75, 0.7),
+        (FOURTH_SET, 0.8, 0.795, 0.89),
+        (FIFTH_SET, 0.66, 0.66, 0.79),
     ],
-    ids=["gold", "second", "third", "fourth"],
+    ids=["gold", "second", "third", "fourth", "fifth"],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(path: Path, of_all: float, numbers: float, sides: float):
     """Bounds of what is reached on sets that are read by now; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""

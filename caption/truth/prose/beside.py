@@ -82,6 +82,8 @@ class Beside:
                 and not self.text.startswith(("or ", "give"), token.start)
             ):
                 continue
+            if any(t.start == token.start for t in self.clause.of("time", "max", "min")):
+                continue  # "earlier up to 22 m", "as low as 18 m" is an extreme
             if any(token.end <= t.start and t.end <= numeral.start for t in self.clause.of("who")):
                 continue  # "slightly above the target's 1.2 m/s"
             if -1 <= distance <= reach and not crossing(self.sentence, self.clause, token, numeral.start, numeral.end):

@@ -46,7 +46,7 @@ class ClauseWords:
         if times:
             return min(times, key=lambda pair: gap(pair[0], token.start, token.end))[1]
         if (
-            self.clause.has("time", "window", "past", "last_second", "last_step", "since", "until", "last_s")
+            self.clause.has("time", "some", "window", "past", "last_second", "last_step", "since", "until", "last_s")
             or self.context.has_past
         ):
             return None

@@ -93,10 +93,13 @@ def parse(text: str, language: Language) -> Sentence:
     tokens = load_lexicon(language).scan(text)
     tokens += [Token("time", "t" + match[1], match.start(), match.end()) for match in _FRAME.finditer(text)]
     tokens += _spans(text, found, language)
+    if language == "zh":
+        tokens += _unknown_moments(text, tokens)
     if language == "en":
         tokens += _particles(text, tokens)
         if _GROUND.search(text):
             tokens = [_may_be_slant(t, text) for t in tokens]
+        tokens = [t for t in tokens if not _is_particle(t, text, tokens)]
     ratios = [t for t in tokens if t.kind == "ratio"]
     kept = [
         n
@@ -113,6 +116,33 @@ def parse(text: str, language: Language) -> Sentence:
     clauses = _cut(text, tokens, kept, language)
     _block(clauses, text)
     return Sentence(text, language, kept, clauses)
+
+
+_AT_SOME_TIME = re.compile(r"(?<=[\u4e00-\u9fff])(?<![同及随小此适届暂临准一当按定实平有这那])时(?![刻候间长段常])")
+
+
+def _unknown_moments(text: str, tokens: list[Token]) -> list[Token]:
+    """Read "入院时" as a moment of which nothing more is known."""
+    ends = {t.end for t in tokens if t.kind == "time"}
+    found = _AT_SOME_TIME.finditer(text)
+    return [Token("time", "some", match.start(), match.end()) for match in found if match.start() not in ends]
+
+
+_REASON = re.compile(
+    r"since (?:the (?!start|beginning|first|last|previous|window|opening)|its?\b|we\b|they\b|he\b|she\b|our\b|both\b)"
+)
+
+
+_READING = re.compile(r"\b(?:initial|original|first|starting|earlier|previous|same|present|latest|current|final) $")
+
+
+def _is_particle(token: Token, text: str, tokens: list[Token]) -> bool:
+    """Tell whether a word means nothing here: the "own" of "his own pace", the "figure" that is a number, the "since" that gives a reason."""
+    if token.kind == "who" and text[token.start : token.end] == "own":
+        return any(t.kind == "who" and t.end == token.start - 1 for t in tokens)
+    if token.kind == "who" and text[token.start : token.end] == "figure":
+        return _READING.search(text, 0, token.start) is not None
+    return token.kind in ("time", "link") and _REASON.match(text, token.start) is not None
 
 
 _GROUND = re.compile(r"\bground (?:distance|range)\b|\bhorizontal")
@@ -154,7 +184,7 @@ def _spans(text: str, found: list[Numeral], language: Language) -> list[Token]:
             tokens.append(Token("time", f"back:{n.value:.0f}", n.start, n.end))
         elif _LAST[language].search(before):
             tokens.append(Token("time", f"last{'' if n.unit == 'frames' else '_s'}:{n.value}", n.start, n.end))
-        elif n.unit == "frames" and _FIRST[language].search(before):
+        elif n.unit == "frames" and _FIRST[language].search(before) and not (n.value == 1 and before.endswith("前")):
             tokens.append(Token("time", f"first:{n.value:.0f}", n.start, n.end))
         elif n.unit == "s":
             tokens.append(Token("time", "window", n.start, n.end))

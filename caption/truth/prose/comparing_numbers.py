@@ -15,7 +15,7 @@ from caption.truth.prose.statements import Form, Statement
 
 SIGNED = {"yaw": 1, "heading": 1, "bearing": 1, "target_turn": 1, "target_heading": 1, "offset_x": -1, "offset_y": -1}
 RESOLUTION = {"m": 0.1, "mps": 0.02, "deg": 0.2, "px": 1.0, "dps": 0.4}  # of a difference of two printed values
-_ABOUT = 0.07  # share of the value that "about" allows
+ABOUT = 0.07  # share of the value that "about" allows
 
 
 class NumberComparison:
@@ -57,7 +57,7 @@ class NumberComparison:
             base = 0.05 * abs(value)  # of a foreign unit: absolute tolerances are those of our own
         if unit == "px" and value < 25:
             base = min(base, 2.0)
-        share = _ABOUT if hedge else cfg.relative
+        share = ABOUT if hedge else cfg.relative
         return max(base, share * abs(value)) + step + 1e-9
 
     def _frames(self, s: Statement, name: str) -> list[int]:
@@ -109,8 +109,10 @@ class NumberComparison:
         if s.mode == "value":
             return False
         tight = max(step, RESOLUTION[numeral.unit]) + 1e-9
-        tight += _ABOUT * value if s.hedge else 0.0
-        direction = sign if base in SIGNED and s.side else 0 if name in ("yaw", "heading", "bearing") else s.trend
+        tight += ABOUT * value if s.hedge else 0.0
+        direction = (
+            sign if base in SIGNED and s.side else 0 if name in ("yaw", "heading", "bearing", "pitch") else s.trend
+        )
         known = [] if name.startswith("rate:") else self.measured.known(name)
         if s.hedge == "less" and known and max(known) - min(known) <= value + tight:
             return True  # "varies by less than"
@@ -186,7 +188,7 @@ class NumberComparison:
         for name in s.names or ANY[numeral.unit]:
             series = self.measured.series(name) if not name.startswith("rate:") else ()
             if not series:
-                is_unknown = is_unknown or bool(s.names)
+                is_unknown = is_unknown or (bool(s.names) and not name.startswith("rate:"))
                 continue
             ends = set(self._frames(s, name))
             slack_first = self.slack(numeral.unit, first, step, s.hedge)
@@ -273,7 +275,7 @@ class NumberComparison:
         f = self.measured.facts
         pairs = ((f.box_width_px[frame], width), (f.box_height_px[frame], height))
         for true, told in pairs:
-            slack = max(2.0 if told < 25 else self.cfg.tolerance_px, _ABOUT * told * bool(hedge))
+            slack = max(2.0 if told < 25 else self.cfg.tolerance_px, ABOUT * told * bool(hedge))
             if true is None or abs(true - told) > slack:
                 return False
         return True

@@ -6,15 +6,15 @@ import re
 from dataclasses import replace
 
 from caption.schema import EvidenceConfig
-from caption.truth.prose.comparing_numbers import RESOLUTION, SIGNED, NumberComparison
+from caption.truth.prose.comparing_numbers import ABOUT, RESOLUTION, SIGNED, NumberComparison
 from caption.truth.prose.cues import ANY
 from caption.truth.prose.measured import Measured
 from caption.truth.prose.pool import Pool
 from caption.truth.prose.statements import Form, Mode, Statement
 
 _EXTREME = re.compile(
-    r"\b(?:low|high|peak|top|trough|maximum|minimum|mean|average) (?:of|at) (?:only |just )?$|\baverag(?:es|ed|ing) $"
-    r"|(?:最高|最低|最大|最小|最快|最慢|峰值|谷底|平均|均值|平均值)(?:为|是|达|到|只有|仅)?\s*$"
+    r"\b(?:low|high|peak|top|trough|maximum|minimum|mean|average) (?:of|at) (?:only |just )?$|\baverag(?:es|ed|ing) $|\b(?:bottomed out|bottomed|topped out|peaked|topped) at $|\bas (?:low|high|fast|slow) as (?:only |just )?$"
+    r"|(?:最高|最低|最大|最小|最快|最慢|峰值|谷底|平均|均值|平均值)(?:为|是|曾|达|到|至|报|只有|仅|约)*\s*$"
 )
 _WHOLE = 4  # numbers of a list that runs over the window
 _ROUGHLY = 0.04  # share of a hedged number by which it may lie from another value of the window
@@ -42,7 +42,7 @@ class NumberJudge(NumberComparison):
         if s.kind in ("pair", "clock", "speeds", "ratio", "percent"):
             return True
         if s.kind == "course":
-            return bool(s.sure_names) and self._is_turned_round(s)
+            return bool(s.sure_names) and (s.sure_mode == "value" or self._is_turned_round(s))
         if s.kind == "range":
             return self._falls(s) and not self._are_changes(replace(s, frames=None))
         if s.kind != "number":
@@ -80,13 +80,13 @@ class NumberJudge(NumberComparison):
         numeral, value, step = self.read(s.numbers[0])
         passes: list[tuple[tuple[str, ...], float, Mode]]
         rough = _ROUGHLY * value * bool(s.hedge)
+        tight = max(step, RESOLUTION[numeral.unit]) + ABOUT * value * bool(s.hedge)
         passes = [(s.sure_names, step + rough, mode) for mode in ("value", "change") if s.sure_mode in (mode, "either")]
         if passes[-1][2] == "change":
-            passes[-1] = (s.sure_names, max(step, RESOLUTION[numeral.unit]) + rough, "change")
-        if is_meant:
-            passes.append(
-                (s.sure_names or s.names, self.slack(numeral.unit, value, step, s.hedge, numeral.factor), s.sure_mode)
-            )
+            passes[-1] = (s.sure_names, tight, "change")
+        if is_meant and s.sure_mode != "change":  # changes are told exactly
+            slack = self.slack(numeral.unit, value, step, s.hedge, numeral.factor)
+            passes.append((s.sure_names or s.names, slack, "value"))
         for names, near, mode in passes:
             below, above = near, near
             if s.hedge == "more":

@@ -30,7 +30,9 @@ def ratio_holds(s: Statement, measured: Measured, read: dict[int, tuple[float, f
         return any(_is_told(value, unit * ratio, slack, s.hedge) for ratio in _of_operands(s, a / b))
     if not s.names:
         shares = picture_shares(measured.facts)
-        return True if any(_is_told(value, unit * share, slack, s.hedge) for share in shares) else None
+        if any(_is_told(value, unit * share, slack, s.hedge) for share in shares):
+            return True
+        return False if s.word == "picture" and s.kind == "percent" else None
     found = list(_ratios(s, measured))
     if any(_is_told(value, unit * ratio, slack, s.hedge) for ratio in found):
         return True
@@ -59,18 +61,28 @@ def _of_operands(s: Statement, ratio: float) -> Iterator[float]:
     is_change = s.mode != "value"
     if s.kind == "percent" and is_change and s.trend and not s.is_ordered:
         low, high = min(ratio, 1.0 / ratio), max(ratio, 1.0 / ratio)
+        if _is_added(s):
+            yield 1.0 - low if s.trend < 0 else high - 1.0
+            return
         yield from (low, 1.0 - low) if s.trend < 0 else (high, high - 1.0)
         return
     is_one_way = s.is_ordered and (s.kind == "percent" or not is_change)
     for told in (ratio,) if is_one_way else (ratio, 1.0 / ratio):
-        yield told
+        if not _is_added(s):
+            yield told
         if s.kind == "percent" or is_change:
             yield abs(told - 1.0)
 
 
+def _is_added(s: Statement) -> bool:
+    """Tell whether it is what was added or lost alone: "30 % lower"; "twice more" may be the multiple itself."""
+    return s.mode == "change" and (s.kind == "percent" or 0.0 < s.value < 1.0)
+
+
 def _with_share(s: Statement, ratio: float) -> Iterator[float]:
     """Yield a ratio, and what is added or lost where that may be told."""
-    yield ratio
+    if not _is_added(s):
+        yield ratio
     if s.mode != "value":
         yield abs(ratio - 1.0)
 
@@ -92,6 +104,9 @@ def _ratios(s: Statement, measured: Measured) -> Iterator[float]:
                     yield from _with_share(s, true)
             continue
         series = [abs(v) for v in measured.known(name)]
+        if s.span is not None:
+            first = next((v for v in measured.series(name)[s.span[0] :] if v is not None), None)
+            series = [] if first is None else [abs(first), series[-1]]
         for before in series[:-1]:
             if before and series[-1] and s.trend * (series[-1] / before - 1.0) >= 0:
                 yield from _with_share(s, series[-1] / before)
@@ -117,6 +132,8 @@ def _at_other_frames(s: Statement, measured: Measured) -> Iterator[float]:
     """Yield ratios of the same series at any frames: of the two speeds the way round that is told, of one series either way."""
     for name in s.names:
         if name != "speed_ratio":
+            if s.span is not None:
+                continue
             for a, b in permutations([abs(v) for v in measured.known(name) if v], 2):
                 yield from _with_share(s, a / b)
             continue

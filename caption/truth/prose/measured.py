@@ -87,6 +87,11 @@ _DERIVED: dict[str, Callable[[Facts], Values]] = {
     "target_mean": lambda f: _constant(f.target_speed_mps, f),
     "target_turn": lambda f: _constant(f.target_turn_deg, f),
     "difference_mean": _difference_mean,
+    "way_difference": lambda f: (
+        ()
+        if not f.travelled_m or not f.target_travelled_m
+        else tuple([None if w is None else v - w for v, w in zip(f.travelled_m, f.target_travelled_m, strict=True)])
+    ),
     "box_area": _area,
     "picture": _picture,
 }

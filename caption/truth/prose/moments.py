@@ -13,17 +13,17 @@ from caption.truth.prose.statements import NOW
 # Of another moment, or of a part of the window.
 _ELSEWHERE = {
     "en": re.compile(
-        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|used to|did|against|versus|vs)\b|\|"
+        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since(?! the (?!start|first|last|begin)| its?\b| we\b| they\b| he\b| she\b| our\b| both\b)|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|used to|did|against|versus|vs)\b|\|"
     ),
     "zh": re.compile(
-        r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每|比|较|差|再|随|还|(?<![到至])了|(?<![已现])(?:升到|降到)(?!了)|增|减|\|"
+        r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每(?!秒)|比|较|差|再|随|还|(?<![到至])了|(?<![已现])(?:升到|降到)(?!了)|增|减|\|"
     ),
 }
 _LATER = {
     "en": re.compile(
         r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since|steps|frames)\b|\|"
     ),
-    "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每|比|较|差|再|随|起|\|"),
+    "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每(?!秒)|比|较|差|再|随|起|\|"),
 }
 # What goes on with another moment: "1.3 m/s for three steps, then 3.2".
 _THEN = {
@@ -33,6 +33,9 @@ _THEN = {
 _PAST = re.compile(
     r"(?<!has )(?<!have )(?<!been )(?<!is )(?<!are )\b(?!cent(?:re|ere)d|occluded|\w*speed|need|indeed|exceed)\w{2,}ed\b|\b(?:went|came|rose|fell|flew|ran|shot|made|took)\b|了"
 )
+
+
+_AFTER_CHANGE = re.compile(r"#\s*(?:米|度|m|°)之?后(?!,)")  # "爬升 2.3 米之后高度为 20.3 米"
 
 
 class Moments:
@@ -53,12 +56,12 @@ class Moments:
             return (frame,)
         following = [n.start for n in self._measured() if n.start > numeral.start]
         after = following[0] if following else self.clause.end
-        if _ELSEWHERE[self.language].search(self._without_todays(numeral)):
+        if _ELSEWHERE[self.language].search(_AFTER_CHANGE.sub("", self._without_todays(numeral))):
             return None
         if _LATER[self.language].search(self.text, numeral.end, after) or _THEN[self.language].match(self.text, after):
             return None
         for time in self.clause.of("time"):
-            if _is_reached(time, numeral):
+            if _is_reached(time, numeral) or _AFTER_CHANGE.search(self.text, self.clause.start, time.end + 1):
                 continue
             is_next = (bool(following) and time.end >= after - 2) or (
                 time.start >= numeral.end and time.value in ("since", "past")
@@ -90,6 +93,8 @@ class Moments:
         if self.clause.has("time", *self._todays(numeral)):
             return True
         is_own = is_value and self.clause.has("quantity")
+        if is_own:
+            before = [c for c in before if c is self.sentence.clauses[0] or c.has("quantity") or not c.numerals]
         told = "" if is_own else self.text[since : self.clause.start]
         return all(_reaches_now(c) for c in before) and not _PAST.search(told)
 
@@ -98,6 +103,8 @@ class Moments:
         match = match or _MOMENT_BEFORE[self.language].search(self.text, max(0, numeral.start - _REACH), numeral.start)
         if match is None:
             return None
+        if self.language == "zh" and match.groupdict().get("first"):
+            return 1 if numeral.unit == "mps" else 0
         return NOW if match["frame"] is None else int(match["frame"])
 
     def _only_moment(self) -> int | None:
@@ -153,7 +160,7 @@ _TODAY = ("now", "window", "last_step", "last_second", "last", "last_s", "mean")
 _SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}
 _MOMENT_BEFORE = {
     "en": re.compile(r"(?:\bt(?P<frame>\d)|\b(?P<now>now|currently))\s*(?::|=|at|is|was|of|stands at|stood at|reads|read|about|only|just|a)*\s*$"),
-    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现))(?:的|:|=|为|是|达到|达|约|只有|仅|曾|一度|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
+    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现|末帧|最后一帧)|(?P<first>首帧|第一帧|起初|最初|开始时|窗口开始时))(?:的|之|所处|:|=|为|是|达到|达|约|只有|仅|曾|一度|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
 }  # fmt: skip
 _MOMENT_AFTER = {
     "en": re.compile(r"\s*(?:(?:to the |to )?(?:left|right|high|low|up|down)\s+(?=at t|in t))?(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|~|→|,? ?t\d|(?:to|and)\b\s*(?:at )?t\d))|(?P<now>now|at present|currently)\b(?! than))"),

@@ -6,7 +6,7 @@ import re
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import Context, cues_of, names_of, owner_of
+from caption.truth.prose.cues import Context, cues_of, names_of, owner_of, times_of
 from caption.truth.prose.numerals import Numeral
 
 # "17.5 m beneath us", "19.1 m above the walker": how much higher the drone is.
@@ -14,6 +14,11 @@ OVER_OTHER = re.compile(
     r"\s*(?:straight |directly |right |vertically )?(?:above|over|below|beneath|under|underneath|higher than|lower than)"
     r" (?:us|me|him|her(?! \w)|them|the (?:drone|aircraft|camera|craft|uav|walker|person|pedestrian|target|subject))\b(?!')"
 )
+# "4.0 m beneath t2", "0.3 m below that of the first frame": how much higher it is than then.
+OVER_MOMENT = re.compile(
+    r"\s*(?:above|over|below|beneath|under|higher than|lower than) (?:that of |that in |what it was |the value )?(?:at |in |of )?(?:the |our |its )?"
+)
+_WAY_MORE = re.compile(r"[多少](?:走|飞)(?:出|了)?(?:约|大约)?\s*$")
 _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
         "closer nearer farther further 近 远": ("distance", "slant"),
@@ -38,6 +43,10 @@ class Naming:
             owner = ""
         if numeral.unit == "m" and OVER_OTHER.match(self.text, numeral.end):
             return ("height_over_target",), True
+        if self.differs_by_way(numeral):
+            return ("way_difference",), True
+        if self.over_moment(numeral) is not None:
+            return ("altitude",), True
         cues = cues_of(self.sentence, self.clause, numeral, owner)
         if cues and not self.clause.has("who", "drone", "target") and cues[0].value in ("turn", "heading", "yaw_rate"):
             owner = ""
@@ -67,6 +76,22 @@ class Naming:
         for cue in cues:
             found += tuple(n for n in names_of(cue.value, numeral.unit, owner) if n not in found)
         return found, bool(found)
+
+    def differs_by_way(self, numeral: Numeral) -> bool:
+        """ "飞机比人多走了 0.3 米": by how much one way is longer than the other's."""
+        if numeral.unit != "m" or self.language == "en" or not self.clause.has("link", "than"):
+            return False
+        people = {t.value for t in self.clause.of("who", "drone", "target")}
+        return len(people) == 2 and _WAY_MORE.search(self.text, self.clause.start, numeral.start) is not None
+
+    def over_moment(self, numeral: Numeral) -> int | None:
+        """Give the frame above or below whose height a number tells to be now."""
+        if numeral.unit != "m" or self.language == "zh":
+            return None
+        for time, frames in times_of(self.clause):
+            if time.start >= numeral.end and OVER_MOMENT.fullmatch(self.text, numeral.end, time.start):
+                return frames[0]
+        return None
 
     def told_after(self, numeral: Numeral) -> tuple[str, ...]:
         """ "1.1 m closer", "0.8 m higher", "近了 1.1 米": the word for the change says of what."""

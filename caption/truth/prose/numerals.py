@@ -69,7 +69,7 @@ def masked(sentence: str, language: Language) -> tuple[str, tuple[str, ...]]:
     if "-" in text or "→" in text or "=" in text:
         text = _EQUALS.sub(" = ", _ARROW.sub(" → ", _HYPHEN.sub(" ", text)))
     if language == "en":
-        text = _LAST_FEW.sub(r"\1 frames", text)
+        text = _LAST_FEW.sub(r"\1 frames", text).replace(" decimal ", " point ")
         text = _SIDE_LETTER.sub(lambda match: " left" if match[1] in ("l", "left") else " right", text)
     runs: list[str] = []
 
@@ -101,10 +101,14 @@ def _pattern(language: Language) -> re.Pattern[str]:
 
 
 _JOIN = re.compile(
-    r"\s*(?:(?:to the )?(?:left|right|up|down|l|r|low|high)\b)?\s*"  # "22 px right, 12 px left"
+    r"\s*(?:(?:to the )?(?:left|right|up|down|l|r|low|high)\b|[降升减增落跌涨加缩](?=到|至))?\s*"  # "22 px right, 12 px left"; "1.27 down to 1.09"
     r"(?P<join>,|、|/|-|~|→|x|\*|;|and|to|then|and then|by|至|到|和|与|及|或|or|\.\.\.|…|,\s*and|,\s*then|再到|\|)"
     r"\s*(?:(?:now|finally|again|then|currently|lastly|and|又是|又|再|最后|然后|现在?|左|右|上|下|偏)\s*)*(?:t\d\s*[:=]?\s*)?$"
 )
+
+
+_BY_PIXELS = re.compile(r"\s+by\s+[a-z ]{3,24}(?:pixels|px)\b")  # "thirty-three by seventy-four pixels"
+WAY = re.compile(r"[降升减增落跌涨加缩](?=[到至])|\b(?:up|down) to\b")  # "1.27 down to 1.09 m/s"
 
 
 def numerals(text: str, language: Language) -> list[Numeral]:
@@ -115,7 +119,7 @@ def numerals(text: str, language: Language) -> list[Numeral]:
     for match in _pattern(language).finditer(text):
         written = match["digits"]
         unit = lexicon.units.get(match["unit"] or "")
-        if written is None and unit is None:
+        if written is None and unit is None and not _BY_PIXELS.match(text, match.end()):
             continue  # "one", "two people"
         numeral = Numeral(match.start(), match.end(), unit.name if unit else "", unit.factor if unit else 1.0)
         if written is None:
@@ -170,9 +174,9 @@ def _side_of(match: re.Match[str], text: str, language: Language) -> int:
 
 
 EVERY_SECOND = re.compile(
-    r"\s*(?:of \w+ |in \w+ )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
+    r"\s*(?:of \w+ |in \w+ |in )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
 )
-_PER_SECOND = re.compile(r"每秒[^,#;。]*$")
+_PER_SECOND = re.compile(r"(?:每秒|一秒钟?(?=[能可]?[走飞跑移挪]))[^,#;。]*$")
 
 
 def _said_apart(numeral: Numeral, text: str) -> Numeral:
@@ -195,6 +199,8 @@ def _joined(numeral: Numeral, before: list[Numeral], text: str) -> Numeral:
     if match is None:
         return replace(numeral, group=last.group + 1)
     is_bare = not numeral.unit and match["join"] in ",、" and text.startswith((",", "、"), numeral.end)
+    if last.unit and WAY.search(match.group()):
+        return replace(numeral, group=last.group + 1)
     joins_units = not last.unit or last.unit == numeral.unit or match["join"] in ("→", "x", "-", "~") or is_bare
     if not joins_units:
         return replace(numeral, group=last.group + 1)
@@ -205,7 +211,8 @@ def _with_units(found: list[Numeral], text: str, lexicon: Lexicon) -> list[Numer
     """Give a unit that stands once, after a list or in brackets before it, to all of it."""
     for i in range(len(found) - 2, -1, -1):
         after = found[i + 1]
-        if not found[i].unit and after.unit and after.group == found[i].group and after.unit not in ("s", "frames"):
+        spreads = after.unit not in ("s", "frames", "") and not (after.unit == "times" and after.joined == ",")
+        if not found[i].unit and spreads and after.group == found[i].group:
             found[i] = replace(found[i], unit=after.unit, factor=after.factor)
     for i, numeral in enumerate(found):
         before = found[i - 1] if i else None

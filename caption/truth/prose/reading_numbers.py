@@ -16,7 +16,7 @@ from caption.truth.prose.cues import (
     times_of,
 )
 from caption.truth.prose.naming import Naming
-from caption.truth.prose.numerals import EVERY_SECOND, Numeral
+from caption.truth.prose.numerals import EVERY_SECOND, WAY, Numeral
 from caption.truth.prose.reading_ratios import ratio_statement
 from caption.truth.prose.statements import NOW, Mode, Statement
 from caption.truth.prose.sureness import Sureness
@@ -31,6 +31,18 @@ _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
+# Shares of the picture: "one per cent of the image width", "图像宽度的百分之一".
+_OF_PICTURE = {
+    "en": re.compile(r"\s*of (?:the |a )?(?:image|picture|frame)(?:'s)?(?: (?:width|height))?\b"),
+    "zh": re.compile(
+        r"[^#]*(?:图像|画面|图片|画幅)(?:的)?(?:宽度|高度|宽|高)的?约?[^#]{0,5}$|[^#]*(?:图像|画面)(?:宽度|高度)"
+    ),
+}
+_IN_LAST_STEP = {
+    "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
+    "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
+}  # fmt: skip
+_AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 
 
@@ -69,7 +81,7 @@ class NumberReader:
                 continue
             if any(t.value[0] == "t" and t.value[1:].isdigit() for t in self.clause.of("time")):
                 continue
-            owners = [self.sureness.right_beside(n) for n in (a, b)]
+            owners = [self.sureness.owners.right_beside(n) for n in (a, b)]
             if re.match(r"\s*的?[^(]*\(", self.text[b.end :]) or self.text[: self.clause.start].endswith(":"):
                 owners = owners_behind(self.sentence, self.clause)  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
             first = {"drone": 1, "target": -1, "": 0}[owners[0]] or -{"drone": 1, "target": -1, "": 0}[owners[1]]
@@ -113,6 +125,7 @@ class NumberReader:
             len(members) == 2
             and joins[0] in ("-", "~", "to", "至", "到", "or", "或")
             and not self.timing.comes_from(first)
+            and not self._is_way(first, numerals[1])
         ):
             self._single(members, "range")
         elif (
@@ -121,11 +134,15 @@ class NumberReader:
             and joins[0] in ("and", "和", "与", "到", "至", "及")
         ):
             self._single(members, "range", None)
-        elif len(members) == 2 and joins[0] == "→":
+        elif len(members) == 2 and (joins[0] == "→" or self._is_way(first, numerals[1])):
             self._course(members[0], members[1])
         else:
             for i in members:
                 self._single([i], "number")
+
+    def _is_way(self, first: Numeral, last: Numeral) -> bool:
+        """Tell whether a word between two numbers says which way it goes: "1.27 down to 1.09 m/s"."""
+        return WAY.search(self.text, first.end, last.start) is not None
 
     def _is_none(self, numeral: Numeral) -> bool:
         """ "not a single pixel", "一个像素也没变", "give or take 0.3 m"."""
@@ -171,6 +188,17 @@ class NumberReader:
         )
         if found.sure_names and not set(found.names) & set(found.sure_names):
             found = replace(found, names=found.sure_names)
+        if names == ("way_difference",):
+            found = replace(found, mode="value", frames=(NOW,), sure_names=names, sure_frames=(NOW,), sure_mode="value")
+        if (moment := self.naming.over_moment(numeral)) is not None and names == ("altitude",):
+            found = replace(
+                found,
+                mode="change",
+                frames=(moment, NOW),
+                sure_names=names,
+                sure_frames=(moment, NOW),
+                sure_mode="change",
+            )
         found = self._angle(found) if numeral.unit == "deg" else found
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
@@ -191,7 +219,7 @@ class NumberReader:
         if s.side and s.names and set(s.names) <= {"target_turn", "target_heading"}:
             s = replace(s, mode="change", frames=None)  # "has bent left by 45 degrees"
         if set(s.names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
-            s = replace(s, names=("target_turn",))
+            s = replace(s, names=("target_turn",), sure_names=("target_turn",))
         is_total = (
             (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not self.clause.has("who", "target")
         )
@@ -209,7 +237,7 @@ class NumberReader:
         is_length = (
             numeral.unit == "m" and is_bare and self.clause.has("quantity") and not self.sureness.is_in_group(numeral)
         )
-        if set(s.names) <= WAYS and not self.sureness.owner(numeral):
+        if set(s.names) <= WAYS and not self.sureness.owners.owner(numeral):
             is_length = False  # of somebody who is not known to have been named
         if is_length and s.names and set(s.names) <= WAYS and (end := self.ways.end_of_all()):
             return replace(s, sure_names=s.sure_names or s.names, sure_frames=end, sure_mode="value")
@@ -221,10 +249,19 @@ class NumberReader:
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
             return s
+        if s.names == ("yaw",) and s.frames == (-2, NOW) and self._turned_by(numeral):
+            return replace(s, sure_names=("yaw", "heading"), sure_frames=s.frames, sure_mode="change")
         if not s.sure_names and s.names == ("yaw",) and s.side:
             s = replace(s, sure_names=s.names)  # "has swung 3 degrees to the left in the last step"
         is_speed = numeral.unit == "mps" and s.mode == "either" and s.sure_names and s.frames == (-2, NOW)
         return replace(s, sure_frames=(NOW,) if is_speed else s.frames)  # a speed is that of the step before it
+
+    def _turned_by(self, numeral: Numeral) -> bool:
+        """Tell whether an angle is how far something turned in the last step: "1.9 degrees in the final step"."""
+        pattern = _IN_LAST_STEP[self.language]
+        if self.language == "en":
+            return pattern.match(self.text, numeral.end) is not None
+        return pattern.search(self.text, self.clause.start, numeral.start) is not None
 
     def _frames(self, numeral: Numeral, mode: Mode) -> tuple[int, ...] | None:
         return self.timing.frames(numeral, mode, is_extreme=bool(self.beside.aggregate(numeral)))
@@ -236,6 +273,10 @@ class NumberReader:
         singles = [s for s in self.statements if s.kind == "number" and s.mode == "value"]
         for early, late in itertools.pairwise(singles):
             a, b = self.sentence.numerals[early.numbers[0]], self.sentence.numerals[late.numbers[0]]
+            if a.unit == b.unit and self._comes_after(a, b):
+                self.statements = [s for s in self.statements if s is not early and s is not late]
+                self._course(late.numbers[0], early.numbers[0])
+                return
             if a.unit != b.unit or not self.timing.goes_to(b):
                 continue
             if self.timing.comes_from(a) or (
@@ -245,6 +286,12 @@ class NumberReader:
                 self.statements = [s for s in self.statements if s is not early and s is not late]
                 self._course(early.numbers[0], late.numbers[0])
                 return
+
+    def _comes_after(self, now: Numeral, before: Numeral) -> bool:
+        """ "1.1 m/s after the 6.4 m/s burst", but not "21 m after 2 m of climb"."""
+        return _AFTER.fullmatch(self.text, now.end, before.start) is not None and not self.text.startswith(
+            " of", before.end
+        )
 
     def _course(self, early: int, late: int) -> None:
         numeral = self.sentence.numerals[late]
@@ -266,11 +313,12 @@ class NumberReader:
         side, vertical = self.beside.side(numeral)
         first = self.sentence.numerals[early]
         told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
-        if is_cued and not told and (numeral.unit != "mps" or self.sureness.owner(first)):
+        is_owned = names == ("speed",) or set(names) == {"target_speed", "target_mean"}
+        if is_cued and not told and (numeral.unit != "mps" or is_owned):
             told = {names}
         self.statements.append(
             Statement(
-                kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral),
+                kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral), sure_mode="value" if self.sureness.moments.beside(numeral) == NOW else "either",
                 clause=(self.clause.start, self.clause.end), names=names, numbers=(early, late), frames=frames,
                 hedge=self.beside.hedge(numeral) or self.beside.hedge(self.sentence.numerals[early]), side=side or vertical,
                 trend=signs.pop() if len(signs) == 1 else 0,
@@ -337,6 +385,11 @@ class NumberReader:
             replace(
                 ratio_statement(self.sentence, self.clause, self.context, numeral.start, numeral.end, (index,)),
                 kind="percent",
+                word="picture"
+                if _OF_PICTURE[self.language].match(
+                    self.text, numeral.end if self.language == "en" else self.clause.start
+                )
+                else "",
                 hedge=self.beside.hedge(numeral),
             )
         )

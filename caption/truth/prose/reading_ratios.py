@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import TREND_SERIES, Context
+from caption.truth.prose.cues import TREND_SERIES, Context, times_of
 from caption.truth.prose.statements import NOW, Hedge, Statement
 
 _SPEED = re.compile(r"fast|quick|slow|pace|speed|swift|rapid|velocit|速|快|慢")
@@ -15,6 +15,10 @@ _MORE_BY = re.compile(
 )
 
 
+_INITIAL = re.compile(
+    r"\s*(?:of )?(?:the |its |our )?(?:initial|original|first|starting|opening) (?:figure|value|one|speed|reading|pace)\b"
+    r"|\s*of (?:what it was at first|where it started)"
+)
 # What a speed or a size is compared with is its own at another moment.
 _EARLIER = re.compile(
     r"\b(?:initial|original|first|what it (?:was|did|had)|before|earlier|previous|ago|at the start|relative to its)\b|原来|原先|最初|起初|当初|开始|之前|此前|前一|上一|[降减增涨升]幅"
@@ -47,13 +51,14 @@ def ratio_statement(
         names,
         numbers,
         None if is_past else (NOW,),
-        mode="either" if told.may_be_change() else "value",
+        mode="change" if told.is_change() else "either" if told.may_be_change() else "value",
         hedge=_hedge(sentence, clause, start, end),
         side=side,
         trend=signs.pop() if len(signs) == 1 and "speed_ratio" not in names else 0,
         value=value,
         operands=operands,
         is_ordered=is_ordered,
+        span=told.since(),
     )
 
 
@@ -84,12 +89,16 @@ class _Multiple:
         is_behind = not self.people and len(set(context.people)) == 2 and self.text[: self.clause.start].endswith(")")
         if speeds and not self.is_earlier and (is_behind or self._compares_two()):
             first = 1 if context.people and context.people[0] == "drone" else -1
-            return ("speed_ratio",), first if is_behind else _direction(self.sentence, self.before, self.after, context)
+            return ("speed_ratio",), first if is_behind else _direction(
+                self.sentence, self.before, self.after, context, self.end
+            )
         only_differs = all(t.value == "difference" for t in self.clause.of("quantity"))
         if speeds and self.people and len(self.owners) == 2 and only_differs:
             return ("speed_ratio", "speed", "target_speed"), 0  # "is a third faster": than it was, or than the other
         names = self._changing() if self._may_change() else ()
         if not names and speeds:
+            if self.since() and len(set(context.people)) == 1:
+                return ("speed",) if context.people[0] == "drone" else ("target_speed",), 0
             is_past = self.is_earlier or any(t.value != "now" for c in self.sentence.clauses for t in c.of("time"))
             names = ("speed_ratio", "speed", "target_speed") if is_past else ("speed_ratio",)
         return names, 0
@@ -119,7 +128,14 @@ class _Multiple:
         cues = [t for t in self.clause.of("quantity") if t.value in TREND_SERIES or t.value == "speed"]
         cue = min(cues, key=lambda t: abs(t.start - self.start)).value if cues else self.context.cue
         if cue in ("speed", "difference"):
-            return ("speed", "target_speed")
+            owners = {t.value for t in self.people}
+            return (
+                ("speed",)
+                if owners == {"drone"}
+                else ("target_speed",)
+                if owners == {"target"}
+                else ("speed", "target_speed")
+            )
         if cue in ("altitude", "height") and self.context.cue in ("box", "tall", "width"):
             return ("altitude", "box_height")
         names = TREND_SERIES.get(cue, ())
@@ -132,6 +148,22 @@ class _Multiple:
         zh = _ZH_MORE_BY.search(self.text[self.clause.start : self.start]) if not self.text.isascii() else None
         word = zh.group()[0] if zh else word
         return {-1} if word in _LESS else {1} if word in _MORE else set()
+
+    def since(self) -> tuple[int, int] | None:
+        """Give the moment with which now is compared, where one is told: "和 t1 相比", "four times the initial figure"."""
+        if _INITIAL.match(self.text, self.end):
+            return (0, NOW)
+        named = {frames for _, frames in times_of(self.clause) if frames != (NOW,)}
+        if len(named) == 1 and len(next(iter(named))) == 1 and self.clause.has("link", "than"):
+            return (next(iter(named))[0], NOW)
+        return None
+
+    def is_change(self) -> bool:
+        """Tell whether it is what was added or lost, and not what is left: "30 % lower", "低了约三分之一"."""
+        if self.sentence.language == "zh":
+            return _ZH_MORE_BY.search(self.text[self.clause.start : self.start]) is not None
+        more = _MORE_BY.match(self.text, self.end)
+        return more is not None and more.group().split()[-1] in _LESS | _MORE and "as much" not in more.group()
 
     def may_be_change(self) -> bool:
         """Tell whether a share that was added or lost may be told, not the multiple itself."""
@@ -221,7 +253,10 @@ def _is_object(sentence: Sentence, before: list, after: list) -> bool:
     return bool(after)
 
 
-def _direction(sentence: Sentence, before: list, after: list, context: Context) -> int:
+_AS_FAST = re.compile(r"\s*(?:as (?:fast|quick|quickly)|(?:the|that) (?:speed|pace))\b(?! (?:of|as))")
+
+
+def _direction(sentence: Sentence, before: list, after: list, context: Context, end: int) -> int:
     """Say whose speed is the multiple of the other's: +1 the drone's."""
     if sentence.language == "zh":
         if len(before) >= 2 and before[0].value != before[-1].value:
@@ -240,6 +275,8 @@ def _direction(sentence: Sentence, before: list, after: list, context: Context) 
         return 1 if before[0].value == "drone" else -1
     if after and not before and context.subject and context.subject != after[0].value:
         return 1 if context.subject == "drone" else -1
+    if before and not after and len({t.value for t in before}) == 1 and _AS_FAST.match(sentence.text, end):
+        return 1 if before[0].value == "drone" else -1
     return 0
 
 

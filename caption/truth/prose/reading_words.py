@@ -26,6 +26,9 @@ _APART = {"dist_up": 1, "dist_down": -1}
 _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between a word of change and its number
 
 
+_SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
+
+
 class WordReader(ClauseWords):
     """Reads the words of one clause."""
 
@@ -108,6 +111,8 @@ class WordReader(ClauseWords):
             and self._speaks_of_box()
         ):
             nearest = "height"
+        if value in ("up", "down") and self._is_of_size(token):
+            nearest = "box"
         if value in _PACE:
             return self._speed_names(token)
         same = [t for t in self.clause.of("trend") if t.start == token.start and t.end == token.end]
@@ -126,6 +131,11 @@ class WordReader(ClauseWords):
         if nearest == "height":
             return ("box_height",) if self._speaks_of_box() else ("altitude",)
         return TREND_SERIES.get(nearest, ())
+
+    def _is_of_size(self, token: Token) -> bool:
+        """ "the walker gets smaller", "她越来越小": of a person whose clause names no quantity, the size in the picture."""
+        is_size = _SIZE.search(self.text, token.start, token.end) is not None
+        return is_size and self.clause.has("who", "target") and not self.clause.has("quantity")
 
     def _nears_something(self, token: Token) -> bool:
         rest = self.text[token.end : self.clause.end].strip(" ，。,.")

@@ -10,47 +10,23 @@ from functools import cached_property
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import GOES_TO, OBJECTS, Context, names_of
-from caption.truth.prose.lexicon import Token
+from caption.truth.prose.cues import GOES_TO, Context, names_of, without_mean
 from caption.truth.prose.moments import Moments
 from caption.truth.prose.naming import OVER_OTHER
 from caption.truth.prose.numerals import Numeral
+from caption.truth.prose.owners import BEHIND, GOES_ON, LINK, Owners
 from caption.truth.prose.statements import NOW, Mode
 from caption.truth.prose.versus import pairs_of_speeds
 
-_LINK = {
-    "en": re.compile(r"(?:[\s:=]|\bat t\d|\(t\d\)|is|was|are|of|at|now|currently|today|reads|stands|sits|holds|remains|stays|keeps|just|only|near|a mere|merely|still|a|an|steady|unchanged|constant|to (?:the )?(?:target|walker|subject|pedestrian|person|him|her|them)\b|(?:about|roughly|around|approximately|some|almost|nearly|exactly|again|back|down|up|to|throughout|all along|on the ground|over ground|along the ground)\b)*"),
-    "zh": re.compile(r"(?:[\s:=]|t\d时?|为|是|仅|现|约|大约|只有|还有|仍有|目前|当前|现在|已|稳定|保持|维持|恒定|在|仍|有|达|到|回|升|降|至|了|一路|始终|一直|全程|均|都)*"),
-}  # fmt: skip
-_BEHIND = re.compile(r"\s*(?:of (?:the |our )?)?")  # "20.5 m of ground distance", "16 m flown"
 _OFF_TO = re.compile(
     r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er)|axis|cross ?hairs?|reticle|midline)\b"
 )
-_DOES = re.compile(
-    r"\s*(?:is )?(?:doing|does|do|did|makes?|making|moves? at|moving at|fl(?:y|ies|ying) at|goes at|going at|walks? at|walking at|on)?\s*(?:about |only |just |a mere |some |still )*"
-)
-_GENITIVE = re.compile(
-    r"(?:'s?|的)?\s*(?:own |current |present |ground |flight |forward |mean |average |walking |latest |recent |final |last |actual |momentary |当前|目前|平均|最新|末步)*"
-)
-# What a clause without a subject begins with when it goes on about the last one: "but is back to 3.2 m/s", "当前 2.3 米/秒".
-_GOES_ON = {
-    "en": re.compile(r"(?:[\s,=:]|and|but|yet|now|currently|still|is|has|at|about|roughly|only|just|back|down|up|to|doing|making|going|moving|flying|walking|slowed|dropped|fallen|risen|settled|presently|today|then|holding|steady|which|that|speed|a|mere|lazy|it|earlier|before|previously|once|at first|initially|having|been|as low as|as high as)*"),
-    "zh": re.compile(r"(?:[\s,=:]|却|现在?|当前|目前|如今|此刻|已|仍|还|只|有|仅|达|约|为|是|回|升|降|落|减|增|到|至|速度|步速|了|起初|先前|之前|此前|原先|一开始|开头|曾)*"),
-}  # fmt: skip
-_ITS_OWN = re.compile(r"\s*(?:for|by|of) (?:the |our )?|\s*\((?:the )?")  # "1.1 m/s for us", "1.2 m/s (walker)"
-_OWNS = re.compile(r"[^,;)]{0,12}#")  # "(the walker 1.3 m/s)" is about another number
-_SUBJECT = {
-    "en": re.compile(r"[\s,]*(?:(?:and|while|but|the|our|a|an|now|so|then|meanwhile|as|at t\d|given|because|since|that|with|whereas)\b[\s,]*)*"),
-    "zh": re.compile(r"[\s,]*(?:此刻|当前|目前|现在|而|且|但|同时|因为|由于|t\d\s*时?|最后一步|末步|,)*"),
-}  # fmt: skip
 _CLOSING = re.compile(
     r"\b(?:clos(?:ing|ure)|approach\w*|opening|relative|vertical\w*|climb\w*|sink\w*|descen\w*|surplus|margin|lead|deficit|wind)\b|接近|靠近|逼近|远离|相对|垂直|爬升|升降|下降|富余|风"
 )
+_LEVEL = re.compile(r"\b(?:on|over|along|across) the ground\b|地面|平地|水平")
+_BY = re.compile(r"\bby (?:about |roughly |some |only |just |almost |nearly |an? )*$")
 _MISSING = re.compile(r"\b(?:short of|remain\w*|left over|to go|missing)\b|还差|相差|差了|仍差")
-_OTHER = {
-    "en": re.compile(r"\b(?:than|against|versus|vs|over|past|round|around|behind|to|toward\w*|compared)\b"),
-    "zh": re.compile(r"比|较|于|与|和|对"),
-}
 # unit -> cue -> what it surely names; an owner's where it is by drone and target.
 _NAMED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
@@ -75,7 +51,7 @@ class Sureness:
         self.sentence, self.clause, self.context = sentence, clause, context
         self.text, self.language = sentence.text, sentence.language
         self.people = {t.value for t in clause.of("who", "drone", "target")}
-        self.moments = Moments(sentence, clause)
+        self.moments, self.owners = Moments(sentence, clause), Owners(sentence, clause, context)
 
     @cached_property
     def pairs(self) -> list[tuple[Numeral, Numeral]]:
@@ -86,6 +62,8 @@ class Sureness:
 
     def names(self, numeral: Numeral, told: tuple[str, ...] = ()) -> tuple[str, ...]:
         """Give the series of which a number surely is. told: those of the word for its change."""
+        if self.differs_by(numeral):
+            return ("speed_difference", "difference_mean")
         if self.is_in_group(numeral) or (numeral.unit == "mps" and self._may_differ(numeral)):
             return ()
         if _MISSING.search(self.text, self.clause.start, self.clause.end) or self._is_apart(numeral):
@@ -99,6 +77,14 @@ class Sureness:
             return ("height_over_target",)
         if numeral.unit == "mps" and not cues:
             return self._speeds(numeral)
+        if (
+            numeral.unit == "deg"
+            and not cues
+            and numeral.sign
+            and self.people == {"target"}
+            and self.context.cue == "heading"
+        ):
+            return names_of("heading", "deg", "target") if self.owners.opens(self.clause.of("who")[0]) else ()
         cues = cues or self._gone_on_about(numeral)
         named = _NAMED.get(numeral.unit, {})
         found = {named[cue] or self._owned(cue, numeral) for cue in cues}
@@ -106,7 +92,23 @@ class Sureness:
             found = {(*names, "picture") for names in found}  # "in a picture 1280 px wide"
         if len(found) > 1 and numeral.unit == "px":
             found.discard(("box_width", "box_height"))  # "box height", "框子高"
+        if found == {("distance", "slant")} and _LEVEL.search(self.text, self.clause.start, self.clause.end):
+            return ("distance",)  # "on the ground they were 17 m apart"
         return found.pop() if len(found) == 1 else () if cues else told
+
+    def differs_by(self, numeral: Numeral) -> bool:
+        """Tell whether a speed is that by which one of the two is faster now: "slower than the walker by 0.3 m/s"."""
+        if (
+            numeral.unit != "mps"
+            or self.language != "en"
+            or not _BY.search(self.text, self.clause.start, numeral.start)
+        ):
+            return False
+        at = self.sentence.clauses.index(self.clause)
+        near = self.sentence.clauses[max(0, at - 1) : at + 1]
+        people = {t.value for c in near for t in c.of("who", "drone", "target")}
+        is_now = all(t.value in ("now", "last_step") for c in near for t in c.of("time"))
+        return is_now and len(people) == 2 and any(c.has("compare", "faster", "slower") for c in near)
 
     def _is_apart(self, numeral: Numeral) -> bool:
         """Tell whether a number is of something else than the clauses before: worked out from them, or along another line."""
@@ -116,16 +118,16 @@ class Sureness:
     def _speeds(self, numeral: Numeral) -> tuple[str, ...]:
         if self._closes():
             return ()
-        owner, link = self.owner(numeral), _LINK[self.language]
+        owner, link = self.owners.owner(numeral), LINK[self.language]
         beside = any(
             t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)
             for t in self.clause.of("quantity", "speed")
         )
-        return names_of("speed", "mps", owner) if owner or beside else ()
+        return without_mean(names_of("speed", "mps", owner), self.sentence, self.clause) if owner or beside else ()
 
     def _gone_on_about(self, numeral: Numeral) -> set[str]:
         """Give the one quantity of the clauses before, where this one only goes on about it: "..., now 20.3 m"."""
-        if self.clause.has("quantity") or not _GOES_ON[self.language].fullmatch(
+        if self.clause.has("quantity") or not GOES_ON[self.language].fullmatch(
             self.text, self.clause.start, numeral.start
         ):
             return set()
@@ -142,16 +144,31 @@ class Sureness:
         row = [n for n in self.sentence.numerals if n.group == numeral.group]
         if numeral.unit == "px" and all(_SIDED.search(self.text, 0, n.start) for n in row):
             return False  # "偏右 12 像素、偏下 19 像素"
-        if len(row) > 1 and all(self._has_own_word(n) for n in row):
-            return False  # "12.0 m up, 9.5 m away"
+        if len(row) > 1 and (all(self._has_own_word(n) for n in row) or self._is_named_in(row, numeral)):
+            return False  # "12.0 m up, 9.5 m away", "斜距 28.0 米、水平距离 20.5 米"
         after = MORE_THAN.match(self.text, row[-1].end) if self.language == "en" and len(row) == 2 else None
         if after and after["than"]:
             return False  # "20.0 m, 1.2 m lower than at t3"
         return len(row) > 1 or any(numeral in pair for pair in self.pairs)
 
+    def _is_named_in(self, row: list[Numeral], numeral: Numeral) -> bool:
+        """Tell whether a quantity stands between a number of a row and the one before it."""
+        before = [n for n in row if n.end <= numeral.start]
+        link = LINK[self.language]
+        return bool(before) and any(
+            before[-1].end <= t.start and t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)
+            for t in self.clause.of("quantity")
+        )
+
     def _has_own_word(self, numeral: Numeral) -> bool:
-        return any(
-            numeral.start < t.start <= numeral.end + 1 and t.end > numeral.end for t in self.clause.of("quantity")
+        quantities = [t for c in self.sentence.clauses for t in c.of("quantity")]
+        behind = any(
+            numeral.start < t.start <= numeral.end + 1 + self.text.startswith("的", numeral.end) and t.end > numeral.end
+            for t in quantities
+        )
+        before = [t for t in self.clause.of("quantity") if t.end <= numeral.start]
+        return behind or (
+            len(before) == 1 and LINK[self.language].fullmatch(self.text, before[0].end, numeral.start) is not None
         )
 
     def _cues(self, numeral: Numeral) -> set[str]:
@@ -160,9 +177,10 @@ class Sureness:
         tokens = [t for c in self.sentence.clauses for t in c.of("quantity") if t.value in named]
         at = {t.start for t in tokens if t.value == "travelled" and GOES_TO.search(self.text[t.end : numeral.start])}
         tokens = [t for t in tokens if t.start not in at]  # "flew at 20 m"
-        link = _LINK[self.language]
+        link = LINK[self.language]
         near = [t for t in tokens if t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)]
-        near += [t for t in tokens if t.start >= numeral.end and _BEHIND.fullmatch(self.text, numeral.end, t.start)]
+        near += [t for t in tokens if t.start >= numeral.end and BEHIND.fullmatch(self.text, numeral.end, t.start)]
+        near += [t for t in tokens if numeral.start < t.start < numeral.end < t.end]  # "17 px high"
         if near:
             found = {t.value for t in near}
             from_start = self.clause.has("quantity", "displacement") and found <= {"slant", "distance"}
@@ -179,9 +197,12 @@ class Sureness:
     def _owned(self, cue: str, numeral: Numeral) -> tuple[str, ...]:
         if self.clause.has("quantity", "bearing") or (self.clause.has("side") and len(self.people) > 1):
             return ()
-        if cue == "yaw" and ("target" in self.people or (not self.people and self.context.subject == "target")):
+        if cue == "yaw" and (
+            "target" in self.people
+            or (not self.people and self.context.subject == "target" and not self.context.is_carried)
+        ):
             return ()  # "the nose points 2 degrees away from the walker"
-        owner = "drone" if cue == "yaw" else self.owner(numeral)
+        owner = "drone" if cue == "yaw" else self.owners.owner(numeral)
         if cue == "displacement" and not owner and not any(c.has("who", "target") for c in self.sentence.clauses):
             owner = "drone"
         if cue in ("turn", "heading", "yaw") and owner == "drone":
@@ -198,78 +219,10 @@ class Sureness:
             "quantity", "difference", "distance", "slant", "altitude", "over", "ratio"
         ) or self.clause.has("trend", "alt_up", "alt_down", "dist_up", "dist_down")
 
-    def owner(self, numeral: Numeral) -> str:
-        """Say whose a number is: of the one named right before it, or of its clause's or sentence's only subject."""
-        return self.right_beside(numeral) or self._subject(numeral)
-
-    def right_beside(self, numeral: Numeral) -> str:
-        tokens = [t for c in self.sentence.clauses for t in c.tokens]
-        people = [t for t in tokens if t.kind == "who" and t.value in ("drone", "target")]
-        link = _LINK[self.language]
-        quantities = [
-            t
-            for t in tokens
-            if t.kind == "quantity" and t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)
-        ]
-        for who in reversed(people):
-            if any(_GENITIVE.fullmatch(self.text, who.end, t.start) for t in quantities if who.end <= t.start):
-                return who.value
-            is_subject = who.end <= numeral.start and self.text[who.start : who.end] not in OBJECTS
-            if is_subject and _COMPARED.search(self.text, 0, who.start) and ":" in self.text[who.end : numeral.start]:
-                continue  # "faster than she was: 4.3 m/s"
-            if is_subject and any(
-                pattern.fullmatch(self.text, who.end, numeral.start) for pattern in (_GENITIVE, link, _DOES)
-            ):
-                return who.value
-            if (
-                who.start >= numeral.end
-                and _ITS_OWN.fullmatch(self.text, numeral.end, who.start)
-                and not _OWNS.match(self.text, who.end)
-            ):
-                return who.value
-        return ""
-
-    def _subject(self, numeral: Numeral) -> str:
-        named = self.clause.of("who", "drone", "target")
-        if len({t.value for t in named}) == 1 and named[0].end <= numeral.start:
-            if self.clause.has("compare", "faster", "slower"):
-                return ""  # "faster by 2 m/s"
-            is_first = self._opens(named[0])
-            return (
-                named[0].value
-                if is_first and not _OTHER[self.language].search(self.text, named[0].end, numeral.start)
-                else ""
-            )
-        if named or self.text[: self.clause.start].endswith(("(", ":")) or self.context.is_carried:
-            return ""
-        if self.context.cue not in ("", "speed") or self.context.told not in ("", "speed"):
-            return ""
-        return self.gone_on_by(numeral)
-
-    def gone_on_by(self, numeral: Numeral) -> str:
-        """Give the only one of whom the sentence speaks, where a clause only goes on about them: "but is only 3 m from its start"."""
-        quantity = next((t for t in self.clause.of("quantity", "displacement") if t.end <= numeral.start), None)
-        at = self.clause.start  # "..., 净位移却仅 1.7 米": it begins with the quantity
-        if quantity is not None and _GOES_ON[self.language].fullmatch(self.text, at, quantity.start):
-            at = quantity.end
-        goes_on = _GOES_ON[self.language].fullmatch(self.text, at, numeral.start)
-        is_alone = len(set(self.context.people)) == 1 and not self.context.is_carried
-        return self.context.subject if goes_on and is_alone else ""
-
-    def _opens(self, who: Token) -> bool:
-        """Tell whether a clause begins with somebody, times and conjunctions aside."""
-        at = self.clause.start
-        for time in self.clause.of("time"):
-            if (
-                at <= time.start
-                and time.end <= who.start
-                and _SUBJECT[self.language].fullmatch(self.text, at, time.start)
-            ):
-                at = time.end
-        return _SUBJECT[self.language].fullmatch(self.text, at, who.start) is not None
-
     def frames(self, numeral: Numeral) -> tuple[int, ...] | None:
         """Give the frame of which a number surely is, or the two between which it is a change."""
+        if self.differs_by(numeral):
+            return (NOW,)
         if self.is_in_group(numeral):
             return None
         mode = self.mode(numeral)
@@ -280,12 +233,19 @@ class Sureness:
         found = [self.moments.beside(n) for n in (first, last)]
         if found[0] is not None:
             return None if found[0] == found[1] else (found[0], NOW if found[1] is None else found[1])
-        spans = {t.value for t in self.clause.of("time")} - {"since", "last_s:0.5"}  # "from", "half a second"
+        told = self.clause
+        before = [c for c in self.sentence.clauses if c.end <= told.start]
+        if before and not told.has("time") and self.text[before[-1].end : told.start] == "(":
+            told = before[-1]  # "slowed in the last step (1.27 down to 1.09 m/s)"
+        times = [t for t in told.of("time") if self.text[t.start : t.end] != "up to"]
+        spans = {t.value for t in times} - {"since", "last_s:0.5"}  # "from", "half a second"
         return (-2, NOW) if spans == {"last_step"} and found[1] in (None, NOW) else None
 
     # --- value or change ---------------------------------------------------------------------------------------------
 
     def mode(self, numeral: Numeral) -> Mode:
+        if self.differs_by(numeral):
+            return "value"
         if numeral.unit == "deg" and not self.clause.has("quantity", "pitch", "depression", "bearing"):
             return "value" if numeral.sign and self.moments.beside(numeral) is not None else "either"
         if self._is_changed(numeral):
@@ -299,7 +259,7 @@ class Sureness:
             self.text, self.clause.start, numeral.start
         ):
             return "either"
-        if any(_LINK[self.language].fullmatch(self.text, t.end, numeral.start) for t in tokens):
+        if any(LINK[self.language].fullmatch(self.text, t.end, numeral.start) for t in tokens):
             return "value"
         return "either"
 
@@ -338,7 +298,6 @@ class Sureness:
 
 
 _SIDED = re.compile(r"[左右上下](?:方|侧|边|偏|移)?\s*$")
-_COMPARED = re.compile(r"\b(?:than|as) (?:the )?$|比$")
 _DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|[,;(]\s*that is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
 _ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")
 _REACHED = re.compile(r"[到至]了[约近]?\s*$")

@@ -15,6 +15,7 @@ _IMPLIED = {
     "depression": "deg", "bearing": "deg", "box": "px", "width": "px", "tall": "px", "centre": "px", "climb_rate": "mps",
     "yaw_rate": "dps", "travelled": "m", "displacement": "m", "target_heading": "deg",
 }  # fmt: skip
+_KNOWN = re.compile(r"[\s,，、才只有仅还在也是为约的了又、]*")
 _AT_PACE = re.compile(r"(?:\b(?:at|doing|does|do|did|making|makes|our|their|his|her)|\w's|只有|为|是|有) ?$")
 _PLACED = re.compile(r"\s*(?:below|above|under|beneath|left|right|down|up)\b")
 _IS_DONE = re.compile(r"已经|一共|飞出|走出|了")  # a way, not a pace
@@ -38,11 +39,18 @@ class Units:
             return numeral
         earlier = [n for n in self.sentence.numerals if n.start < numeral.start and n.unit in MEASURED]
         is_told = times_of(self.clause) or self.clause.has("time", "mean", "max", "min")
-        if earlier and is_told and not self.clause.has("quantity") and self._num_told() == 1:
+        if earlier and is_told and not self.clause.has("quantity") and self._is_only_unit(earlier[-1]):
             return replace(numeral, unit=earlier[-1].unit, factor=earlier[-1].factor)
         if earlier and earlier[-1].unit == "mps" and numeral.fraction is not None and self._is_pace(numeral):
             return replace(numeral, unit="mps", factor=earlier[-1].factor)
         near = [t for t in self.clause.of("quantity") if t.end <= numeral.start and t.value in _IMPLIED]
+        if (
+            not near
+            and numeral.fraction is not None
+            and not self.clause.has("quantity")
+            and (only := self._only_unit(numeral))
+        ):
+            return replace(numeral, unit=only[0], factor=only[1])
         if (
             not near
             or numeral.start - near[-1].end > 12
@@ -56,6 +64,22 @@ class Units:
         ):
             return numeral
         return replace(numeral, unit=_IMPLIED[near[-1].value])
+
+    def _only_unit(self, numeral: Numeral) -> tuple[str, float] | None:
+        """Give the unit of all other numbers of the sentence: "we pass 17.3 metres, and left 12.8 two seconds ago"."""
+        if self.sentence.language == "zh" and not _KNOWN.fullmatch(self._unread_before(numeral)):
+            return None
+        told = {(n.unit, n.factor) for n in self.sentence.numerals if n.unit not in ("", "s", "frames")}
+        is_later = any(n.unit and n.start < numeral.start for n in self.sentence.numerals)
+        return told.pop() if is_later and len(told) == 1 and min(told)[0] in MEASURED else None
+
+    def _unread_before(self, numeral: Numeral) -> str:
+        """Give what stands before a number in its clause, without the words of the lexicon."""
+        part, at = "", self.clause.start
+        for token in self.clause.tokens:
+            if at <= token.start and token.end <= numeral.start:
+                part, at = part + self.text[at : token.start], token.end
+        return part + self.text[at : numeral.start]
 
     def _is_pace(self, numeral: Numeral) -> bool:
         """ "and the walker crawls at 1.28", "而行人只有 0.62": a speed after one with its unit."""
@@ -77,5 +101,9 @@ class Units:
         )
         return earlier and not is_way  # "他只走 1.59 米" goes on about paces
 
-    def _num_told(self) -> int:
-        return sum(self.sentence.numerals[i].unit not in ("s", "frames") for i in self.clause.numerals)
+    def _is_only_unit(self, earlier: Numeral) -> bool:
+        """Tell whether a clause tells one number, or others of the same unit alone: "1.26 m/s at t1 and 1.19 now"."""
+        told = [
+            n for n in map(self.sentence.numerals.__getitem__, self.clause.numerals) if n.unit not in ("s", "frames")
+        ]
+        return len(told) == 1 or all(n.unit in ("", earlier.unit) for n in told)

@@ -15,17 +15,25 @@ _VERSUS = {
 }  # fmt: skip
 
 
+_AGAINST_ONE = re.compile(
+    r"\b(?:against|versus|vs\.?) (?:the )?(?:our|his|her|their|(?:walker|drone|target|pedestrian|person|subject|aircraft|uav)'s)\b"
+)
+
+
 def pairs_of_speeds(sentence: Sentence, clause: Clause) -> list[tuple[Numeral, Numeral]]:
     """Give the pairs of speeds that a sentence sets against each other: "1.2 against 1.4 m/s", "1.2 对 1.4 米/秒"."""
     numerals = sentence.numerals
     if sum(n.unit in ("mps", "") for n in numerals) < 2:
         return []
-    near = [c for c in sentence.clauses if c is clause or (c.end == clause.start - 1 and sentence.text[c.end] in "(:")]
+    near = [c for c in sentence.clauses if c is clause or (c.end == clause.start - 1 and sentence.text[c.end] in "(:,")]
     owners = {t.value for c in near for t in c.of("who", "drone", "target")}
     if any(t.value not in ("now", "last_step", "mean") for c in near for t in c.of("time")):
         return []
     groups = [n.group for n in numerals]
-    if len(owners) < 2 and not _BOTH.search(sentence.text, near[0].start, clause.end):
+    is_told = any(owners_behind(sentence, clause))
+    is_told = is_told or _BOTH.search(sentence.text, near[0].start, clause.end) is not None
+    is_told = is_told or _AGAINST_ONE.search(sentence.text, clause.start) is not None
+    if len(owners) < 2 and not is_told and not any(c.has("compare", "faster", "slower") for c in sentence.clauses):
         return []
     return [
         (a, b)

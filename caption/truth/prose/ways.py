@@ -66,10 +66,15 @@ class Ways:
             frames not in ((0,), (NOW,)) for clause in self.sentence.clauses for _, frames in times_of(clause)
         )
 
+    def _named(self) -> set[str]:
+        """Give those whom the sentence names, pronouns of the third person aside."""
+        people = [t for clause in self.sentence.clauses for t in clause.of("who", "drone", "target")]
+        return {t.value for t in people if self.text[t.start : t.end] not in _PRONOUNS or t.value == "drone"}
+
     def whole_way(self, numeral: Numeral, names: tuple[str, ...]) -> tuple[str, ...]:
         """Give whose way over the whole window a length is; () where it may be another length, or that of a part."""
         is_told = set(names) <= WAYS if names else _GOES[self.language].search(self.text[: numeral.start])
-        if not is_told or (numeral.unit, numeral.factor) != ("m", 1.0):
+        if not is_told or numeral.unit != "m":
             return ()
         if self.sureness.is_in_group(numeral) or not self._tells_all():
             return ()
@@ -78,8 +83,10 @@ class Ways:
         owners = {t.value for t in people}
         if _FLIES.search(self.text, self.clause.start, numeral.start):
             owners = {"drone"}
-        elif not people and (told := self.sureness.gone_on_by(numeral)):
+        elif not people and (told := self.sureness.owners.gone_on_by(numeral)):
             owners = {told}
+        elif not people and self._named() == {"drone"} and _PATH.search(self.text, self.clause.start, numeral.start):
+            owners = {"drone"}
         elif len(owners) > 1 or not named:
             owners = {"drone", "target"}  # of somebody who may not be known
         ways = ["target_travelled"] if "target" in owners else []
