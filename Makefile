@@ -13,7 +13,7 @@ FUZZ_INPUTS ?= 150000
 FUZZ_SEED ?= 1
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
-.PHONY: quickstart test fuzz lint format audit sbom lock clean
+.PHONY: quickstart test fuzz lint format site audit sbom lock clean
 
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
@@ -32,6 +32,9 @@ lint: $(VENV)/.installed-dev
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+site: $(TOOLS)/.installed  ## build/site: docs/ as pages to open; a link that leads nowhere is an error
+	$(TOOLS)/bin/mkdocs build --strict
 
 audit: $(TOOLS)/.installed $(VENV)/.installed-dev  ## Known weaknesses of what the container and the tests install; asks a public advisory service
 	$(TOOLS)/bin/pip-audit --disable-pip --require-hashes -r $(PINNED)
@@ -78,5 +81,5 @@ $(VENV)/.installed-dev: pyproject.toml tests/constraints.txt | $(VENV)/bin/pytho
 
 $(TOOLS)/.installed: | $(VENV)/bin/python
 	$(VENV)/bin/python -m venv $(TOOLS)
-	$(TOOLS)/bin/python -m pip install -q --upgrade pip pip-audit pip-tools cyclonedx-bom
+	$(TOOLS)/bin/python -m pip install -q --upgrade pip pip-audit pip-tools cyclonedx-bom mkdocs
 	touch $@

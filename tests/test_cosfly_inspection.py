@@ -719,3 +719,22 @@ def test_write_flight_is_used_so_round_trips_hold(workplace):
     folder = first_flight(workplace)
     write_flight(folder, read_flight(folder))
     assert inspect(workplace, CFG.model_copy(update={"check_checksums": False})).funnel.flights.accepted == 4
+
+
+def test_progress_is_told_by_frames(tmp_path, monkeypatch):
+    bars = []
+
+    @contextlib.contextmanager
+    def bar(label, total, done=0):
+        bars.append([label, total, done])
+
+        def advance(count, told=""):
+            bars[-1][2] += count
+            assert bars[-1][2] <= total
+
+        yield advance
+
+    monkeypatch.setattr("cosfly.runner.progress_bar", bar)
+    tree = make_playback_tree(tmp_path / "tree", 1, 7)
+    run(InspectConfig(), None, None, tree, tmp_path / "inspect")
+    assert bars == [["inspect: frames", 14, 14]]

@@ -2,13 +2,18 @@
 
 import re
 import shlex
+import subprocess
+import sys
+import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
+import yaml
 
+import cosfly
 from cosfly.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -141,3 +146,66 @@ def test_every_file_of_the_files_page_is_written_by_code():
     }  # named by a loop; a user's own
     assert len(names) > 40
     assert sorted(name for name in names - elsewhere if f'{name}"' not in CODE and f"{name}'" not in CODE) == []
+
+
+# --- the site, and versions -------------------------------------------------------------------------------------------
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip("mkdocs")
+    words = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "-q",
+        "-f",
+        str(ROOT / "mkdocs.yml"),
+        "-d",
+        str(tmp_path / "site"),
+    ]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert {f"{page.stem}.html" for page in (ROOT / "docs").glob("*.md")} <= {
+        p.name for p in (tmp_path / "site").iterdir()
+    }
+
+
+def test_every_page_stands_in_the_site_s_list():
+    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
+    assert listed == {page.name for page in (ROOT / "docs").glob("*.md")}
+
+
+HEADING = re.compile(r"^## (\d+\.\d+\.\d+) \((unreleased|\d{4}-\d\d-\d\d)\)$", re.MULTILINE)
+
+
+def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    found = HEADING.findall(changelog)
+    assert len(found) == len(re.findall(r"^## ", changelog, re.MULTILINE))  # no heading of another form
+    numbers = [tuple(map(int, number.split("."))) for number, _ in found]
+    assert numbers == sorted(set(numbers), reverse=True)
+    assert all(day != "unreleased" for _, day in found[1:])
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"]
+    assert found[0][0] == cosfly.__version__ == pyproject == citation
+    tags = subprocess.run(
+        ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.split()
+    assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
+
+
+def test_templates_of_issues_are_forms():
+    folder = ROOT / ".github/ISSUE_TEMPLATE"
+    forms = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path in folder.glob("*.yml")}
+    assert forms.pop("config").keys() == {"blank_issues_enabled"}
+    assert len(forms) == 3
+    for form in forms.values():
+        assert form.keys() == {"name", "description", "body"}
+        ids = [field["id"] for field in form["body"]]
+        assert len(ids) == len(set(ids))
+        assert all(
+            field["type"] in ("input", "textarea", "checkboxes", "dropdown", "markdown") for field in form["body"]
+        )

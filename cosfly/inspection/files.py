@@ -36,7 +36,6 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
             "note", "not_in_this_tree", f"{FRAMES_DIR}/*/{name}", "no such file", "one a frame, in cosfly's trees"
         )
     for i in range(len(flight)):
-        advance()
         problems_before, meta = len(report.issues), None
         for name in names:
             path, where = flight.frame_folder(i) / name, f"{frame_name(i)}/{name}"

@@ -17,6 +17,7 @@ from cosfly.inspection.view import FlightView
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
+from cosfly.products.frames import FRAMES_DIR
 from cosfly.products.inspection import (
     FlightFunnel,
     FlightInspection,
@@ -79,13 +80,20 @@ def run(
         return product
     planned = None if traces is None else read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_flights(data)]
-    items, arguments = [Item(name, name) for name in names], (cfg, simplified, traces, data)
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect")
+    every = cfg.check_pixels == "all"  # then a frame is a step
+    items = [Item(name, name, num_steps=_num_frames(data / name) if every else None) for name in names]
+    arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: flights"
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
     write_report(out / "report.html", inspection, views, cfg.page_mb)
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     return product
+
+
+def _num_frames(folder: Path) -> int:
+    """About how many frames a flight has, for the progress bar: its folders are counted, nothing is read."""
+    return max(1, sum(1 for _ in (folder / FRAMES_DIR).glob("frame_*")))
 
 
 def assemble(

@@ -52,7 +52,9 @@ def run(
     format = format_of(cfg.format)
     units = format.plan(release, scan(release), cfg)
     items = [Item(unit.name, unit, unit.frames) for unit in units]
-    finished = run_items(stage, items, make_worker, (release, parts, cfg), workers=workers, watch=watch, label="export")
+    finished = run_items(
+        stage, items, make_worker, (release, parts, cfg), workers=workers, watch=watch, label="export: frames"
+    )
     if finished.tally.failed:  # nothing half is published
         raise InputError(
             "parts of the release could not be exported", where=out / "failures.jsonl", got=str(finished.tally),

@@ -98,7 +98,7 @@ def _write_parts(
         row_group_bytes=cfg.row_group_bytes,
     )
     items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
-    finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release")
+    finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release: frames")
     findings = Findings(stage)
     findings.failures += [record for record in finished.records if isinstance(record, Failed)]
     findings.check()
