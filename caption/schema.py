@@ -268,6 +268,11 @@ class CaptionConfig(Config):
         None,
         description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export DIR` writes one to begin with",
     )
+    actions: Path | None = Field(
+        None,
+        description="file with a closed set of actions of yours in the place of the one that ships: tokens, names in both languages, what the "
+        "motion implies and contradicts; `cosfly caption actions --export FILE` writes one to begin with",
+    )
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
@@ -345,4 +350,5 @@ class CaptionConfig(Config):
 
     def recorded(self) -> dict[str, Any]:
         """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their digests stand beside."""
-        return super().recorded() | {"teacher": self.teacher_kind, "prompts": "own" if self.prompts else None}
+        own = {name: "own" if getattr(self, name) else None for name in ("prompts", "actions")}
+        return super().recorded() | {"teacher": self.teacher_kind} | own

@@ -23,8 +23,8 @@ from typing import Any
 
 from cosfly.console import set_levels
 from cosfly.errors import CosflyError
+from cosfly.in_place import put_all
 from cosfly.items import Item, Work, attempt, counted_steps
-from cosfly.own import put_in_place
 from cosfly.reading.limits import Limits, use_limits
 from cosfly.stage_folder import ItemRecord
 
@@ -63,7 +63,7 @@ class Manner:
 @dataclass(frozen=True)
 class Start:
     """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what stands in the place of
-    files that ship (cosfly/own.py)."""
+    files that ship (cosfly/in_place.py)."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
@@ -95,7 +95,7 @@ def work_through(connection: Connection, manner: Manner) -> None:
     try:
         start: Start | None = _received(connection)
         if start:
-            put_in_place(start.own_files)
+            put_all(start.own_files)
         work = start.make_worker(*start.worker_args) if start else None
         while work and (item := _received(connection)):
             voice.begin(item)

@@ -21,8 +21,8 @@ from multiprocessing.connection import Connection
 from typing import Any, Literal
 
 from cosfly.errors import EnvironmentMissing
+from cosfly.in_place import everything
 from cosfly.items import Item, Work
-from cosfly.own import all_in_place
 from cosfly.reading.limits import limits
 from cosfly.stage_events import EventLog, cpu_seconds
 from cosfly.stage_folder import Failed, ItemRecord
@@ -182,7 +182,7 @@ class WorkerPool:
             process.start()
         there.close()
         worker = self._workers[place] = _Worker(place, process, queue.SimpleQueue())
-        start = Start(self.make_worker, self.worker_args, all_in_place())
+        start = Start(self.make_worker, self.worker_args, everything())
         threading.Thread(target=_attend, args=(worker, start, here, self._messages), daemon=True).start()
         self.events.tell("restarted" if place in self._lost else "worker_started", worker=place, pid=process.pid)
         self._lost.discard(place)

@@ -8,17 +8,21 @@ README.md                                  for `datasets.load_dataset`
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, ParamSpec, TypeVar, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
+from cosfly import in_place
 from cosfly.errors import InputError
 from cosfly.frame_views import VIEW_FILES, Pictures, View
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.provenance import fingerprint, fingerprints
@@ -98,7 +102,8 @@ class SourceTree(BaseModel):
 
 
 class TrainingSet(BaseModel):
-    """`training_set.json`. samples: of each split; systems: the system prompts, which samples name by their place."""
+    """`training_set.json`. samples: of each split; systems: the system prompts, which samples name by their place; actions: the closed set of
+    the answers' decisions, null for the one that ships."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -106,6 +111,7 @@ class TrainingSet(BaseModel):
     trees: list[SourceTree]
     samples: dict[Split, int]
     systems: list[str]
+    actions: ActionSet | None = None
 
 
 def read_training_set(dataset: Path) -> TrainingSet:
@@ -121,6 +127,23 @@ def read_training_set(dataset: Path) -> TrainingSet:
         got = f"no {RECORD}" if older is None else OLDER.format(split=older)
         raise InputError(what, where=dataset, got=got, expected=f"{RECORD} of version {VERSION}", fix=PREPARE)
     return read_model(path, TrainingSet, schema=RECORD_SCHEMA, version=VERSION, what="training set", tree=dataset)
+
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def in_its_actions(step: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Have a step, which takes a training set as `dataset`, work with the set of actions that this was made with."""
+    arguments = inspect.signature(step)
+
+    @functools.wraps(step)
+    def in_actions(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+        record = read_training_set(arguments.bind(*args, **kwargs).arguments["dataset"])
+        with in_place.put(actions=record.actions):
+            return step(*args, **kwargs)
+
+    return in_actions
 
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
@@ -287,7 +310,13 @@ class TrainingSetWriter:
     def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
         """Write the record and the page, after the block ended and the splits stand."""
         samples = self._splits.counts
-        record = TrainingSet(split_by=split_by, trees=list(trees), samples=samples, systems=list(self._systems))
+        record = TrainingSet(
+            split_by=split_by,
+            trees=list(trees),
+            samples=samples,
+            systems=list(self._systems),
+            actions=in_place.given("actions"),
+        )
         write_model(self._out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
         write_bytes(self._out / PAGE, _page(record))
         self.files = [*self._splits.paths, self._out / RECORD, self._out / PAGE]

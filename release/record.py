@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosfly.products.actions import ActionSet, shipped_actions
 from cosfly.products.coverage import Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
@@ -265,7 +266,8 @@ class PartOf(Strict):
 
 
 class ReleaseRecord(Strict):
-    """The whole file. part_of: null for what `release build` made, whole as it is."""
+    """The whole file. actions: the closed set of decisions, null for the one that ships. prompts: by run the questions (`user_en`,
+    `user_zh`) of captions that were asked with prompts of their own. part_of: null for what `release build` made, whole as it is."""
 
     name: str
     licence: str
@@ -276,6 +278,8 @@ class ReleaseRecord(Strict):
     frame_selection: str
     depth: DepthCoding | None  # null: without depth
     coordinates: dict[str, Any]
+    actions: ActionSet | None = None
+    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     splits: Splits
     numbers: Numbers
     history: History
@@ -284,6 +288,11 @@ class ReleaseRecord(Strict):
     content_digest: str
     shards: list[Shard]
     part_of: PartOf | None = None
+
+    @property
+    def closed_set(self) -> tuple[str, ...]:
+        """The decisions that its captions may have."""
+        return (self.actions or shipped_actions()).tokens
 
 
 DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards

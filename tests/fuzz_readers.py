@@ -23,12 +23,13 @@ from caption.run.asking import read_quarantine
 from caption.run.flights import named_flights
 from caption.schema import CaptionConfig, EvidenceConfig
 from caption.teachers.foreign import read_foreign, read_student
+from caption.teachers.prompt_files import export_prompts, own_prompts
 from caption.truth.facts import Facts
 from caption.truth.gold import GOLD_PROSE, read_gold_prose
 from caption.truth.prose.judging import judge_sentences
 from caption.truth.references import parse_reference
 from caption.writing.slots import Slots
-from cosfly import provenance
+from cosfly import in_place, provenance
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
 from cosfly.chat.contract import Request
 from cosfly.chat.protocol import (
@@ -56,6 +57,7 @@ from cosfly.planners import compare
 from cosfly.planners.compare_tables import text_tables
 from cosfly.png.read import parse_png
 from cosfly.products import review
+from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
@@ -390,6 +392,10 @@ def _merged(root: Path, scratch: Path) -> None:
 
 
 def _records(root: Path) -> None:
+    shutil.copy(ACTIONS_FILE, root / "actions.yaml")
+    with in_place.put(actions=shipped_actions()):
+        write_own_actions(root)
+    export_prompts(root / "prompts")
     (root / "sky.yaml").write_text(
         "presets:\n  sleet: {cloudiness: 90, precipitation: 40.5, fog_density: 20, fog_distance: 25}\n"
         "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 12.5}\n"
@@ -754,6 +760,9 @@ READERS: dict[str, Reader] = {
     "summary": _one("summary.json", read_json),
     "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
     "presets of weather": _one("sky.yaml", lambda path: read_pools(build(RenderConfig, {"weather_mode": "random_per_path", "weather_pool": str(path)}, "x"))),
+    "actions": _one("actions.yaml", read_actions),
+    "actions beside captions": _one("actions.json", lambda path: actions_beside(path)),
+    "prompts": Reader(("prompts/user_en.txt", "prompts/system_zh.txt"), lambda root, _: own_prompts(root / "prompts")),
     "settings": _one("run.yaml", lambda path: resolve(path, None)),
     "--set": Reader(("set.txt",), lambda root, _: _setting(root, "set.txt")),
     "--set, a URL": Reader(("set_url.txt",), lambda root, _: _setting(root, "set_url.txt")),

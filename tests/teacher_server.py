@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cosfly.journal import Journal
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 
 MODEL = "test-teacher"
 ENGLISH = {
@@ -153,7 +153,7 @@ def is_mirror(body: dict) -> bool:
 
 
 def _decision_by_seed(body: dict) -> str:
-    return ACTIONS[body.get("seed", 0) % len(ACTIONS)]
+    return action_tokens()[body.get("seed", 0) % len(action_tokens())]
 
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
@@ -166,7 +166,7 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
             reasons = reasons.replace("。", "，距离为 77.7 米。")
         return {**CHINESE, "reasoning_trace": reasons, "flight_decision": decision}
     schema = body.get("response_format", {}).get("json_schema", {}).get("schema", {})
-    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", ACTIONS)
+    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", action_tokens())
     decision = server.decision(body)
     if len(allowed) == 1 and fault != "schema_ignored":
         decision = allowed[0]

@@ -11,13 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import BY_TOKEN, TABLE, is_contradicted, label_of, measure, verdict_of
-from cosfly.products.captions import ACTIONS
+from caption.truth.actions import is_contradicted, label_of, measure, table_of, verdict_of
+from cosfly.products.actions import action_tokens
 
 CFG = LabelConfig()
 
 MIRRORED = {
-    token: token.replace("left", "right") if "left" in token else token.replace("right", "left") for token in ACTIONS
+    token: token.replace("left", "right") if "left" in token else token.replace("right", "left")
+    for token in action_tokens()
 }
 
 
@@ -97,7 +98,7 @@ def test_an_order_is_the_label_whatever_is_flown(order, motion):
 
 
 def test_every_action_that_geometry_can_imply_has_an_example():
-    assert set(ACTIONS) - {label for _, label in LABELS} == {"break_off", "return_to_home"}
+    assert set(action_tokens()) - {label for _, label in LABELS} == {"break_off", "return_to_home"}
 
 
 STEADY = {"forward": 3.0, "target_step": (0.6, 0.0)}  # straight and level behind a walker
@@ -141,7 +142,7 @@ def test_contradiction_of_each_action(decision, motion):
 
 
 def test_all_actions_are_in_the_contradiction_table():
-    assert {decision for decision, _ in HARD} == set(ACTIONS)
+    assert {decision for decision, _ in HARD} == set(action_tokens())
 
 
 def test_soft_and_abstain_and_consistent():
@@ -190,7 +191,9 @@ def test_unknown_target_leaves_the_other_labels_alone():
 
 
 def test_the_table_holds_every_action_of_the_paper_once():
-    assert sorted(action.token for group in TABLE for action in group) == sorted(ACTIONS)
+    assert sorted(token for group in table_of(CFG).implied for token, _ in group) == sorted(action_tokens())
+    assert set(table_of(CFG).shown) == set(action_tokens())
+    assert len(action_tokens()) == 17
 
 
 # --- properties -------------------------------------------------------------------------------------------------------
@@ -216,7 +219,7 @@ def futures(draw) -> FutureMotion:
 
 def judged(motion) -> tuple[str | None, dict[str, str]]:
     label = label_of(motion, CFG)
-    return label, {token: verdict_of(token, motion, CFG, label) for token in ACTIONS}
+    return label, {token: verdict_of(token, motion, CFG, label) for token in action_tokens()}
 
 
 def is_near_a_threshold(motion) -> bool:
@@ -227,9 +230,9 @@ def is_near_a_threshold(motion) -> bool:
     numbers += [abs(motion.left_m) - abs(motion.forward_m)]
     if any(abs(abs(number) - limit) < 1e-6 for number in numbers for limit in limits if limit or number):
         return True
-    for group in TABLE:
-        shown = [action.shown(motion, CFG) for action in group]
-        implied = [action.implied(motion, CFG) for action in group]
+    for group in table_of(CFG).implied:
+        shown = [table_of(CFG).shown[token][0](motion) for token, _ in group]
+        implied = [size(motion) for _, size in group]
         ranks = sorted(size for size in implied if size >= 0.99)
         if any(
             abs(size - limit) < 1e-6
@@ -277,7 +280,7 @@ def test_what_is_implied_is_never_contradicted(drawn):
     label = label_of(motion, CFG)
     if label is not None:
         assert not is_contradicted(label, motion, CFG)
-        assert BY_TOKEN[label].shown(motion, CFG) >= 1.0
+        assert table_of(CFG).shown[label][0](motion) >= 1.0
 
 
 @given(futures())

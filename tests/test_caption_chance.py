@@ -15,7 +15,8 @@ from caption.teachers.teacher import RuleTeacher
 from caption.truth.actions import measure, verdict_of
 from caption.window_loop import caption_window
 from caption.windows import cut_windows
-from cosfly.products.captions import ACTIONS, Caption
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Caption
 from specimens import make_flight
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
@@ -53,7 +54,7 @@ def test_expected_shares_are_those_of_many_guesses(captions):
     expected = counted([caption for caption, _ in captions]).report()
     rng = np.random.default_rng(0)
     verdicts = [
-        verdict_of(ACTIONS[rng.integers(len(ACTIONS))], motion, CFG.label, caption.label)
+        verdict_of(action_tokens()[rng.integers(len(action_tokens()))], motion, CFG.label, caption.label)
         for caption, motion in captions
         for _ in range(200)
     ]
@@ -81,7 +82,9 @@ def test_a_teacher_that_looks_gets_no_warning(captions):
 
 def test_a_teacher_that_guesses_is_told_apart(captions):
     rng = np.random.default_rng(1)
-    guessed = [decided(caption, motion, ACTIONS[rng.integers(len(ACTIONS))]) for caption, motion in captions]
+    guessed = [
+        decided(caption, motion, action_tokens()[rng.integers(len(action_tokens()))]) for caption, motion in captions
+    ]
     assert any("no better than chance" in warning for warning in counted(guessed).report().warnings)
 
 

@@ -15,7 +15,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, prompt_format, read_prompt
 from caption.teachers.prompts import system_prompt
-from cosfly import own
+from cosfly import in_place
 from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.products.captions import OWN_PROMPTS, read_captions
@@ -117,7 +117,7 @@ def test_captions_are_asked_with_them_and_keep_them(tree, mine, tmp_path):
     }
     listed = {entry["path"] for entry in json.loads((out / "manifest.json").read_text())["outputs"]}
     assert {f"{OWN_PROMPTS}/{p.name}" for p in mine.iterdir()} <= listed
-    assert own.in_place("prompts") is None  # what ships is in use again
+    assert in_place.given("prompts") is None  # what ships is in use again
     with pytest.raises(ResumeError, match="the prompts changed"):
         run(CaptionConfig(), tree, out)
     edit(mine / "hint_en.txt", "Hint:", "A hint:")
@@ -167,7 +167,7 @@ def test_training_sets_and_students_follow(tree, mine, tmp_path):
 
 def test_what_is_kept_is_forgotten_when_another_file_takes_its_place():
     before = system_prompt("en"), prompt_format("user_en")
-    with own.put(prompts={"system_en": "# version: 9\nBe $actions\n", "user_en": "# version: 9\n$speed%\n"}):
+    with in_place.put(prompts={"system_en": "# version: 9\nBe $actions\n", "user_en": "# version: 9\n$speed%\n"}):
         assert system_prompt("en").startswith("Be track_straight, ")
         assert prompt_format("user_en") == "%(speed)s%%"
         assert read_prompt("hint_en").template  # what is not given is what ships

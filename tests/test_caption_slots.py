@@ -28,7 +28,8 @@ from caption.writing.filling import Filler
 from caption.writing.slots import Slots, fact_table
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.errors import NothingKept
-from cosfly.products.captions import ACTIONS, Coc, Language, Parsed, read_captions
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Coc, Language, Parsed, read_captions
 from specimens import make_flight, make_playback_tree
 
 FACTS = Facts(
@@ -533,7 +534,7 @@ def test_the_rule_teacher_writes_slots(writing):
 
 
 def test_actions_named_in_words_are_those_of_the_answer():
-    for action in ACTIONS:
+    for action in action_tokens():
         sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5)
         assert isinstance(sentence, Sentence)
         assert isinstance(Filler(FACTS, action, "en").fill(sentence), str)

@@ -16,7 +16,8 @@ from caption.truth.glossary import load_glossary
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.judging import check_evidence
 from caption.windows import cut_windows
-from cosfly.products.captions import ACTIONS, Coc
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Coc
 from specimens import make_flight
 
 CFG = EvidenceConfig()
@@ -233,7 +234,7 @@ def test_rule_captions_are_one_record_in_two_languages():
 # --- the rule teacher ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("decision", ACTIONS)
+@pytest.mark.parametrize("decision", action_tokens())
 def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)

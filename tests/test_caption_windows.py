@@ -29,8 +29,9 @@ from caption.teachers.prompts import make_question, question_messages, system_pr
 from caption.truth.actions import label_of, measure
 from caption.truth.facts import measure_facts
 from caption.windows import current_frames, cut_future, cut_windows
+from cosfly.products.actions import action_tokens
 from cosfly.products.boxes import MapHeader, make_box_map
-from cosfly.products.captions import ACTIONS, answer_schema, read_captions
+from cosfly.products.captions import answer_schema, read_captions
 from cosfly.products.playback import Flight, find_flights, read_flight, read_twin, write_flight
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
@@ -209,9 +210,9 @@ def test_the_box_is_that_of_what_is_seen(tree):
 def test_prompts_name_the_closed_set_and_the_shape():
     for language in ("en", "zh"):
         text = system_prompt(language)
-        assert all(token in text for token in ACTIONS)
+        assert all(token in text for token in action_tokens())
         assert all(name in text for name in ("critical_components", "reasoning_trace", "flight_decision"))
-    assert answer_schema()["properties"]["flight_decision"]["enum"] == list(ACTIONS)
+    assert answer_schema()["properties"]["flight_decision"]["enum"] == list(action_tokens())
     assert answer_schema("hover", "zh")["properties"]["flight_decision"]["enum"] == ["hover"]
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 from distill.prepare.choice import Ranks, cost_of, limit_to
 
 
@@ -26,7 +26,7 @@ def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tu
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(ACTIONS), st.integers(1, 60), min_size=1),
+    counts=st.dictionaries(st.sampled_from(action_tokens()), st.integers(1, 60), min_size=1),
     ratio=st.sampled_from([0.01, 0.3, 1.0, 1.7, 20.0]),
     seed=st.integers(0, 3),
 )
@@ -75,7 +75,7 @@ def test_the_cost_by_hand():
     assert (straight.windows, straight.windows_left_out, straight.samples_left_out) == (8, 6, 12)
     assert (straight.share.before, straight.share.after) == (0.6667, 0.3333)
     assert (hover.windows_left_out, hover.samples_left_out, hover.share.before) == (0, 0, 0.1667)
-    assert set(cost.absent) == set(ACTIONS) - {"track_straight", "hover", "slow_down"}
+    assert set(cost.absent) == set(action_tokens()) - {"track_straight", "hover", "slow_down"}
     assert "track_straight 8 -> 2 (66.7% -> 33.3%); whole: hover 2, slow_down 2; absent: yaw_left_to_follow" in str(
         cost
     )
@@ -85,7 +85,7 @@ def test_the_cost_by_hand():
 
 TABLES = st.dictionaries(
     st.sampled_from([f"flight_{i}" for i in range(12)]),
-    st.dictionaries(st.sampled_from(ACTIONS[:6]), st.integers(1, 30), min_size=1),
+    st.dictionaries(st.sampled_from(action_tokens()[:6]), st.integers(1, 30), min_size=1),
     min_size=1,
 )
 

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 from release.card.numbers import COLUMNS, Counted, Sum, count_shard, spread_of
 from release.card.render import render_card
 from release.card.snippets import first_split
@@ -200,7 +200,7 @@ def test_the_card_says_whom_it_is_not_for_and_whom_to_cite(record):
 
 def test_limits_are_those_of_the_numbers(record):
     card = render_card(record)
-    missing = [name for name in ACTIONS if name not in record.numbers.captions.decision]
+    missing = [name for name in action_tokens() if name not in record.numbers.captions.decision]
     line = next(line for line in card.splitlines() if line.startswith("- Decisions that no caption has"))
     assert all(f"`{name}`" in line for name in missing)
     assert "rule teacher" in card

@@ -12,7 +12,8 @@ from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.products.captions import ACTIONS, Caption, Language
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Caption, Language
 from cosfly.store import sha256_bytes
 
 FEWEST_WINDOWS = 30  # below, a share says nothing
@@ -75,7 +76,7 @@ class ChanceCounts:
         self.verdicts[str(repair.first_verdict if repair else caption.verdict)] += 1
         self.hard.update(contradicted)
         if caption.label is None:
-            self.open.update(set(ACTIONS) - set(contradicted))
+            self.open.update(set(action_tokens()) - set(contradicted))
         else:
             self.labels[caption.label] += 1
         for language, texts in self.texts.items():
@@ -91,13 +92,13 @@ class ChanceCounts:
         if n == 0:
             return None
         first = Shares(**{name.lower(): self.verdicts[name] / n for name in _VERDICTS})
-        best = max(ACTIONS, key=lambda action: self.labels[action])
-        shuffled = self._expected((action, self.decisions[action] / n) for action in ACTIONS)
+        best = max(action_tokens(), key=lambda action: self.labels[action])
+        shuffled = self._expected((action, self.decisions[action] / n) for action in action_tokens())
         constant = self._expected([(best, 1.0)])
         return ChanceReport(
             windows=n,
             first_answers=first,
-            random_decisions=self._expected((action, 1.0 / len(ACTIONS)) for action in ACTIONS),
+            random_decisions=self._expected((action, 1.0 / len(action_tokens())) for action in action_tokens()),
             shuffled_decisions=shuffled,
             one_decision=constant,
             decision=best,

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from caption.run.chance import ChanceCounts, ChanceReport
 from cosfly.chat.contract import Usage
-from cosfly.products.captions import ACTIONS, Caption, TeacherRecord
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Caption, TeacherRecord
 from cosfly.stage_folder import Tally
 from cosfly.store import sha256_bytes
 
@@ -217,7 +218,7 @@ class Ledger:
         return tally
 
     def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
-        order = {token: i for i, token in enumerate((*ACTIONS, "none"))}
+        order = {token: i for i, token in enumerate((*action_tokens(), "none"))}
         confusion = _nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]]))
         return CaptionReport(
             teacher=self.teacher,

@@ -9,7 +9,8 @@ from caption.run.ledger import CaptionReport, Histogram
 from cosfly.chat.budget import BudgetConfig
 from cosfly.escaping import for_html, html_page
 from cosfly.frame_views import thumbnail
-from cosfly.products.captions import ACTIONS, Caption, Language
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import flight_of
 from cosfly.products.sentences import sentences_of
@@ -160,8 +161,8 @@ def _sentences(report: CaptionReport) -> str:
 
 
 def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
-    labels = [name for name in (*ACTIONS, "none") if name in confusion]
-    decisions = [name for name in ACTIONS if any(name in row for row in confusion.values())]
+    labels = [name for name in (*action_tokens(), "none") if name in confusion]
+    decisions = [name for name in action_tokens() if any(name in row for row in confusion.values())]
     if not labels:
         return "No answer."
     head = "".join(f'<th class="column"><span>{_words(name)}</span></th>' for name in decisions)

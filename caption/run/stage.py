@@ -21,7 +21,6 @@ from caption.schema import CaptionConfig
 from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
-from caption.truth import actions
 from caption.truth.glossary import GLOSSARY_FILE
 from caption.window_loop import caption_window
 from cosfly.chat.answers import refuse_one_file
@@ -37,8 +36,8 @@ from cosfly.student_chat import student_files
 log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
-# One folder never holds captions of two glossaries or tables of actions, nor of two prompts (own_files.py).
-PACKAGE_FILES = {"glossary": GLOSSARY_FILE, "action table": Path(actions.__file__)}
+# One folder never holds captions of two glossaries, nor of two prompts or sets of actions (own_files.py).
+PACKAGE_FILES = {"glossary": GLOSSARY_FILE}
 
 
 def run(

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from string import Template
 
-from cosfly import own
+from cosfly import in_place
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.files import read_text
 from cosfly.store import refuse_links, write_bytes
@@ -21,7 +21,7 @@ PROMPTS = Path(__file__).with_name("prompts")
 SUFFIX, VERSION = ".txt", "# version: "
 
 
-@own.kept()
+@in_place.kept()
 def shipped_prompts() -> dict[str, str]:
     """Give the files that ship, name without suffix -> text with its version line."""
     return {path.stem: read_text(path) for path in sorted(PROMPTS.glob(f"*{SUFFIX}"))}
@@ -92,15 +92,15 @@ def slots_of(text: str) -> list[str]:
     return Template(text).get_identifiers()
 
 
-@own.kept()
+@in_place.kept()
 def read_prompt(name: str) -> Template:
     """Give a prompt in use, without its version line."""
-    texts: Mapping[str, str] = own.in_place("prompts") or {}
+    texts: Mapping[str, str] = in_place.given("prompts") or {}
     text = texts[name] if name in texts else shipped_prompts()[name]
     return Template(text.partition("\n")[2].rstrip("\n"))
 
 
-@own.kept()
+@in_place.kept()
 def prompt_format(name: str) -> str:
     """Give a prompt in use as a format for `%`, which is ten times faster than a template."""
     template, pieces, end = read_prompt(name).template, list[str](), 0
@@ -118,7 +118,7 @@ def export_prompts(folder: Path) -> list[Path]:
     Raises:
         ConfigError: a file of these names is there.
     """
-    texts = own.in_place("prompts") or shipped_prompts()
+    texts = in_place.given("prompts") or shipped_prompts()
     folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
     there = [name for name in texts if (folder / f"{name}{SUFFIX}").exists()]

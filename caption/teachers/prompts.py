@@ -14,9 +14,10 @@ from caption.teachers.prompt_files import prompt_format, read_prompt
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.writing.contract import Draft, way_of
-from cosfly import own
+from cosfly import in_place
 from cosfly.frame_views import Pictures, frame_label
-from cosfly.products.captions import ACTIONS, PICTURES_MARK, Language, Prompt, Writing
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
 from cosfly.store import dump_json, sha256_bytes
 
@@ -63,15 +64,15 @@ class Question:
         return {language: prompt.told(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
 
 
-@own.kept()
+@in_place.kept()
 def system_prompt(language: Language) -> str:
-    return read_prompt(f"system_{language}").substitute(actions=", ".join(ACTIONS))
+    return read_prompt(f"system_{language}").substitute(actions=", ".join(action_tokens()))
 
 
-@own.kept()
+@in_place.kept()
 def way_prompt(writing: Writing, decision: str | None = None) -> str:
     """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of sec:appendix_e)."""
-    prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(ACTIONS))
+    prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(action_tokens()))
     return prompt if decision is None else f"{prompt}\n{decision_words(decision)}"
 
 

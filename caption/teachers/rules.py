@@ -12,6 +12,7 @@ from functools import cache, partial
 
 from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe, word_of
 from caption.truth.facts import Facts
+from cosfly.products.actions import actions_in_use
 
 MODEL = "rules-5"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
@@ -65,6 +66,13 @@ def _slope_weights(count: int) -> tuple[list[float], float]:
     middle = (count - 1) / 2.0
     weights = [i - middle for i in range(count)]
     return weights, sum(w * w for w in weights)
+
+
+# What it decides by itself. Others it justifies where they are given.
+DECIDES = (
+    "return_to_home", "break_off", "search_to_reacquire_target", "hover", "yaw_left_to_follow", "yaw_right_to_follow", "ascend", "descend",
+    "speed_up", "slow_down", "track_straight",
+)  # fmt: skip
 
 
 def decide(facts: Facts) -> str:
@@ -131,9 +139,10 @@ _CONCLUSIONS: tuple[Both, ...] = (
 
 
 def _causes(f: Facts, cues: Cues, token: str) -> list[Both]:
-    """Give the reasons for a decision that the facts hold, else its general reason."""
+    """Give the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
     found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
-    return found[:2] or [_GENERAL[token]]
+    general = actions_in_use().actions[token].reason
+    return found[:2] or [(general.en, general.zh)]
 
 
 Cause = Callable[[Facts, Cues], Both | None]
@@ -248,33 +257,4 @@ _EVIDENCE: dict[str, tuple[Cause, ...]] = {
     "search_to_reacquire_target": (_lost,),
     "break_off": (_order,),
     "return_to_home": (_order,),
-}
-
-# Reasons that claim nothing measurable: for a decision that the facts alone do not explain.
-_CORRECTION = ("The line of sight to the target calls for a correction of the heading.", "对准目标的视线需要修正航向。")
-_OTHER_SIDE = (
-    "A view from another side of the target keeps it well in frame.",
-    "换一侧观察目标有利于将其保持在画面内。",
-)
-_SHIFT = ("A sideways shift keeps the target framed without a turn.", "侧向移动可在不转向的情况下保持目标构图。")
-_FIT = ("The pace has to fit that of the target.", "飞行节奏需要与目标相适应。")
-_ROOM = "More room keeps the target and its surroundings in frame."
-_GENERAL: dict[str, Both] = {
-    "track_straight": ("The present course keeps the target in frame.", "当前航向可使目标保持在画面内。"),
-    "yaw_left_to_follow": _CORRECTION,
-    "yaw_right_to_follow": _CORRECTION,
-    "circle_left": _OTHER_SIDE,
-    "circle_right": _OTHER_SIDE,
-    "ascend": ("A higher viewpoint keeps a free line of sight to the target.", "更高的视点可保持对目标的通畅视线。"),
-    "descend": ("A lower viewpoint shows the target at a better scale.", "更低的视点可让目标尺度更合适。"),
-    "move_forward": ("Closing in keeps the target at a useful scale.", "靠近目标可保持合适的尺度。"),
-    "move_backward": (_ROOM, "留出更多空间可将目标与周围环境保持在画面内。"),
-    "strafe_left": _SHIFT,
-    "strafe_right": _SHIFT,
-    "slow_down": _FIT,
-    "speed_up": _FIT,
-    "search_to_reacquire_target": ("Contact with the target has to be secured.", "需要确保与目标保持联系。"),
-    "hover": ("Holding the present position keeps the target in frame.", "保持当前位置可使目标留在画面内。"),
-    "break_off": ("The mission ends the pursuit here.", "任务要求在此结束跟踪。"),
-    "return_to_home": ("The mission calls the drone back.", "任务要求无人机返回。"),
 }

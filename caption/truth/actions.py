@@ -1,6 +1,6 @@
-"""The 17 actions against geometry: one table that says how much of each action a motion shows.
+"""The actions against geometry: how much of each a motion shows, by the rules of the set in use (cosfly/products/actions.yaml).
 
-The first group of `TABLE` in which an action is `implied` by the actual future gives the label: in it the action of which there is
+The first line of its precedence in which an action is `implied` by the actual future gives the label: in it the action of which there is
 most, in units of its own threshold. A decision of which the future shows next to nothing is contradicted. `break_off` and
 `return_to_home` are orders of a mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
 """
@@ -8,13 +8,16 @@ most, in units of its own threshold. A decision of which the future shows next t
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 from caption.schema import FutureMotion, LabelConfig
-from cosfly.products.captions import ACTIONS, Verdict
+from cosfly import in_place
+from cosfly.products.actions import Condition, Rule, Size, Term, actions_in_use
+from cosfly.products.captions import Verdict
 
 
 @dataclass(frozen=True)
@@ -69,150 +72,127 @@ def measure(future: FutureMotion) -> Motion:
     )
 
 
-Size = Callable[[Motion, LabelConfig], float]
+Measure = Callable[[Motion], float]
 
 
 @dataclass(frozen=True)
-class Action:
-    """One row. Sizes are in units of the action's own threshold; what holds or not is 1 or -1.
+class Table:
+    """The rules of a set of actions with their thresholds put in.
 
-    shown: how much of the action the motion shows, negative for its opposite; less than `hard_below` contradicts it (None: than
-    the setting `absent_share`). implied: how much there is of what makes it the label, from 1 on, where 1 is shown too.
+    implied: in order of precedence, groups of actions and how much there is of what makes each the label, from 1 on. shown: how much of an
+    action a motion shows, negative for its opposite, and what it must not fall below: less contradicts it.
     """
 
-    token: str
-    shown: Size
-    implied: Size
-    hard_below: float | None = None
+    implied: tuple[tuple[tuple[str, Measure], ...], ...]
+    shown: dict[str, tuple[Measure, float]]
 
 
-def _yes(holds: bool) -> float:
-    return 1.0 if holds else -1.0
+@in_place.kept(16)
+def table_of(cfg: LabelConfig) -> Table:
+    """Give the rules of the actions in use."""
+    actions = actions_in_use()
+    groups = [
+        [(token, _rule(rule, token, cfg)) for token in line if (rule := actions.actions[token].implied) is not None]
+        for line in actions.precedence
+    ]
+    shown = {
+        token: (
+            _rule(action.shown, token, cfg),
+            cfg.absent_share if (limit := action.contradicted_below) is None else limit,
+        )
+        for token, action in actions.actions.items()
+    }
+    return Table(tuple(map(tuple, groups)), shown)
 
 
-def _yaw(side: int, m: Motion, c: LabelConfig) -> float:
-    return side * m.yaw_deg / c.yaw_deg
+_COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 
 
-def _climb(side: int, m: Motion, c: LabelConfig) -> float:
-    return side * m.altitude_m / c.altitude_m
+def _rule(rule: Rule, token: str, cfg: LabelConfig) -> Measure:
+    sizes = [_size(Size(text), token, cfg) for text in rule.size]
+    where, unless = ([_condition(Condition(text), token, cfg) for text in texts] for texts in (rule.where, rule.unless))
+    size = None if not sizes else sizes[0] if len(sizes) == 1 else partial(_least, sizes)
+    if size is not None and not (where or unless):
+        return size
+
+    def measure_rule(motion: Motion) -> float:
+        for check in where:
+            if not check(motion):
+                return -1.0 if size is None else 0.0
+        for check in unless:
+            if not check(motion):
+                break
+        else:
+            if unless:
+                return -1.0 if size is None else 0.0
+        return 1.0 if size is None else size(motion)
+
+    return measure_rule
 
 
-def _speed(side: int, m: Motion, c: LabelConfig) -> float:
-    return side * m.speed_change_mps / c.speed_change_mps
+def _least(sizes: list[Measure], motion: Motion) -> float:
+    """Give the least size; one that cannot be measured is none (the angle round a target that nobody knows)."""
+    least = math.nan
+    for size in sizes:
+        value = size(motion)
+        if value < least or least != least:
+            least = value
+    return least
 
 
-def _forward_gain(m: Motion, c: LabelConfig) -> float:
-    # Who leaves a hover backwards, sideways or upwards gains speed too, but not on the way.
-    return m.forward_gain_mps / c.speed_change_mps
+def _size(size: Size, token: str, cfg: LabelConfig) -> Measure:
+    term, unit = size.term, size.unit.factor * _setting(size.unit, cfg)
+    if term.name is None or term.setting is not None or term.is_size or abs(term.factor) != 1.0:
+        value = _term(term, token, cfg)
+        return lambda motion: value(motion) / unit
+    read, unit = _read(term.name, token), unit * term.factor  # the same to the last digit, and a call less
+    return lambda motion: read(motion) / unit
 
 
-def _lateral(side: int, m: Motion, c: LabelConfig) -> float:
-    return side * m.left_m / c.lateral_m
+def _condition(condition: Condition, token: str, cfg: LabelConfig) -> Callable[[Motion], bool]:
+    """A comparison does not hold where something cannot be measured."""
+    left, right = _term(condition.left, token, cfg), _term(condition.right, token, cfg)
+    compare = _COMPARE[condition.how]
+    if condition.right.name is None or condition.right.setting is not None:
+        limit = condition.right.factor * _setting(condition.right, cfg)
+        return lambda motion: compare(left(motion), limit)
+    return lambda motion: compare(left(motion), right(motion))
 
 
-def _strafe(side: int, m: Motion, c: LabelConfig) -> float:
-    # A drone that swings round the person shifts to one side and turns to the other to keep its aim. That is one motion, a turn
-    # to follow: which of its parts is more thresholds only tells the distance (1 m is 3 degrees at 19 m).
-    swings = -_yaw(side, m, c) >= 1.0
-    return _lateral(side, m, c) if abs(m.left_m) > abs(m.forward_m) and not swings else 0.0
+def _term(term: Term, token: str, cfg: LabelConfig) -> Measure:
+    name, factor = term.name, term.factor
+    if name is None or term.setting is not None:
+        value = factor * _setting(term, cfg)
+        return lambda motion: value
+    read = _read(name, token)
+    if term.is_size:
+        return lambda motion: factor * abs(read(motion))
+    return read if factor == 1.0 else lambda motion: factor * read(motion)
 
 
-def _swept(side: int, m: Motion, c: LabelConfig) -> float:
-    sideways, swept = _lateral(side, m, c), side * m.sweep_deg / c.circle_deg
-    return swept if swept < sideways else sideways  # the angle is NaN where nobody knows the target
+def _read(name: str, token: str) -> Measure:
+    """Give how a measure is read; `ordered` is of the action itself."""
+    return operator.attrgetter(name) if name != "ordered" else lambda motion: float(motion.order == token)
 
 
-def _circle(side: int, m: Motion, c: LabelConfig) -> float:
-    # Following a walker through a bend sweeps an angle too: a circle is flown round someone who moves less than the drone.
-    is_round = abs(m.approach_m) < c.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
-    return _swept(side, m, c) if is_round else 0.0
-
-
-def _forward(side: int, m: Motion, c: LabelConfig) -> float:
-    return side * m.forward_m / c.forward_m
-
-
-def _backward(m: Motion, c: LabelConfig) -> float:
-    return _forward(-1, m, c) if abs(m.forward_m) >= abs(m.left_m) else 0.0
-
-
-def _closing(m: Motion, c: LabelConfig) -> float:
-    return m.approach_m / c.approach_m if _forward(1, m, c) >= 1.0 else 0.0
-
-
-def _goes_straight(m: Motion, c: LabelConfig) -> float:
-    return _yes(abs(m.yaw_deg) < c.hard_turn_deg and m.forward_m > -c.forward_m)
-
-
-def _loses_target(m: Motion, c: LabelConfig) -> float:
-    return _yes(not (m.visible_now and m.visible_share == 1.0 and m.approach_m > -c.approach_m))
-
-
-def _ordered(token: str) -> Action:
-    return Action(
-        token,
-        lambda m, c: _yes(m.order == token or _loses_target(m, c) > 0.0),
-        lambda m, c: _yes(m.order == token),
-    )
-
-
-def _both_sides(left: str, right: str, shown: Callable, implied: Callable, **more: float) -> tuple[Action, Action]:
-    return (
-        Action(left, partial(shown, 1), partial(implied, 1), **more),
-        Action(right, partial(shown, -1), partial(implied, -1), **more),
-    )
-
-
-# In order of precedence: orders, states, then a manoeuvre that has the following ones as its parts, then these, then the neutral one.
-TABLE: tuple[tuple[Action, ...], ...] = (
-    (_ordered("break_off"), _ordered("return_to_home")),
-    (
-        Action(
-            "search_to_reacquire_target",
-            lambda m, c: _yes(not (m.visible_now and m.visible_share == 1.0)),
-            lambda m, c: _yes(not m.visible_now),
-        ),
-    ),
-    (
-        Action(
-            "hover",
-            lambda m, c: _yes(m.mean_speed_mps < c.moving_mps),
-            lambda m, c: _yes(m.mean_speed_mps < c.hover_mps and abs(m.yaw_deg) < c.yaw_deg),
-        ),
-    ),
-    _both_sides("circle_left", "circle_right", _swept, _circle),
-    (
-        # A turn that was not flown is the paper's example of a soft conflict: only a turn to the other side is a hard one.
-        *_both_sides("yaw_left_to_follow", "yaw_right_to_follow", _yaw, _yaw, hard_below=-1.0),
-        *_both_sides("ascend", "descend", _climb, _climb),
-        Action("speed_up", partial(_speed, 1), _forward_gain),
-        Action("slow_down", partial(_speed, -1), partial(_speed, -1)),
-        *_both_sides("strafe_left", "strafe_right", _lateral, _strafe),
-        Action("move_backward", partial(_forward, -1), _backward),
-        Action("move_forward", partial(_forward, 1), _closing),
-    ),
-    (Action("track_straight", _goes_straight, partial(_forward, 1)),),
-)
-BY_TOKEN = {action.token: action for group in TABLE for action in group}
-assert set(BY_TOKEN) == set(ACTIONS)
+def _setting(term: Term, cfg: LabelConfig) -> float:
+    return 1.0 if term.setting is None else float(getattr(cfg, term.setting))
 
 
 def label_of(motion: Motion, cfg: LabelConfig) -> str | None:
     """Give the ground-truth decision, None where neither an order nor geometry tells."""
-    for group in TABLE:
-        sizes = [(action.implied(motion, cfg), action.token) for action in group]
+    for group in table_of(cfg).implied:
+        sizes = [(size(motion), token) for token, size in group]
         found = [pair for pair in sizes if pair[0] >= 1.0]
         if found:
-            return max(found, key=lambda pair: pair[0])[1]  # the earlier row of two equal ones
+            return max(found, key=lambda pair: pair[0])[1]  # the earlier one of two equal ones
     return None
 
 
 def is_contradicted(decision: str, motion: Motion, cfg: LabelConfig) -> bool:
     """Tell whether a motion shows too little of a decision, or its opposite."""
-    action = BY_TOKEN[decision]
-    limit = cfg.absent_share if action.hard_below is None else action.hard_below
-    return action.shown(motion, cfg) < limit
+    shown, limit = table_of(cfg).shown[decision]
+    return shown(motion) < limit
 
 
 def verdict_of(decision: str, motion: Motion, cfg: LabelConfig, label: str | None) -> Verdict:
@@ -226,4 +206,5 @@ def verdict_of(decision: str, motion: Motion, cfg: LabelConfig, label: str | Non
 
 def contradicted_by(motion: Motion, cfg: LabelConfig, label: str | None) -> list[str]:
     """Give the decisions that the actual future contradicts: what a guess would have run into."""
-    return [token for token in ACTIONS if token != label and is_contradicted(token, motion, cfg)]
+    shown = table_of(cfg).shown.items()
+    return [token for token, (size, limit) in shown if token != label and size(motion) < limit]

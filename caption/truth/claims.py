@@ -30,6 +30,7 @@ from caption.truth.said import SCENE, Said
 from caption.truth.sentences import Judged
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import Stated, read_stated
+from cosfly.products.actions import kin_of
 from cosfly.products.captions import Claim, Coc, Language, SentenceState, normalize_action
 from cosfly.products.sentences import sentences_of
 
@@ -269,7 +270,7 @@ def goes_against(claim: Claim, decision: str) -> bool:
             return False
         rises = word > 0
         word = ("left" if rises else "right") if name == "yaw" else ("increasing" if rises else "decreasing")
-    return decision in _AGAINST.get((name, word), ())
+    return kin_of(decision) in _AGAINST.get((name, word), ())
 
 
 def claim_name(claim: Claim) -> str:

@@ -18,6 +18,7 @@ from caption.truth.references import QUANTITIES
 from caption.truth.said import Said, frames_of
 from caption.truth.sizes import may_mean, same_size
 from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
+from cosfly.products.actions import kin_of
 from cosfly.products.captions import Claim, Language
 
 # Said of two quantities as well as of one that changes.
@@ -284,7 +285,7 @@ def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
             if "off" in places and not _is_off_somewhere(said):
                 yield _name(claim)
         elif claim.quantity == "decision" and claim.modality == "predicted":
-            word = ACTION_WORDS.get(str(claim.value))
+            word = ACTION_WORDS.get(kin_of(str(claim.value)))
             if stated.named and word not in stated.actions:
                 yield _name(claim)
 

@@ -1,4 +1,4 @@
-"""The bilingual glossary (`glossary.yaml`): names of actions and words, units, opposites.
+"""The bilingual glossary (`glossary.yaml`, and the names and terms of the actions in use): words, units, opposites.
 
 One reader, one frozen record with its patterns compiled; everything that writes or compares the two languages takes it.
 """
@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cosfly import own
+from cosfly import in_place
 from cosfly.config import Config, build, read_yaml
-from cosfly.errors import ConfigError
-from cosfly.products.captions import ACTIONS, Language
+from cosfly.products.actions import ActionSet, actions_in_use
+from cosfly.products.captions import Language
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
 LANGUAGES: tuple[Language, Language] = ("en", "zh")
@@ -44,10 +44,8 @@ class _Forms(Config):
 class _GlossaryFile(Config):
     schema_: str = Field(alias="schema", description="cosfly.glossary")
     schema_version: str = Field(description="version of this layout")
-    actions: dict[str, _Pair] = Field(description="names of the closed set")
     visibility: dict[str, _Pair] = Field(description="visibility words")
     units: dict[str, _Spellings] = Field(description="unit -> spellings, the first is written")
-    terms: list[_Pair] = Field(description="recurring terms")
     polarity: dict[str, _Opposites] = Field(description="opposites")
     negations: _Spellings = Field(description="words that turn a term round")
     not_terms: _Spellings = Field(description="spellings that hold a term but do not mean it")
@@ -70,10 +68,10 @@ class Number(NamedTuple):
 class Glossary:
     """The glossary with its patterns compiled."""
 
-    def __init__(self, file: _GlossaryFile) -> None:
-        self.actions = {token: {"en": pair.en, "zh": pair.zh} for token, pair in file.actions.items()}
+    def __init__(self, file: _GlossaryFile, actions: ActionSet) -> None:
+        self.actions = {token: {"en": action.en, "zh": action.zh} for token, action in actions.actions.items()}
         self.visibility = {word: {"en": pair.en, "zh": pair.zh} for word, pair in file.visibility.items()}
-        self.terms = [(pair.en, pair.zh) for pair in file.terms]
+        self.terms = [(pair.en, pair.zh) for pair in actions.terms]
         self._units: dict[Language, dict[str, str]] = {"en": {}, "zh": {}}
         for unit, spellings in file.units.items():
             for language in LANGUAGES:
@@ -104,7 +102,7 @@ class Glossary:
         self._idioms = {
             language: re.compile("|".join(getattr(file.idioms, language)), re.IGNORECASE) for language in LANGUAGES
         }
-        pairs = [(pair.en, pair.zh) for pair in (*file.actions.values(), *file.terms)]
+        pairs = [*((action.en, action.zh) for action in actions.actions.values()), *self.terms]
         self._translations = dict(pairs)
         self._translated = _term_pattern(dict.fromkeys(self._translations, ("", 0)), [], "en")
 
@@ -188,16 +186,12 @@ def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], langu
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
 
-@own.kept()
+@in_place.kept()
 def load_glossary(path: Path | None = None) -> Glossary:
-    """Read a glossary, by default the one that ships.
+    """Read a glossary, by default the one that ships, and put the actions in use into it.
 
     Raises:
-        ConfigError: malformed, or an action of the closed set is missing.
+        ConfigError: malformed.
     """
     path = path or GLOSSARY_FILE
-    file = build(_GlossaryFile, read_yaml(path), path)
-    if set(file.actions) != set(ACTIONS):
-        wrong = sorted(set(file.actions) ^ set(ACTIONS))
-        raise ConfigError("the glossary's actions are not the closed set", where=path, got=", ".join(wrong))
-    return Glossary(file)
+    return Glossary(build(_GlossaryFile, read_yaml(path), path), actions_in_use())

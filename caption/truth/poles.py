@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from cosfly.products.actions import kin_of
 from cosfly.products.captions import Claim
 
 Pair = tuple[str, str]  # dimension, value
@@ -74,7 +75,7 @@ def poles_of(claim: Claim) -> set[Pair]:
 
 
 def _decision_poles(action: str) -> Iterator[Pair]:
-    yield from _DECISIONS.get(action, ())
+    yield from _DECISIONS.get(kin_of(action), ())
     for side in ("left", "right"):
         if side in action:
             yield "side", side

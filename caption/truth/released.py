@@ -20,15 +20,21 @@ from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.judging import check_evidence
 from caption.windows import cut_future, frames_of
+from cosfly import in_place
+from cosfly.products.actions import actions_in_use
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
 
-ORDERS = ("break_off", "return_to_home")
 NUDGE = 1e-9  # of a threshold: what taking offsets off again may cost
 MOST_SHOWN = 160  # characters of a text in a finding
 
 
 def read_released(shown: ShownFlight) -> list[Lie]:
     """Say what of a flight's captions cannot be."""
+    with in_place.put(prompts=shown.prompts or None):
+        return _read_released(shown)
+
+
+def _read_released(shown: ShownFlight) -> list[Lie]:
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
     motion, frames = label_motion(shown.flight, shown.twin), frames_of(shown.flight)
     lies: list[Lie] = []
@@ -134,7 +140,8 @@ def _label_lies(
 ) -> list[Lie]:
     """The label must be what the frames after the window show, where these are released."""
     where = f"{caption.sample_id}: label"
-    is_order = caption.label in ORDERS
+    action = actions_in_use().actions.get(caption.label or "")
+    is_order = action is not None and action.is_order
     if caption.prompts and is_order != (mission is not None):
         got = f"{caption.label}, and {'an order' if mission else 'no order'} in the prompt"
         return [Lie("label", where, got, "an order as label exactly where the prompt tells of one")]

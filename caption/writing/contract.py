@@ -14,7 +14,8 @@ from typing import Protocol
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.sentences import Judged
-from cosfly.products.captions import ACTIONS, Claim, Coc, Language, Parsed, SentenceState, Template, Writing
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Claim, Coc, Language, Parsed, SentenceState, Template, Writing
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",
@@ -87,7 +88,7 @@ def way_of(name: Writing) -> Way:
 
 def more_fields(way: Way) -> dict[str, dict]:
     """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
-    return {**way.fields, "therefore": {"type": "string", "enum": list(ACTIONS)}}
+    return {**way.fields, "therefore": {"type": "string", "enum": list(action_tokens())}}
 
 
 def refuse_decision(answer: Parsed) -> Refused | None:

@@ -10,6 +10,7 @@ from caption.truth.glossary import load_glossary
 from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
 from caption.writing.contract import DECISION_REASON, Refused
 from caption.writing.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
+from cosfly.products.actions import kin_of
 from cosfly.products.captions import Language
 
 _DIRECTIONS = {
@@ -29,7 +30,7 @@ class Filler:
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
         """Give the plain text of a sentence."""
-        if is_reasoning and self.decision in sentence.opposed:
+        if is_reasoning and kin_of(self.decision) in sentence.opposed:
             complaint = f'it argues against {self.decision}, and "flight_decision" says {self.decision}; let the reasoning lead to it'
             return Refused(DECISION_REASON, complaint)
         if sentence.decisions:

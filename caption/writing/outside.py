@@ -13,8 +13,9 @@ from caption.truth.numerals import read_numerals
 from caption.truth.prose.numerals import masked
 from caption.truth.prose.reading import read_form
 from caption.writing.contract import Refused
-from cosfly import own
-from cosfly.products.captions import ACTIONS, Language
+from cosfly import in_place
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Language
 
 SLOT_MARK = "¤"
 
@@ -111,10 +112,10 @@ def decisions_named(text: str) -> tuple[str, ...]:
     return tuple((match["words"] or match["token"]).lower() for match in _named().finditer(text))
 
 
-@own.kept()
+@in_place.kept()
 def _named() -> re.Pattern[str]:
     words = "|".join(re.escape(pair["en"]) for pair in load_glossary().actions.values())
-    tokens = "|".join(token for token in ACTIONS if "_" in token)
+    tokens = "|".join(token for token in action_tokens() if "_" in token)
     return re.compile(
         r"\b(?:should|must|shall|needs? to|has to|have to|best to|decision (?:is|that follows is)(?: to)?|therefore,?)\s+(?:now\s+)?"
         rf"(?P<words>{words})\b|\b(?P<token>{tokens})\b",

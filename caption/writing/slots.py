@@ -18,7 +18,7 @@ from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler, facts_of
 from caption.writing.templates import Sentence, read_sentence
-from cosfly import own
+from cosfly import in_place
 from cosfly.products.captions import Coc, Language, Parsed, SentenceState, Template
 from cosfly.products.sentences import cut_sentences
 
@@ -59,7 +59,7 @@ class Slots:
         return [_JUDGED[state] for state in draft.states]
 
 
-@own.kept(64)  # an English text is read again when its mirror is held against it
+@in_place.kept(64)  # an English text is read again when its mirror is held against it
 def read_text(text: str, language: Language, num_frames: int, step_s: float) -> tuple[Sentence | Refused, ...]:
     """Read the sentences of a text."""
     return tuple([read_sentence(part, language, num_frames, step_s) for part in cut_sentences(text)])

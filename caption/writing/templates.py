@@ -29,7 +29,7 @@ from caption.truth.references import (
 )
 from caption.writing.contract import Refused
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, holds_state
-from cosfly import own
+from cosfly import in_place
 from cosfly.errors import nearest
 from cosfly.products.captions import Language, SentenceState, is_in_script
 
@@ -153,7 +153,7 @@ class Sentence:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-@own.kept(32768)  # neighbouring windows share most sentences
+@in_place.kept(32768)  # neighbouring windows share most sentences
 def read_sentence(text: str, language: Language, num_frames: int, step_s: float) -> Sentence | Refused:
     """Read a sentence, or say why it cannot be filled in any window of so many frames."""
     parts = _BRACES.split(text)
@@ -219,7 +219,7 @@ def _place(slot: Slot, language: Language) -> Place:
     return Place(slot.key, slot.fact_key, slot, quantity.read, frame, form)
 
 
-@own.kept()
+@in_place.kept()
 def _words_written(language: Language, form: Form, with_neither: bool) -> dict[float | str, str]:
     """Give how words are written in a form; without those that are neither side where a side may be needed."""
     left_out = () if with_neither else NEITHER
@@ -227,7 +227,7 @@ def _words_written(language: Language, form: Form, with_neither: bool) -> dict[f
     return {word: forms[min(form, len(forms) - 1)] for word, forms in words.items()}
 
 
-@own.kept()
+@in_place.kept()
 def words_of(language: Language) -> dict[str, tuple[str, ...]]:
     """Give the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
     glossary = load_glossary()

@@ -146,6 +146,25 @@ def caption_prompts(
             typer.echo(f"{export}: {len(export_prompts(export))} prompts")
 
 
+@app.command("actions")
+def caption_actions(
+    export: Annotated[
+        Path | None, typer.Option(help="File to write the set of actions that ships to, to begin with.")
+    ] = None,
+    check: Annotated[Path | None, typer.Option(help="File with actions of yours: say what is wrong with it.")] = None,
+) -> None:
+    """Write the closed set of actions into a file, or check a file of yours; --set caption.actions=FILE captions with it."""
+    from cosfly.products.actions import export_actions, read_actions
+
+    if (export is None) == (check is None):
+        raise typer.BadParameter("give --export FILE or --check FILE")
+    if check is not None:
+        typer.echo(f"{check}: {len(read_actions(check).tokens)} actions, nothing wrong")
+    elif export is not None:
+        export_actions(export)
+        typer.echo(export)
+
+
 @app.command("judge-check")
 def caption_judge_check(
     url: Annotated[str, typer.Argument(help="OpenAI-compatible endpoint of the judge.")],

@@ -1,4 +1,4 @@
-"""Chain-of-Cause captions on disk: the closed action set, the three-field answer, `captions.jsonl`.
+"""Chain-of-Cause captions on disk: the three-field answer with its decision of the closed set (actions.py), `captions.jsonl`.
 
 Shared by caption (which writes), distill and release (which read). How a decision is judged against the geometry lives in
 caption/truth/actions.py; here is only what an answer must look like.
@@ -18,23 +18,13 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_json
 
+from cosfly import in_place
 from cosfly.chat.contract import Usage
 from cosfly.chat.objects import find_object
+from cosfly.products.actions import action_tokens
 from cosfly.reading.documents import model_lines
 from cosfly.store import atomic_file
 
-# tab:coc_actions, group -> tokens. The order is the order of the schema's enum and of every table.
-ACTION_GROUPS: dict[str, tuple[str, ...]] = {
-    "tracking": ("track_straight",),
-    "heading": ("yaw_left_to_follow", "yaw_right_to_follow", "circle_left", "circle_right"),
-    "vertical": ("ascend", "descend"),
-    "translation": ("move_forward", "move_backward", "strafe_left", "strafe_right"),
-    "speed": ("slow_down", "speed_up"),
-    "recovery": ("search_to_reacquire_target", "hover", "break_off", "return_to_home"),
-}
-ACTIONS: tuple[str, ...] = tuple(token for tokens in ACTION_GROUPS.values() for token in tokens)
-_TOKENS = frozenset(ACTIONS)
-_TOKENS_BY_LETTERS = {token.replace("_", ""): token for token in ACTIONS}
 _DECISION = re.compile(
     r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
     r"""(?:(?:option|action|decision|answer|(?:flight|final)[\s_-]?(?:decision|action|answer)|动作|决策|飞行决策)["'`*]*\s*[:=]\s*["'`*]*)?"""
@@ -60,15 +50,21 @@ LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
 
+@in_place.kept()
+def _tokens_by_letters() -> dict[str, str]:
+    return {token.replace("_", ""): token for token in action_tokens()}
+
+
 def normalize_action(text: str) -> str | None:
     """Give the token for any spelling (spaces, hyphens, case; quotes, marks and brackets round it; `Decision:` before it), else None."""
-    if text in _TOKENS:
+    by_letters = _tokens_by_letters()
+    if by_letters.get(text.replace("_", "")) == text:
         return text
     if len(text) > MAX_DECISION_CHARACTERS:
         return None
     plain = "".join(char for char in unicodedata.normalize("NFKC", text) if unicodedata.category(char) != "Cf")
     found = _DECISION.fullmatch(plain.lower())
-    return _TOKENS_BY_LETTERS.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
+    return by_letters.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
 
 
 def answer_schema(
@@ -84,7 +80,7 @@ def answer_schema(
         for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
     }
     properties |= more or {}
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(ACTIONS)}
+    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(action_tokens())}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
@@ -210,6 +206,7 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 
 
 OWN_PROMPTS = "prompts"  # beside `captions.jsonl`: the prompts of whoever made them, where these do not ship
+QUESTIONS = ("user_en", "user_zh")  # of them, what is asked of a window
 PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says what pictures are given
 
 

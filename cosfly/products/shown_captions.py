@@ -42,7 +42,7 @@ class ShownFlight:
     """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps; styles: (n,).
 
     twin: the clean flight of a perturbed one, of the same frames; None where it is not released or shows others.
-    settings: the captions' own, as they are on record; empty: the defaults.
+    settings: the captions' own, as they are on record; empty: the defaults. prompts: their questions, where these do not ship.
     """
 
     flight: Flight
@@ -51,6 +51,7 @@ class ShownFlight:
     captions: Sequence[ShownCaption]
     twin: Flight | None = None
     settings: dict[str, Any] | None = None
+    prompts: dict[str, str] | None = None
 
 
 class Lie(NamedTuple):

@@ -11,10 +11,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosfly import in_place
 from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.escaping import for_html, for_markdown, html_page
+from cosfly.products.actions import one_set
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes, write_model
 from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, NEITHER, Difference, differences_of
@@ -93,15 +95,21 @@ def run(
         return path
     folders = dict(zip(names, evaluations, strict=True))
     reports = {name: read_report(folder) for name, folder in folders.items()}
+    with in_place.put(actions=one_set((folders[name], report.actions) for name, report in reports.items())):
+        return _compare(cfg, reports, folders, stage, seed)
+
+
+def _compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], stage: StageFolder, seed: int) -> Path:
+    out = stage.path
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
         raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
     comparison = compare(cfg, reports, folders, seed)
-    record, page = out / "comparison.json", out / "comparison.html"
+    record, path, page = out / "comparison.json", out / "comparison.md", out / "comparison.html"
     write_model(record, comparison, schema="cosfly.distill_comparison", version="1.0")
     write_bytes(path, markdown_of(comparison, reports).encode())
     write_bytes(page, page_of(comparison, reports).encode())
-    stage.finish([record, path, page], Tally(input=len(names), kept=len(names)))
+    stage.finish([record, path, page], Tally(input=len(reports), kept=len(reports)))
     return path
 
 

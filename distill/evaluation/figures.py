@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 from distill.evaluation.scores import NONE, STATES, UNPARSED, VERDICTS, Scores
 
 # A share or mean: of which samples (a mask), and what each gives. Macro-F1 is no mean over samples and stands apart.
@@ -55,7 +55,7 @@ class Figure(BaseModel):
 
 @dataclass(frozen=True)
 class _Sums:
-    """Of each walk the sums over its samples: numerators, denominators (walks, figures); confusion (walks, 17, 18)."""
+    """Of each walk the sums over its samples: numerators, denominators (walks, figures); confusion (walks, a, a + 1) of a actions, what does not parse last."""
 
     names: list[str]
     numerators: np.ndarray
@@ -97,23 +97,25 @@ def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
         [np.bincount(walk, weights=part.astype(float), minlength=num_walks) for part in pair] for pair in terms.values()
     ]
     answered = scores.answered
-    cell = (walk * len(ACTIONS) + scores.reference) * (UNPARSED + 1) + scores.answer
-    confusion = np.bincount(cell[answered], minlength=num_walks * len(ACTIONS) * (UNPARSED + 1))
+    count = len(action_tokens())
+    answer = np.where(scores.answer == UNPARSED, count, scores.answer)
+    cell = (walk * count + scores.reference) * (count + 1) + answer
+    confusion = np.bincount(cell[answered], minlength=num_walks * count * (count + 1))
     return _Sums(
         list(terms),
         np.array([pair[0] for pair in per_walk]).T,
         np.array([pair[1] for pair in per_walk]).T,
-        confusion.reshape(num_walks, len(ACTIONS), UNPARSED + 1).astype(float),
+        confusion.reshape(num_walks, count, count + 1).astype(float),
     )
 
 
 def macro_f1(confusion: np.ndarray) -> np.ndarray:
-    """Give the mean F1 over the decisions that the references have, (...,) from (..., 17, 18) counts; NaN without any.
+    """Give the mean F1 over the decisions that the references have, (...,) from (..., a, a + 1) counts; NaN without any.
 
     F1 = 2 tp / (2 tp + fp + fn); an answer that does not parse is a miss of its reference and nobody's false alarm.
     """
-    hits = np.diagonal(confusion[..., : len(ACTIONS)], axis1=-2, axis2=-1)
-    references, answers = confusion.sum(axis=-1), confusion[..., : len(ACTIONS)].sum(axis=-2)
+    hits = np.diagonal(confusion[..., :-1], axis1=-2, axis2=-1)
+    references, answers = confusion.sum(axis=-1), confusion[..., :-1].sum(axis=-2)
     occurs = references > 0
     scores = np.where(occurs, 2 * hits / np.maximum(references + answers, 1), 0.0)
     return np.where(occurs.any(axis=-1), scores.sum(axis=-1) / np.maximum(occurs.sum(axis=-1), 1), np.nan)
@@ -127,10 +129,10 @@ def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
     found = dict(zip(sums.names, shares.T, strict=True))
     counted = (draws @ sums.confusion.reshape(len(sums.confusion), -1)).reshape(-1, *sums.confusion.shape[1:])
     found["macro_f1"] = macro_f1(counted)
-    diagonal = np.diagonal(counted[..., : len(ACTIONS)], axis1=-2, axis2=-1)
+    diagonal = np.diagonal(counted[..., :-1], axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         recall = diagonal / counted.sum(axis=-1)
-    return found | {f"decision/{token}": recall[:, number] for number, token in enumerate(ACTIONS)}
+    return found | {f"decision/{token}": recall[:, number] for number, token in enumerate(action_tokens())}
 
 
 def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
@@ -146,11 +148,11 @@ def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple
     drawn = _values(sums, draws)
     counts = dict(zip(sums.names, sums.denominators.sum(axis=0), strict=True))
     references = sums.confusion.sum(axis=(0, 2))
-    counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(ACTIONS)}}
+    counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(action_tokens())}}
     found = {
         name: _figure(float(whole[name][0]), drawn[name], int(counts[name]), len(names), confidence) for name in whole
     }
-    decisions = {token: found[f"decision/{token}"] for i, token in enumerate(ACTIONS) if references[i]}
+    decisions = {token: found[f"decision/{token}"] for i, token in enumerate(action_tokens()) if references[i]}
     return {name: found[name] for name in FIGURES}, decisions
 
 

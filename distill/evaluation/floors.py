@@ -16,13 +16,14 @@ import numpy as np
 
 from cosfly.chance import rng_for
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, Coc, Language
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import Coc, Language
 from cosfly.products.predictions import PREDICTIONS, Prediction
 from cosfly.reading.documents import parse_document, validation_errors
 from cosfly.splits import Split
 from cosfly.store import dump_json, write_bytes
 from distill.evaluation.scores import Answer
-from distill.schema import Sample, open_split
+from distill.schema import Sample, in_its_actions, open_split
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
 WRITTEN = ("shuffled", "constant")  # floors that have texts
@@ -41,7 +42,7 @@ def coc_of(sample: Sample) -> Coc:
 def majority(decisions: Iterable[str]) -> str | None:
     """Give the most frequent decision; a tie goes to the first in the order of the action table."""
     counts = Counter(decisions)
-    return max(ACTIONS, key=lambda action: counts[action]) if counts else None
+    return max(action_tokens(), key=lambda action: counts[action]) if counts else None
 
 
 def shuffled_groups(count: int, rng: np.random.Generator) -> list[np.ndarray]:
@@ -89,6 +90,7 @@ class Floors:
         return found
 
 
+@in_its_actions
 def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
     """Write the floors that have texts as predictions, so that `cosfly caption --teacher student:` judges their sentences too.
 

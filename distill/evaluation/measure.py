@@ -12,7 +12,8 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.chance import rng_for
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, FIELDS, Coc, Language, SentenceState, read_captions
+from cosfly.products.actions import ActionSet, action_tokens
+from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.documents import read_model
 from cosfly.splits import Split
@@ -75,6 +76,7 @@ class Report(_Strict):
     resamples: int
     seed: int
     not_asked: int
+    actions: ActionSet | None = None  # the closed set; None: the one that ships
     metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
     judged: list[str]  # whose sentences were judged
     speed: Speed
@@ -206,7 +208,7 @@ def measure(
 
 
 def _confusion(scores: Scores) -> dict[str, dict[str, int]]:
-    names = (*ACTIONS, UNPARSED_NAME)
+    names = (*action_tokens(), UNPARSED_NAME)
     cells = Counter(
         zip(scores.reference[scores.answered].tolist(), scores.answer[scores.answered].tolist(), strict=True)
     )

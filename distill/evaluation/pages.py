@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from cosfly.escaping import for_html, for_markdown, html_page
-from cosfly.products.captions import ACTIONS, FIELDS, Coc
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import FIELDS, Coc
 from cosfly.reading.files import read_text
 from distill.evaluation.figures import FIGURES, Figure
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Example, Measured, Measurement, Report
@@ -21,7 +22,7 @@ def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
     """Give a figure in words: its value and, in brackets, its interval."""
     if figure.value is None:
         return NOTHING
-    digits = "{:.2%}" if name in SHARES or name in ACTIONS else "{:.1f}" if name == "tokens" else "{:.4f}"
+    digits = "{:.2%}" if name in SHARES or name in action_tokens() else "{:.1f}" if name == "tokens" else "{:.4f}"
     text = digits.format(figure.value)
     if not interval or figure.low is None or figure.high is None:
         return text
@@ -248,9 +249,11 @@ def histogram(who: Mapping[str, Sequence[int]]) -> str:
 
 def heat_map(who: Measured) -> str:
     """Draw the confusion of decisions: rows are references, columns answers, colours the share of the row."""
-    rows = [token for token in ACTIONS if token in who.confusion]
+    rows = [token for token in action_tokens() if token in who.confusion]
     columns = [
-        name for name in (*ACTIONS, UNPARSED_NAME) if name in rows or any(name in who.confusion[row] for row in rows)
+        name
+        for name in (*action_tokens(), UNPARSED_NAME)
+        if name in rows or any(name in who.confusion[row] for row in rows)
     ]
     size, left, top = 44, 190, 150
     parts = []

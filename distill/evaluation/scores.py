@@ -15,8 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cosfly import in_place
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, Coc, SentenceState, Verdict, verdict_on
+from cosfly.products.actions import action_tokens, not_in_set
+from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import row_groups
 from cosfly.store import atomic_file, dump_json, sha256_bytes
@@ -26,9 +28,8 @@ SCORES = "scores.parquet"
 REFERENCE_DIGITS = 16  # of a digest of 64
 VERDICTS: tuple[Verdict, ...] = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 STATES: tuple[SentenceState, ...] = ("proved", "contradicted", "unread")
-UNPARSED = len(ACTIONS)  # the number of the decision that an answer without one makes
+UNPARSED = -2  # the number of the decision that an answer without one makes
 NONE = -1  # the number of a label or verdict that nobody knows
-_NUMBER = {token: number for number, token in enumerate(ACTIONS)}
 _VERDICT = {name: number for number, name in enumerate(VERDICTS)}
 
 
@@ -53,7 +54,7 @@ class Answer:
 class Scores:
     """Columns over n samples.
 
-    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer, label (n,) int8 numbers of ACTIONS, UNPARSED, NONE; answered, unmended (n,) bool;
+    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer, label (n,) int8 numbers of action_tokens(), UNPARSED, NONE; answered, unmended (n,) bool;
     verdict (n,) int8 number of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed;
     proved, contradicted, unread (n,) numbers of sentences, NaN where nobody judged them; num_tokens (n,).
     """
@@ -82,6 +83,22 @@ class Scores:
     def at(self, where: np.ndarray) -> Scores:
         """Give the samples at some places."""
         return Scores(**{field.name: getattr(self, field.name)[where] for field in fields(self)})
+
+
+@in_place.kept()
+def _numbers() -> dict[str, int]:
+    return {token: number for number, token in enumerate(action_tokens())}
+
+
+def _number_of(decision: str, sample: Sample) -> int:
+    """Give the number of a decision.
+
+    Raises:
+        InputError: it is none of the closed set.
+    """
+    if decision not in _numbers():
+        raise not_in_set(decision, sample.key)
+    return _numbers()[decision]
 
 
 def digest_of_reference(sample: Sample) -> str:
@@ -120,9 +137,15 @@ def score_answers(
         walk=np.array([sample.walk for sample in samples], dtype=object),
         language=np.array([sample.language for sample in samples], dtype=object),
         against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
-        reference=np.array([_NUMBER[sample.decision] for sample in samples], dtype=np.int8),
-        answer=np.array([_NUMBER[a.coc.flight_decision] if a.coc else UNPARSED for a in answers], dtype=np.int8),
-        label=np.array([_NUMBER[s.label] if s.label else NONE for s in samples], dtype=np.int8),
+        reference=np.array([_number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
+        answer=np.array(
+            [
+                _number_of(a.coc.flight_decision, s) if a.coc else UNPARSED
+                for s, a in zip(samples, answers, strict=True)
+            ],
+            dtype=np.int8,
+        ),
+        label=np.array([_number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
         verdict=np.array(verdicts, dtype=np.int8),
@@ -141,7 +164,7 @@ _TEXT, _NAMES = ("key", "walk", "language", "against"), [field.name for field in
 
 def _column(name: str, values: np.ndarray) -> pa.Array:
     if name in ("reference", "answer", "label", "verdict"):
-        words = (*VERDICTS, None) if name == "verdict" else (*ACTIONS, "(unparsed)", None)
+        words = (*VERDICTS, None) if name == "verdict" else (*action_tokens(), "(unparsed)", None)
         return pa.array([words[number] for number in values.tolist()], pa.string())
     return pa.array(values.tolist() if name in _TEXT else values, from_pandas=True)
 
@@ -178,7 +201,7 @@ def _values(name: str, values: list[Any]) -> np.ndarray:
     if name == "verdict":
         return np.array([NONE if word is None else _VERDICT[word] for word in values], dtype=np.int8)
     if name in ("reference", "answer", "label"):
-        numbers = _NUMBER | {"(unparsed)": UNPARSED}
+        numbers = _numbers() | {"(unparsed)": UNPARSED}
         return np.array([NONE if word is None else numbers[word] for word in values], dtype=np.int8)
     if name in _TEXT:
         if not all(isinstance(value, str) for value in values):

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import Field
 
+from cosfly import in_place
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.captions import Language
@@ -41,7 +42,7 @@ from distill.evaluation.measure import (
 from distill.evaluation.pages import markdown_of, page_of
 from distill.evaluation.scores import SCORES, Scores, write_scores
 from distill.evaluation.speed import speed_of
-from distill.schema import Sample, open_split
+from distill.schema import Sample, in_its_actions, open_split
 from distill.student.model import require
 
 
@@ -54,6 +55,7 @@ class EvaluateConfig(Config):
     bertscore: BertScoreConfig = Field(BertScoreConfig(), description="semantic similarity of the texts")
 
 
+@in_its_actions
 def run(
     cfg: EvaluateConfig,
     predictions: Path,
@@ -139,6 +141,7 @@ def _evaluate(
         split=predictions[0].split,
         **given,
         not_asked=0,
+        actions=in_place.given("actions"),
         metrics=metrics,
         judged=sorted(judged),
         speed={},

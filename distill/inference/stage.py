@@ -28,7 +28,7 @@ from distill.inference.asking import Asking
 from distill.inference.constraint import AnswerSchemas
 from distill.inference.local import LocalAnswers
 from distill.inference.outcome import ANSWERS, Answered, Results, writing_results
-from distill.schema import Sample, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.encoding import most_pixels
 from distill.student.model import Device, load_student, require, student_folder, weight_files
@@ -179,6 +179,7 @@ def _serving(cfg: InferConfig, model: str) -> InferConfig:
 # --- the step ---------------------------------------------------------------------------------------------------------
 
 
+@in_its_actions
 def run(
     cfg: InferConfig,
     dataset: Path,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 
 
 def _rank(sample_id: str, seed: int) -> int:
@@ -228,7 +228,7 @@ def cost_of(cut: Cut, samples_left_out: Mapping[str, int]) -> Cost:
             )
             for decision, count in before.items()
         },
-        absent=[action for action in ACTIONS if action not in before],
+        absent=[action for action in action_tokens() if action not in before],
     )
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 from cosfly.errors import InputError, VerifyError
 from cosfly.frame_views import VIEW_FILES, View
+from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.frames import frame_name
 from cosfly.products.places import Place, flight_ids, folder_name, stand
@@ -53,12 +54,15 @@ class Source:
 
 
 def inputs_of(sources: Sequence[Source]) -> dict[str, Path]:
-    """Name what a stage reads: `data`, `captions`; of several runs with the run's number in front."""
+    """Name what a stage reads: `data`, `captions`, `actions` where the captions are of a set of their own; of several runs with the run's number in front."""
     return {
         f"{number}.{name}" if len(sources) > 1 else name: path
         for number, source in enumerate(sources, 1)
-        for name, path in (("data", source.data), ("captions", source.captions))
-    }
+        for name, path in (
+            ("data", source.data), ("captions", source.captions), ("actions", source.captions.with_name(OWN_ACTIONS)),
+        )
+        if name != "actions" or path.is_file()
+    }  # fmt: skip
 
 
 def check_sources(sources: Sequence[Source], unbound: Literal["refuse", "accept"]) -> None:

@@ -15,8 +15,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from cosfly import in_place
 from cosfly.console import progress_bar
 from cosfly.frame_views import scaled_size
+from cosfly.products.actions import action_tokens, actions_beside, not_in_set, one_set
 from cosfly.products.captions import Caption, read_captions
 from cosfly.provenance import fingerprint
 from cosfly.splits import SPLITS, Split, assign_splits, town_family
@@ -64,6 +66,8 @@ class _Windows:
 
     def _window(self, source: Source, caption: Caption) -> _Window:
         flight = self.flights.of(source, caption)
+        if caption.en is not None and caption.en.flight_decision not in action_tokens():
+            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
         caption.town = flight.town  # the tree may have been converted since
         window = _Window(flight, flight.sample_id(caption), [], [])
         walk = self.walks.get(flight.key, "")
@@ -125,6 +129,11 @@ def run(cfg: PrepareConfig, sources: Sequence[Source], out: Path, *, seed: int =
     if stage.is_complete:
         return out
     check_sources(sources, cfg.unbound)
+    with in_place.put(actions=one_set((source.captions, actions_beside(source.captions)) for source in sources)):
+        return _prepare(cfg, sources, out, seed, stage)
+
+
+def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int, stage: StageFolder) -> Path:
     windows = _Windows(cfg, sources)
     # Two passes: the splits, and what is too much, must be known before the first sample is written.
     ranks, excluded = _survey(windows, seed)

@@ -15,7 +15,8 @@ from pydantic import Field
 from cosfly.chance import rng_for
 from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, FIELDS
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import FIELDS
 from cosfly.store import atomic_folder
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
 
@@ -38,7 +39,6 @@ _TOKENIZER_TEXT = (
     '{"critical_components":"目标行人在画面中央，无人机保持距离，左侧有建筑物","reasoning_trace":"行人向右转弯，因此无人机应右转跟随",',
     "frame position velocity visibility true false drone target world depth camera yaw pitch roll five frames JSON object",
     " ".join(FIELDS),
-    " ".join(ACTIONS),
 )
 HEAD_WIDTH = 16  # of the attention heads of small students; wide ones have Qwen3.5's
 WIDE_HEAD_WIDTH = 128
@@ -100,7 +100,7 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     quiet_transformers()
-    tokenizer = _tokenizer((*_TOKENIZER_TEXT, *texts), cfg.vocabulary)
+    tokenizer = _tokenizer((*_TOKENIZER_TEXT, " ".join(action_tokens()), *texts), cfg.vocabulary)
     image_processor = Qwen2VLImageProcessorPil(
         patch_size=16,
         merge_size=2,

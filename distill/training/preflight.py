@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 from cosfly.store import write_json
 from distill.schema import Sample
 from distill.student.encoding import END_OF_ANSWER, chat_text, prompt_text
@@ -83,7 +83,7 @@ def _about_data(cfg: TrainConfig, census: Census, validation: Census, steps: Ste
 
 def _about_decisions(cfg: TrainConfig, census: Census, validation: Census) -> list[Finding]:
     """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
-    missing = [action for action in ACTIONS if not census.decisions[action]]
+    missing = [action for action in action_tokens() if not census.decisions[action]]
     asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
     if not asked:
         return [Finding("decisions", f"no sample of {', '.join(missing)}")] if missing else []

@@ -18,7 +18,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import atomic_folder, write_json
 from cosfly.student_chat import Taught, write_taught
-from distill.schema import Sample, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures, folder_bytes
 from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
@@ -106,6 +106,7 @@ def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed
 # --- the step ---------------------------------------------------------------------------------------------------------
 
 
+@in_its_actions
 def run(
     cfg: TrainConfig,
     dataset: Path,

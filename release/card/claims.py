@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from cosfly.escaping import for_markdown, markdown_code
-from cosfly.products.captions import ACTIONS
 from release.record import ReleaseRecord, SourceRecord
 
 # What a map is, by what made it (`maps.source`): no more than the program knows.
@@ -118,7 +117,7 @@ def limits(record: ReleaseRecord) -> str:
             "The renderer draws boxes as a town, plainly lit: no sensor noise, motion blur, lens distortion or rolling shutter. A model trained on it needs checking on real images."
         )
         lines.append("People walk planned ways; real ones do what no plan has.")
-    missing = [name for name in ACTIONS if name not in captions.decision]
+    missing = [name for name in record.closed_set if name not in captions.decision]
     if captions.frames_with and missing:
         lines.append(f"Decisions that no caption has: {', '.join(markdown_code(name) for name in missing)}.")
     if captions.frames_with:

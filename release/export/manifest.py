@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import Field
 
 import cosfly
 from cosfly.escaping import for_markdown
+from cosfly.products.actions import ActionSet
 from cosfly.reading.documents import read_model
 from cosfly.store import dump_json, sha256_bytes, write_bytes
 from release.export.contract import ExportConfig, Facts
@@ -28,7 +30,8 @@ class CameFrom(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`. depth: how the release codes it; null where it has none."""
+    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of decisions (null: the one
+    that ships) and the questions, as the release's record has them."""
 
     format: str
     format_version: str
@@ -38,6 +41,8 @@ class ExportRecord(Strict):
     credits: str
     maps: list[ReleasedMap]
     coordinates: dict[str, Any]
+    actions: ActionSet | None = None
+    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     settings: dict[str, Any]
     codings: dict[str, str]
     depth: DepthCoding | None
@@ -61,6 +66,8 @@ def describe(release: Release, facts: Facts, cfg: ExportConfig, *, frames: int, 
         credits=record.credits,
         maps=record.maps,
         coordinates=facts.coordinates or record.coordinates,
+        actions=record.actions,
+        prompts=record.prompts,
         settings=cfg.recorded(),
         codings=facts.codings,
         depth=record.depth,

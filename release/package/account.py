@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cosfly
+from cosfly import in_place
 from release import columns
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.config import ReleaseConfig
@@ -77,8 +78,9 @@ def make_record(
     shards: list[Shard],
     numbers: Numbers,
     provenance: Provenance,
+    prompts: dict[str, dict[str, str]],
 ) -> ReleaseRecord:
-    """Give what release.json says of its shards."""
+    """Give what release.json says of its shards. prompts: as the record has them."""
     five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
     return ReleaseRecord(
         name=cfg.name,
@@ -96,6 +98,8 @@ def make_record(
         frame_selection=RULE,
         depth=depth_record(cfg.depth, [result.depth for result in written]) if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
+        actions=in_place.given("actions"),
+        prompts=prompts,
         splits=splits_of(cfg, plan, written),
         numbers=numbers,
         history=account_for(plan, written),

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.products.captions import ACTIONS, FIELDS, Caption, caption_lines
+from cosfly.products.actions import action_tokens, not_in_set
+from cosfly.products.captions import FIELDS, Caption, caption_lines
 from cosfly.products.places import town_folder
 from cosfly.products.playback import sample_id
 from cosfly.reading.documents import parse_document, parse_json, validation_errors
@@ -163,8 +164,8 @@ def _no_caption(caption: Caption, where: str) -> InputError | None:
         got = f"{decision} and {caption.zh.flight_decision}"
         return InputError("the two languages decide differently", where=where, got=got)
     for name, action in (("en.flight_decision", decision), ("label", caption.label)):
-        if action is not None and action not in ACTIONS:
-            return InputError("not an action of the closed set", where=f"{where}: {name}", got=action)
+        if action is not None and action not in action_tokens():
+            return not_in_set(action, f"{where}: {name}")
     if caption.verdict == "CONSISTENT" and decision != caption.label:
         return InputError(
             "a decision is called consistent with another label", where=where, got=f"{decision}, {caption.label}"

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.errors import ConfigError, InputError
+from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.boxes import UNKNOWN_LICENCE
+from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
 from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.playback import find_flights
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
 from cosfly.provenance import fingerprint, is_bound, was_made_of
-from cosfly.reading.files import check_stays_below
+from cosfly.reading.files import check_stays_below, read_text
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
@@ -39,7 +41,17 @@ class Source:
             files["inspect"] = self.inspect
             if (decisions := self.inspect.with_name(REVIEW)).exists():
                 files["review"] = decisions
-        return files
+        own = {"actions": OWN_ACTIONS, **{f"prompts/{name}": f"{OWN_PROMPTS}/{name}.txt" for name in QUESTIONS}}
+        return files | {role: path for role, name in own.items() if (path := self.captions.parent / name).is_file()}
+
+    @property
+    def questions(self) -> dict[str, str]:
+        """The questions of captions that were asked with prompts of their own; empty: with those that ship."""
+        return {
+            name: read_text(path, what="prompt", tree=self.captions.parent)
+            for name in QUESTIONS
+            if (path := self.files.get(f"prompts/{name}"))
+        }
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from cosfly import in_place
 from cosfly.errors import VerifyError
+from cosfly.products.actions import actions_beside, one_set
 from cosfly.provenance import read_stage_record
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of
@@ -64,13 +66,29 @@ def run(
         shutil.rmtree(parts, ignore_errors=True)
         return dataset
     shutil.rmtree(dataset, ignore_errors=True)  # of another attempt: until this one is whole, nothing is published
+    with in_place.put(actions=one_set((source.captions, actions_beside(source.captions)) for source in sources)):
+        return _build(cfg, sources, out, stage, workers, watch)
+
+
+def _build(
+    cfg: ReleaseConfig, sources: list[Source], out: Path, stage: StageFolder, workers: int, watch: Watch
+) -> Path:
+    dataset, parts = out / DATASET, out / PARTS
     plan = make_plan(cfg, sources, stage)
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:
         shards = name_shards(_finished(plan, written, parts), folder)
         numbers = compute_numbers([folder / shard.path for shard in shards], cfg.num_frames)
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
-        record = make_record(cfg, plan, written, shards, numbers, provenance)
+        record = make_record(
+            cfg,
+            plan,
+            written,
+            shards,
+            numbers,
+            provenance,
+            {source.run: source.questions for source in sources if source.questions},
+        )
         write_records(folder, record)
         _check_release(folder)
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from cosfly.products.captions import ACTION_GROUPS, ACTIONS, FIELDS, MIN_CHARACTERS, MIN_CHARACTERS_ZH
+from cosfly.products.actions import shipped_actions
+from cosfly.products.captions import FIELDS, MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from release.record import ReleaseRecord
 from release.stats.cells import SPREAD, pairs, percent, spread_row
 from release.stats.counting import LANGUAGES, STATES, TEXT_BIN, Counts
@@ -14,13 +15,14 @@ LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
 def of_captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
     """Give the tables."""
     return [
-        _decisions(counts), _confusion(counts), _verdicts(counts), _repairs(counts), _teachers(record), *_evidence(counts), _lengths(counts),
+        _decisions(record, counts), _confusion(record, counts), _verdicts(counts), _repairs(counts), _teachers(record), *_evidence(counts), _lengths(counts),
         *_length_bins(counts),
     ]  # fmt: skip
 
 
-def _decisions(counts: Counts) -> Table:
-    groups = {action: group for group, actions in ACTION_GROUPS.items() for action in actions}
+def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
+    actions = record.actions or shipped_actions()
+    groups = {token: action.group for token, action in actions.actions.items()}
     total, labelled = counts.decisions.total(), counts.labels.total() - counts.labels["none"]
     rows: list[list[Cell]] = [
         [
@@ -31,7 +33,7 @@ def _decisions(counts: Counts) -> Table:
             percent(counts.labels[name], labelled),
             groups.get(name, ""),
         ]
-        for name in (*ACTIONS, *sorted(counts.decisions.keys() - {*ACTIONS, "none"}))
+        for name in (*actions.tokens, *sorted(counts.decisions.keys() - {*actions.tokens, "none"}))
     ]
     note = f"Decisions of {total:,} captions, and the labels that the later positions imply for {labelled:,} of them."
     head = ["action", "decisions", "%", "labels", "% ", "group"]
@@ -40,8 +42,8 @@ def _decisions(counts: Counts) -> Table:
     )
 
 
-def _confusion(counts: Counts) -> Table:
-    order = [name for name in (*ACTIONS, "none") if counts.labels[name] or counts.decisions[name]]
+def _confusion(record: ReleaseRecord, counts: Counts) -> Table:
+    order = [name for name in (*record.closed_set, "none") if counts.labels[name] or counts.decisions[name]]
     rows: list[list[Cell]] = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
     return Table(
         key="confusion",

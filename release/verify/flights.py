@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -34,7 +34,8 @@ LOSSLESS = DepthCoding(
 @dataclass(frozen=True)
 class Told:
     """What the record says that the checks of flights need. settings: of stages, by run and stage. by_town: splits share no town
-    either. both: every flight's twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as."""
+    either. both: every flight's twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as.
+    prompts: by run."""
 
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
@@ -42,14 +43,20 @@ class Told:
     by_town: bool = False
     both: bool = False
     rounded_as: DepthCodingName = "float32"
+    prompts: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
-        run = flight.name.split("/")[0]
-        found = {own: values for (own, name), values in self.settings.items() if name == stage}
-        of_run = [
-            own for own in found if run == own or run.startswith(f"{own}_")
-        ]  # folders above a town count as part of its run
-        return found[max(of_run, key=len)] if of_run else {}
+        return _of_run({run: values for (run, name), values in self.settings.items() if name == stage}, flight)
+
+    def prompts_of(self, flight: FlightRows) -> dict[str, str]:
+        return _of_run(self.prompts, flight)
+
+
+def _of_run(found: Mapping[str, dict[str, Any]], flight: FlightRows) -> dict[str, Any]:
+    """Give what is said of a flight's run, of which folders above a town count as part."""
+    name = flight.name.split("/")[0]
+    runs = [run for run in found if name == run or name.startswith(f"{run}_")]
+    return found[max(runs, key=len)] if runs else {}
 
 
 @dataclass(frozen=True)
@@ -129,5 +136,5 @@ def _tried(check: Callable[[], Any], name: str, findings: Findings) -> bool:
 def _read_captions(
     flight: FlightRows, twin: FlightRows | None, told: Told, reader: CaptionReader, findings: Findings
 ) -> None:
-    for lie in reader(flight.shown(twin, told.of(flight, "caption"))):
+    for lie in reader(flight.shown(twin, told.of(flight, "caption"), told.prompts_of(flight))):
         findings.error(lie.code, lie.where, lie.got, lie.expected)

@@ -9,7 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cosfly.products.captions import ACTIONS, LabelFrom, TeacherKind, Verdict, Writing
+from cosfly.products.actions import action_tokens
+from cosfly.products.captions import LabelFrom, TeacherKind, Verdict, Writing
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG
 from cosfly.products.playback import EVENTS, ORIGINAL
 from cosfly.products.weather import WeatherMode
@@ -26,15 +27,17 @@ ZOOMED = ("fov_deg", "intrinsics")  # but of a camera that zooms; geometry.py lo
 CLOSED: dict[str, tuple[str, ...]] = {
     "track": ("clean", "perturbed"),
     "weather_mode": get_args(WeatherMode),
-    "decision": ACTIONS,
-    "label": ACTIONS,
-    "caption_en_flight_decision": ACTIONS,
-    "caption_zh_flight_decision": ACTIONS,
     "verdict": get_args(Verdict),
     "label_from": get_args(LabelFrom),
     "teacher_kind": get_args(TeacherKind),
     "writing": get_args(Writing),
 }
+ACTIONS = (
+    "decision",
+    "label",
+    "caption_en_flight_decision",
+    "caption_zh_flight_decision",
+)  # columns that hold one, of the record's set
 # column -> members ("" for a plain number) -> least and greatest value.
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "visibility": {"": (0.0, 1.0)},
@@ -67,11 +70,12 @@ def check_identity(flight: FlightRows, findings: Findings) -> None:
     """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
     _check_names(flight, findings)
     _check_constants(flight, findings)
+    closed = CLOSED | dict.fromkeys(ACTIONS, action_tokens())
     for i, row in enumerate(flight.rows):
         for name in NEVER_NULL:
             if name in row and row[name] is None:
                 findings.error("null", flight.where(i, name), "null", "a value in every row")
-        for name, allowed in CLOSED.items():
+        for name, allowed in closed.items():
             value = row.get(name)
             if value is not None and value not in allowed:
                 findings.error(

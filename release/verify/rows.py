@@ -174,12 +174,14 @@ class FlightRows:
             intrinsics=matrices if self.zooms else None,
         )  # fmt: skip
 
-    def shown(self, twin: FlightRows | None, settings: dict[str, Any] | None) -> ShownFlight:
-        """Give what a reader of captions gets. settings: of the captions, as the record has them."""
+    def shown(
+        self, twin: FlightRows | None, settings: dict[str, Any] | None, prompts: dict[str, str] | None = None
+    ) -> ShownFlight:
+        """Give what a reader of captions gets. settings, prompts: of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and np.array_equal(twin.index, self.index)
         other = twin.flight if twin is not None and same else None
-        return ShownFlight(self.flight, self.index, self.column("style"), captions, other, settings)
+        return ShownFlight(self.flight, self.index, self.column("style"), captions, other, settings, prompts)
 
 
 def shown_caption(row: Row) -> ShownCaption:

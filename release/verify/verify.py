@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from cosfly import in_place
 from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.items import Item
@@ -105,6 +106,11 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
         where = str(error.where).replace(f"{folder}/", "")
         findings.error("record", where, error.got or error.what, error.expected or "a release record")
         return
+    with in_place.put(actions=record.actions):
+        _verify_record(folder, record, how, findings)
+
+
+def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
     expected: dict[str, int | None] = dict.fromkeys(RECORDS)
     good = check_names(folder, expected | {shard.path: shard.bytes for shard in record.shards}, findings)
     digests = read_digests(folder, findings)
@@ -165,8 +171,8 @@ def _told(record: ReleaseRecord) -> Told:
     }
     asked, coded = record.settings, record.depth or LOSSLESS
     return Told(
-        asked.window_frames, coded, settings,
-        by_town=record.splits.by == "town", both=asked.pairs == "both" and len(asked.tracks) == 2, rounded_as=coded.coding,
+        asked.window_frames, coded, settings, by_town=record.splits.by == "town", rounded_as=coded.coding,
+        both=asked.pairs == "both" and len(asked.tracks) == 2, prompts=record.prompts,
     )  # fmt: skip
 
 
@@ -211,7 +217,8 @@ def _verify_export(folder: Path, how: _How, findings: Findings) -> None:
     if is_tree:
         _verify_tree(folder, how, findings, record.depth)
     elif how.level != "structure":
-        _verify_exported_rows(folder, record, good, how, findings)
+        with in_place.put(actions=record.actions):
+            _verify_exported_rows(folder, record, good, how, findings)
 
 
 def _check_readme(folder: Path, record: ExportRecord, findings: Findings) -> None:
@@ -234,7 +241,7 @@ def _verify_exported_rows(folder: Path, record: ExportRecord, names: list[str], 
             tars = [name for name in names if name.endswith(".tar")]
             files = tuple(file for file in FILE_NAMES if file in record.codings)
             source, entries = found_tars(folder, tars, files, coded.coding, findings)
-            told = Told(depth=coded, rounded_as=coded.coding)
+            told = Told(depth=coded, rounded_as=coded.coding, prompts=record.prompts)
         else:  # depth is decoded there, and texts have no prompt that they could be held against
             source, entries = found_episodes(folder, names, findings)
             told, how = Told(rounded_as=coded.coding), replace(how, reader=None)

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from specimens_distill import make_caption, write_set
 
-from cosfly.products.captions import ACTIONS
+from cosfly.products.actions import action_tokens
 from cosfly.store import dump_json
 from distill.evaluation.bertscore import BertScoreConfig, Scorer, score_beside_floors
 from distill.evaluation.floors import coc_of, shuffled_groups, shuffled_places
@@ -38,7 +38,10 @@ def samples_of(count: int) -> list[Sample]:
     for number in range(count):
         words = " ".join(f"{value:.1f} m" for value in rng.uniform(5, 50, int(rng.integers(4, 40))))
         answer = coc_of(made).model_copy(
-            update={"reasoning_trace": f"The pedestrian keeps at {words}.", "flight_decision": ACTIONS[number % 5]}
+            update={
+                "reasoning_trace": f"The pedestrian keeps at {words}.",
+                "flight_decision": action_tokens()[number % 5],
+            }
         )
         found.append(made.model_copy(update={
             "sample_id": f"trajectory_{number // 50}_ORI_frame_{number % 50:05d}", "walk": f"walk_{number // 50}",

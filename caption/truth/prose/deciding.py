@@ -8,6 +8,7 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import gap
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.statements import Force, Said
+from cosfly.products.actions import kin_of
 
 # What a text argues for -> decisions that agree with it; sides are put in where the text names one.
 _SIDED = {"yaw": "yaw_{}_to_follow", "circle": "circle_{}", "strafe": "strafe_{}"}
@@ -131,6 +132,7 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> bool:
     are not known here. said: of the whole reasoning; last: of its last sentence, which is what it asks for where nothing is asked for
     plainly.
     """
+    decision = kin_of(decision)
     asked = [one for one in said if one.force == "directive"] or [one for one in said if one.force == "aim"]
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
     named = {one.action for one in asked if one.side}  # "turning the nose to the left": one turn, not two

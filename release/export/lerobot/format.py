@@ -23,7 +23,6 @@ import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
-from cosfly.products.captions import ACTIONS
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.runner import advance
@@ -77,7 +76,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     """
     fps, size_px = _fps(flights), _size(release)
     found = {decision for flight in flights for decision in flight.decisions}
-    tasks = tuple(decision for decision in ("", *ACTIONS) if decision in found)
+    tasks = tuple(decision for decision in ("", *release.record.closed_set) if decision in found)
     if unknown := found - set(tasks):
         raise InputError(
             "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]

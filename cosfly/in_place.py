@@ -17,17 +17,17 @@ _in_place: dict[str, Any] = {}
 _forget: list[Callable[[], None]] = []
 
 
-def in_place(name: str) -> Any:
+def given(name: str) -> Any:
     """Give what stands in the place of a file that ships; None: nothing does."""
     return _in_place.get(name)
 
 
-def all_in_place() -> dict[str, Any]:
+def everything() -> dict[str, Any]:
     """Give everything that stands in the place of something, for a worker."""
     return dict(_in_place)
 
 
-def put_in_place(files: Mapping[str, Any]) -> None:
+def put_all(files: Mapping[str, Any]) -> None:
     """Put files in place of those that ship, by name; None takes one away."""
     changed = {name: value for name, value in files.items() if _in_place.get(name) != value}
     for name, value in changed.items():
@@ -44,11 +44,11 @@ def put_in_place(files: Mapping[str, Any]) -> None:
 def put(**files: Any) -> Iterator[None]:
     """Put files in place of those that ship while a block runs, whatever stood there before it; None: what ships."""
     before = {name: _in_place.get(name) for name in files}
-    put_in_place(files)
+    put_all(files)
     try:
         yield
     finally:
-        put_in_place(before)
+        put_all(before)
 
 
 def kept(most: int | None = None) -> Callable[[Function], Function]:

@@ -1,0 +1,320 @@
+"""The closed set of decisions, `actions.yaml`: tokens, their names in both languages, and the rules by which a motion shows them.
+
+One set ships, the paper's; another file of the same form may stand in its place (`caption.actions`), and what was made with it says so:
+`actions.json` beside captions, the records of training sets, evaluations and releases. How rules are measured lives in caption/truth/actions.py.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, field_validator, model_validator
+
+from cosfly import in_place
+from cosfly.config import Config, build, read_yaml
+from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.reading.documents import read_model
+from cosfly.reading.files import read_bytes
+from cosfly.store import write_bytes, write_model
+
+ACTIONS_FILE = Path(__file__).with_name("actions.yaml")
+ACTIONS_SCHEMA, ACTIONS_VERSION = "cosfly.actions", "1.0"
+OWN_ACTIONS = "actions.json"  # beside `captions.jsonl`, where the set is not the one that ships
+
+MOST_ACTIONS, MOST_TOKEN_CHARACTERS = 100, 40
+_TOKEN = re.compile(r"[a-z]+(?:_[a-z]+)*")
+RESERVED = ("none",)  # tables call so what is not there
+
+# What of a motion is measured: see Motion in caption/truth/actions.py. ordered: 1 where the mission orders the action itself.
+MEASURES = (
+    "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m", "approach_m",
+    "sweep_deg", "target_path_m", "visible_now", "visible_share", "ordered",
+)  # fmt: skip
+SETTING = (
+    "label."  # in front of a threshold that is a setting of `caption.label` (caption/schema.py); its settings are:
+)
+THRESHOLDS = (
+    "yaw_deg", "hard_turn_deg", "altitude_m", "speed_change_mps", "hover_mps", "moving_mps", "forward_m", "lateral_m", "approach_m",
+    "circle_deg",
+)  # fmt: skip
+
+_TERM = re.compile(
+    r"(?P<sign>-?)\s*(?:(?P<factor>\d+(?:\.\d+)?)\s*\*\s*)?(?:\|(?P<size>[a-z_]+)\||(?P<name>[a-z_]+(?:\.[a-z_]+)?)|(?P<number>\d+(?:\.\d+)?))"
+)
+_CONDITION = re.compile(r"(?P<left>[^<>=]+?)\s*(?P<how><=|>=|<|>)\s*(?P<right>[^<>=]+)")
+
+
+class Term:
+    """A value of a rule: `factor` times a measure, its size or a setting; times 1 for a number alone (name None)."""
+
+    def __init__(self, text: str) -> None:
+        found = _TERM.fullmatch(text.strip())
+        if found is None or (found["number"] and found["factor"]):
+            raise ValueError(f"{text.strip()!r} is no measure, setting or number, as in -0.5 * |left_m|")
+        self.name: str | None = found["size"] or found["name"]
+        self.is_size = found["size"] is not None
+        self.factor = (-1.0 if found["sign"] else 1.0) * float(found["factor"] or found["number"] or 1.0)
+        self.setting = self.name[len(SETTING) :] if self.name and self.name.startswith(SETTING) else None
+        if self.setting is not None and self.setting not in THRESHOLDS:
+            raise ValueError(
+                f"there is no threshold {self.name!r}{nearest(self.setting, THRESHOLDS)}; there are {', '.join(THRESHOLDS)}, or a number"
+            )
+        if self.name is not None and self.setting is None and self.name not in MEASURES:
+            raise ValueError(
+                f"{self.name!r} is not measured{nearest(self.name, MEASURES)}; there are {', '.join(MEASURES)}"
+            )
+
+
+class Condition:
+    """Two terms and how they must compare: <, <=, > or >=."""
+
+    def __init__(self, text: str) -> None:
+        found = _CONDITION.fullmatch(text.strip())
+        if found is None:
+            raise ValueError(f"{text!r} compares nothing, as in |yaw_deg| < label.yaw_deg")
+        self.left, self.how, self.right = Term(found["left"]), found["how"], Term(found["right"])
+
+
+class Size:
+    """A term in units of a threshold, which is a setting or a number."""
+
+    def __init__(self, text: str) -> None:
+        term, stroke, unit = text.partition("/")
+        if not stroke:
+            raise ValueError(f"{text!r} has no threshold, as in yaw_deg / label.yaw_deg")
+        self.term, self.unit = Term(term), Term(unit)
+        if self.unit.factor <= 0 or (self.unit.name is not None and self.unit.setting is None):
+            raise ValueError(f"{text!r}: the threshold must be a number over 0, or a setting of {SETTING}*")
+
+
+class Rule(Config):
+    """How much of an action a motion has, in units of its own threshold: the least of its sizes that can be measured, and nothing where a
+    condition fails. Without sizes 1 where the conditions hold, else -1."""
+
+    size: tuple[str, ...] = Field(
+        (), max_length=8, description="terms in units of a threshold; the least of them counts"
+    )
+    where: tuple[str, ...] = Field((), max_length=16, description="conditions that must all hold")
+    unless: tuple[str, ...] = Field(
+        (), max_length=16, description="conditions of which one must fail, or be of what nobody knows"
+    )
+
+    @field_validator("size")
+    @classmethod
+    def _are_sizes(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        for text in texts:
+            Size(text)
+        return texts
+
+    @field_validator("where", "unless")
+    @classmethod
+    def _are_conditions(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        for text in texts:
+            Condition(text)
+        return texts
+
+    @model_validator(mode="after")
+    def _says_something(self) -> Self:
+        if not (self.size or self.where or self.unless):
+            raise ValueError("a rule needs a size, where or unless")
+        return self
+
+    def terms(self) -> Iterator[Term]:
+        for size in map(Size, self.size):
+            yield from (size.term, size.unit)
+        for condition in map(Condition, (*self.where, *self.unless)):
+            yield from (condition.left, condition.right)
+
+
+class Both(Config):
+    en: str = Field(min_length=1, max_length=400, description="English")
+    zh: str = Field(min_length=1, max_length=400, description="Chinese")
+
+
+class Action(Config):
+    """One action of the set."""
+
+    group: str = Field(min_length=1, max_length=40, description="the heading under which tables show it")
+    en: str = Field(
+        min_length=2,
+        max_length=80,
+        pattern=r"^[a-z][a-z' -]*$",
+        description="its name in running English, an infinitive",
+    )
+    zh: str = Field(min_length=1, max_length=40, description="its name in running Chinese")
+    reason: Both = Field(
+        description="a sentence that justifies it and claims nothing measurable; the rule teacher writes it"
+    )
+    shown: Rule = Field(description="how much of it a motion has, negative for its opposite")
+    implied: Rule | None = Field(None, description="what makes it the label, from 1 on; null: nothing does")
+    contradicted_below: float | None = Field(
+        None, description="of `shown`: less contradicts the decision; null takes caption.label.absent_share"
+    )
+    reads_like: str | None = Field(
+        None,
+        description="an action that ships, whose words in texts (climbing, braking ...) speak of this one too; null: none",
+    )
+
+    @property
+    def is_order(self) -> bool:
+        """Whether missions order it and geometry never implies it."""
+        return self.implied is not None and any(term.name == "ordered" for term in self.implied.terms())
+
+
+class ActionSet(Config):
+    """The whole file."""
+
+    actions: dict[str, Action] = Field(
+        min_length=2, max_length=MOST_ACTIONS, description="token -> the action, in the order of prompts and tables"
+    )
+    precedence: tuple[tuple[str, ...], ...] = Field(
+        description="tokens: of the first line in which one is implied the most implied is the label"
+    )
+    terms: tuple[Both, ...] = Field(
+        (), max_length=500, description="words that a translation must have beside the actions' names"
+    )
+
+    @model_validator(mode="after")
+    def _is_one_set(self) -> Self:
+        problems = [
+            f"{token!r} is no token: words of small letters joined by _, at most {MOST_TOKEN_CHARACTERS}, and not {', '.join(RESERVED)}"
+            for token in self.actions
+            if not _TOKEN.fullmatch(token) or len(token) > MOST_TOKEN_CHARACTERS or token in RESERVED
+        ]
+        for what, names in (
+            ("letters", [token.replace("_", "") for token in self.actions]),
+            ("English name", [action.en for action in self.actions.values()]),
+            ("Chinese name", [action.zh for action in self.actions.values()]),
+        ):
+            problems += [
+                f"two actions have one {what}: {name}" for name in sorted({n for n in names if names.count(n) > 1})
+            ]
+        listed = [token for line in self.precedence for token in line]
+        problems += [
+            f"precedence names {token!r}, which is no action{nearest(token, self.actions)}"
+            for token in listed
+            if token not in self.actions
+        ]
+        problems += [f"precedence names {token} twice" for token in sorted({t for t in listed if listed.count(t) > 1})]
+        problems += [
+            f"{token} is implied by something and stands in no line of precedence"
+            for token in self.actions
+            if self.actions[token].implied and token not in listed
+        ]
+        problems += [
+            f"{token} reads like {action.reads_like!r}, which does not ship{nearest(action.reads_like, shipped_actions().tokens)}"
+            for token, action in self.actions.items()
+            if action.reads_like is not None and action.reads_like not in shipped_actions().tokens
+        ]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    @cached_property
+    def tokens(self) -> tuple[str, ...]:
+        return tuple(self.actions)
+
+
+class _ActionsFile(ActionSet):
+    """With what says which file it is."""
+
+    schema_: str = Field(alias="schema", pattern=f"^{ACTIONS_SCHEMA}$", description=ACTIONS_SCHEMA)
+    schema_version: str = Field(pattern=f"^{re.escape(ACTIONS_VERSION)}$", description="version of this form")
+
+
+def read_actions(path: Path) -> ActionSet:
+    """Read a file of actions.
+
+    Raises:
+        ConfigError: it is missing or malformed; names everything that is wrong.
+    """
+    found = build(_ActionsFile, read_yaml(path), path)
+    return ActionSet.model_construct(**{name: getattr(found, name) for name in ActionSet.model_fields})
+
+
+@in_place.kept()
+def shipped_actions() -> ActionSet:
+    """Give the set that ships."""
+    return read_actions(ACTIONS_FILE)
+
+
+def actions_in_use() -> ActionSet:
+    """Give the set that this process works with."""
+    return in_place.given("actions") or shipped_actions()
+
+
+def action_tokens() -> tuple[str, ...]:
+    """Give the tokens in use. Their order is that of schemas and of every table."""
+    return actions_in_use().tokens
+
+
+@in_place.kept()
+def kin_of(token: str) -> str:
+    """Give the action that ships whose words in texts speak of this one; the token itself where nobody says."""
+    action = actions_in_use().actions.get(token)
+    return (action.reads_like if action else None) or token
+
+
+def export_actions(path: Path) -> None:
+    """Write the file that ships, to begin with.
+
+    Raises:
+        ConfigError: there is something already.
+    """
+    if path.exists() or path.is_symlink():
+        raise ConfigError("there is something already", where=path, fix="choose another file")
+    write_bytes(path, read_bytes(ACTIONS_FILE))
+
+
+# --- beside what was made with it ---------------------------------------------------------------------------------------
+
+
+def write_own_actions(folder: Path) -> list[Path]:
+    """Put the set in use beside the captions that were made with it; nothing where it is the one that ships."""
+    actions = in_place.given("actions")
+    if actions is None:
+        return []
+    write_model(folder / OWN_ACTIONS, actions, schema=ACTIONS_SCHEMA, version=ACTIONS_VERSION)
+    return [folder / OWN_ACTIONS]
+
+
+def actions_beside(captions: Path) -> ActionSet | None:
+    """Give the set that captions were made with; None: the one that ships.
+
+    Raises:
+        InputError: the file is malformed.
+    """
+    path = captions.parent / OWN_ACTIONS
+    if not path.is_file():
+        return None
+    return read_model(path, ActionSet, schema=ACTIONS_SCHEMA, version=ACTIONS_VERSION, what="actions", tree=path.parent)
+
+
+def not_in_set(token: object, where: object) -> InputError:
+    """Give the error of a decision that is none of the set in use."""
+    return InputError(
+        "not an action of the closed set", where=str(where), got=str(token), expected=f"one of {', '.join(action_tokens())}",
+        fix=f"captions of a set of their own have {OWN_ACTIONS} beside them: keep both together",
+    )  # fmt: skip
+
+
+def one_set(sets: Iterable[tuple[object, ActionSet | None]]) -> ActionSet | None:
+    """Give the one set that all were made with; None: the one that ships. sets: whose, and which.
+
+    Raises:
+        InputError: they were made with different ones.
+    """
+    found = list(sets)
+    for whose, one in found[1:]:
+        if one != found[0][1]:
+            differ = sorted(set((one or shipped_actions()).tokens) ^ set((found[0][1] or shipped_actions()).tokens))
+            raise InputError(
+                "these were captioned with different sets of actions", where=str(whose),
+                got=f"another one than {found[0][0]}" + (f": {', '.join(differ)}" if differ else ", of the same tokens"),
+                expected="one set in all of them", fix="caption them with one file (caption.actions), or use them apart",
+            )  # fmt: skip
+    return found[0][1] if found else None

@@ -1,0 +1,306 @@
+"""An eighteenth action, from a file alone: labels, captions, students, release, verification, tables. No line of code names it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from teacher_server import TeacherServer
+from test_caption_actions import future
+from test_pipeline_tiny import TINY
+from typer.testing import CliRunner
+
+from caption.own_files import own_files
+from caption.run.stage import run as caption_run
+from caption.schema import CaptionConfig, LabelConfig
+from caption.truth.actions import Motion, is_contradicted, label_of, measure, table_of
+from caption.truth.released import read_released
+from cosfly import in_place, pipeline
+from cosfly.cli import app
+from cosfly.config import load
+from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.products.actions import (
+    ACTIONS_FILE,
+    MEASURES,
+    OWN_ACTIONS,
+    THRESHOLDS,
+    action_tokens,
+    actions_beside,
+    kin_of,
+    one_set,
+    read_actions,
+)
+from cosfly.products.captions import answer_schema, normalize_action, read_captions
+from cosfly.reading.documents import read_json
+from cosfly.settings import RunConfig
+from cosfly.splits import SPLITS
+from distill.evaluation import compare
+from distill.evaluation import stage as evaluate
+from distill.evaluation.floors import write_floors
+from distill.inference import stage as infer
+from distill.prepare import stage as prepare
+from distill.prepare.samples import PrepareConfig
+from distill.prepare.sources import Source as Prepared
+from distill.schema import open_split, read_training_set
+from release.export import stage as export
+from release.export.contract import ExportConfig
+from release.package import stage as package
+from release.package.config import ReleaseConfig
+from release.package.sources import Source
+from release.record import read_record
+from release.stats import stats
+from release.verify.verify import verify
+
+OWN = "cruise_along"
+ENTRY = """
+  cruise_along:
+    group: tracking
+    en: cruise along
+    zh: 巡航伴飞
+    reason: {en: A brisk and even pace keeps the flight smooth., zh: 轻快而均匀的节奏使飞行平顺。}
+    shown: {size: [mean_speed_mps / 0.5]}
+    implied: {size: [mean_speed_mps / 0.5], where: ["|altitude_m| < 2 * label.altitude_m", visible_now >= 1]}
+    reads_like: track_straight
+"""
+
+
+def with_own(path: Path, entry: str = ENTRY, line: str = f"  - [{OWN}]\n") -> Path:
+    """Write the file that ships with one more action, before manoeuvres and their parts."""
+    text = ACTIONS_FILE.read_text(encoding="utf-8")
+    text = text.replace("\n# The first line in which", entry + "\n# The first line in which").replace(
+        "  - [circle_left", f"{line}  - [circle_left"
+    )
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory) -> Path:
+    return with_own(tmp_path_factory.mktemp("actions") / "mine.yaml")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, mine) -> Path:
+    """The whole way with it: a map to a release."""
+    out = tmp_path_factory.mktemp("own") / "run"
+    more = [
+        f"caption.actions={mine}",
+        "caption.repair.soft_conflict=repair",
+        "release.num_frames=20",
+    ]
+    pipeline.run(load(RunConfig, None, [*TINY, *more]), out)
+    return out
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_names_that_rules_may_use_are_those_that_are_measured_and_set():
+    assert set(MEASURES) - {"ordered"} == set(Motion.__dataclass_fields__) - {"order"}
+    assert set(THRESHOLDS) == set(LabelConfig.model_fields) - {"absent_share"}
+
+
+def test_the_file_that_ships_can_be_written_and_checked(tmp_path):
+    path = tmp_path / "actions.yaml"
+    for words in (["--export", str(path)], ["--check", str(path)]):
+        result = CliRunner().invoke(app, ["caption", "actions", *words])
+        assert result.exit_code == 0, result.output
+    assert path.read_bytes() == ACTIONS_FILE.read_bytes()
+    assert isinstance(CliRunner().invoke(app, ["caption", "actions", "--export", str(path)]).exception, ConfigError)
+
+
+WRONG = [
+    ("mean_speed_mps / 0.5]}\n    implied", "meen_speed / 0.9]}\n    implied", r"'meen_speed' is not measured \(did you mean 'mean_speed_mps'\?\)"),
+    ("2 * label.altitude_m", "label.altitude", r"no threshold 'label\.altitude' \(did you mean 'altitude_m'\?\)"),
+    ("visible_now >= 1", "visible_now = 1", r"compares nothing"),
+    ("{size: [mean_speed_mps / 0.5]}", "{size: [mean_speed_mps]}", r"has no threshold"),
+    ("{size: [mean_speed_mps / 0.5]}", "{size: [mean_speed_mps / -1]}", r"must be a number over 0"),
+    ("{size: [mean_speed_mps / 0.5]}", "{}", r"a rule needs a size"),
+    ("cruise_along:", "Cruise Along:", r"is no token"),
+    ("cruise_along:", "h_over:", r"one letters: hover"),
+    ("en: cruise along", "en: hover", r"one English name: hover"),
+    ("    zh: 巡航伴飞\n", "", r"actions\.cruise_along\.zh: Field required"),
+    ("reads_like: track_straight", "reads_like: trak_straight", r"does not ship \(did you mean 'track_straight'\?\)"),
+    ("  - [cruise_along]", "  - [cruise]", r"precedence names 'cruise', which is no action.*cruise_along is implied by something"),
+    ("  - [cruise_along]", "  - [cruise_along, hover]", r"precedence names hover twice"),
+    ('schema_version: "1.0"', 'schema_version: "9.0"', r"schema_version"),
+    ("schema: cosfly.actions\n", "", r"schema: Field required"),
+    ("group: recovery\n    en: hover", "grup: recovery\n    en: hover", r"unknown setting \(did you mean 'group'\?\)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "told"), WRONG)
+def test_what_is_wrong_with_a_file_is_told(tmp_path, old, new, told):
+    path = with_own(tmp_path / "mine.yaml")
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=told):
+        read_actions(path)
+
+
+def test_a_set_that_lacks_what_the_rule_teacher_decides_is_refused(tmp_path):
+    text = ACTIONS_FILE.read_text(encoding="utf-8")
+    hover = text[text.index("  hover:\n") : text.index("  break_off:\n")]
+    path = tmp_path / "fewer.yaml"
+    path.write_text(text.replace(hover, "").replace("  - [hover]\n", ""), encoding="utf-8")
+    with (
+        pytest.raises(ConfigError, match="rule teacher decides what this set of actions does not hold; got hover"),
+        own_files(CaptionConfig(actions=path)),
+    ):
+        pass
+    with own_files(CaptionConfig(actions=path, teacher="http://localhost:1", writing="prose")):
+        assert len(action_tokens()) == 16
+        assert normalize_action("hover") is None
+        assert "hover" not in table_of(LabelConfig()).shown
+
+
+def test_rules_measure_as_they_say(mine):
+    fast, slow = ({"forward": 4.0, "target_step": (0.8, 0.0)}, {"forward": 1.0, "target_step": (0.2, 0.0)})
+    cfg = LabelConfig()
+    assert label_of(measure(future(**fast)), cfg) == "track_straight"
+    with in_place.put(actions=read_actions(mine)):
+        assert label_of(measure(future(**fast)), cfg) == OWN
+        assert label_of(measure(future(**slow)), cfg) == "track_straight"
+        assert label_of(measure(future(**fast, up=2.1)), cfg) == "ascend"  # it climbs too much
+        assert not is_contradicted(OWN, measure(future(**slow)), cfg)
+        assert is_contradicted(OWN, measure(future()), cfg)
+        assert normalize_action("Cruise-Along.") == OWN
+        assert answer_schema()["properties"]["flight_decision"]["enum"][-1] == OWN
+        assert kin_of(OWN) == "track_straight"
+    assert label_of(measure(future(**fast)), cfg) == "track_straight"
+    assert normalize_action(OWN) is None
+
+
+def test_a_value_that_nobody_knows_fulfils_no_condition(tmp_path):
+    entry = ENTRY.replace(
+        "implied: {size: [mean_speed_mps / 0.5], where:",
+        "implied: {size: [sweep_deg / 1.0, mean_speed_mps / 0.5], unless: [approach_m < 0], where:",
+    )
+    with in_place.put(actions=read_actions(with_own(tmp_path / "mine.yaml", entry))):
+        blind = measure(future(forward=4.0, target=(np.nan, np.nan)))
+        assert np.isnan(blind.sweep_deg)
+        assert dict(table_of(LabelConfig()).implied[3])[OWN](blind) == pytest.approx(4.0 / 2.5 / 0.5)
+
+
+# --- the whole way ----------------------------------------------------------------------------------------------------
+
+
+def test_it_is_labelled_decided_and_written_in_both_languages(whole, mine):
+    captions = [one for one in read_captions(whole / "caption/captions.jsonl") if one.status == "accepted"]
+    labels, decisions = Counter(one.label for one in captions), Counter(one.en.flight_decision for one in captions)
+    assert labels[OWN] > 5
+    assert decisions[OWN] > 5
+    own = next(one for one in captions if one.en.flight_decision == OWN)
+    assert "cruise along" in own.en.reasoning_trace
+    assert "巡航伴飞" in own.zh.reasoning_trace
+    assert OWN in own.prompt["en"].system
+    assert actions_beside(whole / "caption/captions.jsonl") == read_actions(mine)
+    assert json.loads((whole / "caption/caption_report.json").read_text())["labels"][OWN] == sum(
+        one.label == OWN for one in read_captions(whole / "caption/captions.jsonl")
+    )
+    listed = {entry["path"] for entry in json.loads((whole / "caption/manifest.json").read_text())["outputs"]}
+    assert OWN_ACTIONS in listed
+    assert action_tokens() == read_actions(ACTIONS_FILE).tokens  # nothing stays behind
+
+
+def test_captions_of_another_set_are_not_gone_on_with(whole):
+    with pytest.raises(ResumeError, match="the action table changed"):
+        caption_run(CaptionConfig(), whole / "render", whole / "caption")
+
+
+def test_the_release_says_so_and_verify_goes_by_that(whole, tmp_path):
+    dataset = whole / "release/dataset"
+    record = read_record(dataset / "release.json")
+    assert record.closed_set[-1] == OWN
+    assert record.numbers.captions.decision[OWN] > 0
+    report = verify(dataset, level="pixels", reader=read_released)
+    assert report.is_ok, str(report)
+    assert OWN in (dataset / "README.md").read_text(encoding="utf-8")
+
+
+def test_without_its_set_the_release_is_no_release(whole, tmp_path):
+    dataset = shutil.copytree(whole / "release/dataset", tmp_path / "dataset")
+    value = read_json(dataset / "release.json")
+    (dataset / "release.json").write_text(json.dumps(value | {"actions": None}))
+    report = verify(dataset, level="rows", reader=read_released)
+    codes = {kind.code for kind in report.kinds if kind.severity == "error"}
+    assert {"closed_set", "label"} <= codes
+    value["actions"]["actions"][OWN]["shown"] = {"size": ["os.system / 1"]}
+    (dataset / "release.json").write_text(json.dumps(value))
+    report = verify(dataset, level="rows", reader=read_released)
+    assert "record" in {kind.code for kind in report.kinds}
+
+
+@pytest.mark.parametrize("form", ["webdataset", "lerobot"])
+def test_exports_take_it_along(whole, tmp_path, form):
+    out = tmp_path / form
+    export.run(ExportConfig(format=form), whole / "release/dataset", out)
+    report = verify(out / form, level="rows", reader=read_released)
+    assert report.is_ok, str(report)
+
+
+def test_the_tables_show_it(whole, tmp_path):
+    stats.run(whole / "release/dataset", tmp_path / "stats", pixels=0)
+    rows = {table["key"]: table["rows"] for table in read_json(tmp_path / "stats/stats.json")["tables"]}
+    own = next(row for row in rows["decisions"] if row[0] == OWN)
+    assert own[1] > 0
+    assert own[-1] == "tracking"
+
+
+def test_runs_of_two_sets_go_into_no_release_and_no_training_set(whole, tmp_path):
+    plain = caption_run(CaptionConfig(), whole / "render", tmp_path / "plain")
+    mixed = [Source.of_run(whole), Source("other", whole / "render", plain)]
+    with pytest.raises(InputError, match=rf"different sets of actions.*{OWN}"):
+        package.run(ReleaseConfig(licence="cc-by-4.0"), mixed, tmp_path / "release")
+    both = [Prepared.of_run(whole), Prepared("other", whole / "render", plain)]
+    with pytest.raises(InputError, match="different sets of actions"):
+        prepare.run(PrepareConfig(too_few="fill"), both, tmp_path / "set")
+    (tmp_path / "bare").mkdir()
+    bare = tmp_path / "bare/captions.jsonl"
+    bare.write_bytes((whole / "caption/captions.jsonl").read_bytes())
+    with pytest.raises(InputError, match=rf"not an action of the closed set.*got {OWN}.*{re.escape(OWN_ACTIONS)}"):
+        prepare.run(
+            PrepareConfig(too_few="fill", unbound="accept"),
+            [Prepared("run", whole / "render", bare)],
+            tmp_path / "none",
+        )
+
+
+def test_one_set_is_one_set(mine):
+    assert one_set([]) is None
+    assert one_set([("a", None), ("b", None)]) is None
+    with pytest.raises(InputError, match="of the same tokens"):
+        one_set([("a", None), ("b", read_actions(ACTIONS_FILE).model_copy(update={"terms": ()}))])
+
+
+def test_students_are_asked_and_scored_with_it(whole, tmp_path):
+    cfg = PrepareConfig(modalities=("rgb",), too_few="fill", val_fraction=0.0, test_fraction=0.5)
+    prepare.run(cfg, [Prepared.of_run(whole)], tmp_path / "set")
+    record = read_training_set(tmp_path / "set")
+    assert record.actions is not None
+    assert record.actions.tokens[-1] == OWN
+    found = {split: list(open_split(tmp_path / "set", split)) for split in SPLITS if record.samples[split]}
+    split = next(split for split, samples in found.items() if any(sample.decision == OWN for sample in samples))
+    with TeacherServer(decision=lambda body: OWN) as server:
+        asking = infer.InferConfig.model_validate(
+            {"split": split, "engine": "endpoint", "constrained": True, "max_samples": 6, "endpoint": {"max_tries": 1}}
+        )
+        predictions = infer.run(asking, tmp_path / "set", [whole / "render"], server.url, tmp_path / "infer")
+        body = json.loads(server.bodies[0])
+    assert OWN in json.dumps(body["response_format"])
+    report = read_json(
+        evaluate.run(evaluate.EvaluateConfig(resamples=100), predictions, tmp_path / "set", tmp_path / "one")
+    )
+    assert report["actions"]["actions"][OWN]
+    confusion = report["all"]["who"]["student"]["confusion"]
+    assert any(OWN in row for row in confusion.values())
+    floors = write_floors(tmp_path / "set", split, tmp_path / "floors", 0)
+    other = evaluate.run(evaluate.EvaluateConfig(resamples=100), floors[0], tmp_path / "set", tmp_path / "two")
+    compare.run(compare.CompareConfig(resamples=100), [tmp_path / "one", other.parent], tmp_path / "side")
+    assert OWN in (tmp_path / "side/comparison.html").read_text(encoding="utf-8")
