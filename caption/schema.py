@@ -21,6 +21,7 @@ from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.config import Config, MayDiffer
 from cosfly.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.products.captions import KeyframeRecord, LabelFrom, TeacherKind, Verdict, Writing
+from cosfly.products.places import FlightChoice
 from cosfly.products.predictions import PREDICTIONS
 from cosfly.student_chat import MAX_ANSWER_TOKENS
 
@@ -112,6 +113,10 @@ class Window:
 
 
 class WindowConfig(Config):
+    formerly: ClassVar[dict[str, str]] = {
+        "label_without_perturbation": "labels always come from the motion without its perturbation now; take the line out"
+    }
+
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, one time step apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
@@ -185,6 +190,8 @@ class EvidenceConfig(Config):
 
 class JudgeConfig(Config):
     """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+
+    formerly: ClassVar[dict[str, str]] = {"open_flights": "judgements are kept a flight at a time; take the line out"}
 
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
@@ -273,6 +280,7 @@ class CaptionConfig(Config):
         description="file with a closed set of actions of yours in the place of the one that ships: tokens, names in both languages, what the "
         "motion implies and contradicts; `cosfly caption actions --export FILE` writes one to begin with",
     )
+    flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")

@@ -15,6 +15,7 @@ from cosfly.overlay import Overlay
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import DEBUG_FILE, read_instance, read_meta, read_rgb, rgb_bytes
 from cosfly.products.instance_ids import read_instance_ids
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, find_flights, read_flight
 from cosfly.reading.arrays import read_picture
 from cosfly.store import inside, write_bytes
@@ -28,25 +29,25 @@ GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # at the paper's 0.5 s a frame twice as f
 BOX_COLOR = (255, 214, 10)
 
 
-def contact_sheet(tree: Path, out_png: Path) -> None:
+def contact_sheet(tree: Path, out_png: Path, choice: FlightChoice = ALL_FLIGHTS) -> None:
     """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask.
 
     Raises:
         InputError: no tree, or a frame that cannot be read.
     """
-    folders = find_flights(tree)
+    folders = find_flights(tree, choice)
     rows = [_row(read_flight(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
     write_bytes(out_png, _png_below(sheet, SHEET_BYTES))
 
 
-def preview_gif(tree: Path, out_gif: Path) -> None:
+def preview_gif(tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS) -> None:
     """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in.
 
     Raises:
         InputError: no tree, or the flight has no RGB frame.
     """
-    folders = find_flights(tree)
+    folders = find_flights(tree, choice)
     flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, "rgb.png")
     width, num = GIF_WIDTH_PX, 60

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
 from cosfly.reading.documents import read_json, read_model, read_object
-from cosfly.reading.files import sha256_file
+from cosfly.reading.files import files_named, sha256_file
 from cosfly.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ def fingerprint(path: Path) -> str:
         outputs = read_object(path / "manifest.json", what="manifest").get("outputs", [])
         return sha256_bytes(dump_json(outputs).encode())
     digest = hashlib.sha256()
-    for file in sorted(path.rglob(FLIGHT)):
+    for file in files_named(path, FLIGHT):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
     return digest.hexdigest()
 

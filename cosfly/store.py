@@ -138,14 +138,17 @@ def remove_partials(folder: Path) -> None:
 LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
 
 
-def inside(root: Path, name: str) -> Path:
+def inside(root: Path, name: str, *, beside: bool = False) -> Path:
     """Join a name from a file to a root.
+
+    Args:
+        beside: a link may lead into the folder that the root stands in.
 
     Raises:
         InputError: the name leads out of the root, or a link that stands there does; or no file can have it.
     """
     plain = _plain_name(root, name)
-    check_stays_below(root / plain, root)
+    check_stays_below(root / plain, root, beside=beside)
     return root / plain
 
 

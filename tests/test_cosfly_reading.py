@@ -404,14 +404,55 @@ def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
     assert read_depth(tmp_path / "data" / frame.relative_to(frame.parents[4])).shape == (4, 4)
 
 
-def test_a_whole_folder_behind_a_link_is_refused_too(tmp_path):
-    elsewhere = _frame(tmp_path / "elsewhere")
-    (elsewhere / "depth.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
-    flight = tmp_path / "tree/Town01/trajectory_1/ORI"
+def _linked_flight(tree: Path, elsewhere: Path) -> Path:
+    """A tree whose one flight is a link to a folder of the same place below `elsewhere`; gives its frame by the tree's name."""
+    frame = _frame(elsewhere)
+    (frame / "depth.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
+    flight = tree / "Town01/trajectory_1/ORI"
     flight.parent.mkdir(parents=True)
-    flight.symlink_to(elsewhere.parents[1])
+    flight.symlink_to(frame.parents[1])
+    return flight / "frames_playback/frame_00000"
+
+
+def test_a_flight_behind_a_link_is_read_inside_the_folder_of_its_tree_and_refused_outside(tmp_path, limited):
+    assert read_depth(_linked_flight(tmp_path / "data/tree", tmp_path / "data/elsewhere")).shape == (4, 4)
+    outside = _linked_flight(tmp_path / "other/tree", tmp_path / "elsewhere")
     with pytest.raises(InputError, match="leads out"):
-        read_depth(flight / "frames_playback/frame_00000")
+        read_depth(outside)
+    limited(follow_links=True)
+    assert read_depth(outside).shape == (4, 4)
+
+
+def test_nothing_in_a_linked_flight_leads_out_of_it(tmp_path):
+    frame = _linked_flight(tmp_path / "data/tree", tmp_path / "data/elsewhere")
+    private = tmp_path / "data/private.npy"
+    private.write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
+    (frame / "depth.npy").unlink()
+    (frame / "depth.npy").symlink_to(private)
+    with pytest.raises(InputError, match="leads out"):
+        read_depth(frame)
+
+
+def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, limited, caplog):
+    tree = tmp_path / "data/tree"
+    for place in ("tree/Town01/a/ORI", "beside/Town02/b/ORI", "tree/Town01/.hidden/ORI"):
+        (tmp_path / "data" / place).mkdir(parents=True)
+        (tmp_path / "data" / place / "trajectory.json").write_text("{}")
+    (tmp_path / "far/ORI").mkdir(parents=True)
+    (tmp_path / "far/ORI/trajectory.json").write_text("{}")
+    (tree / "Town02").symlink_to(tmp_path / "data/beside/Town02")
+    (tree / "Town01/far").symlink_to(tmp_path / "far")
+    (tree / "Town01/round").symlink_to(tree)  # and round again
+    (tree / "Town01/gone").symlink_to(tmp_path / "nowhere")
+
+    def found() -> list[str]:
+        return [path.parent.relative_to(tree).as_posix() for path in files.files_named(tree, "trajectory.json")]
+
+    assert found() == ["Town01/a/ORI", "Town02/b/ORI"]
+    assert "far: leads to" in caplog.text
+    assert "--set reading.follow_links=true" in caplog.text
+    limited(follow_links=True)
+    assert found() == ["Town01/a/ORI", "Town01/far/ORI", "Town02/b/ORI"]
 
 
 def test_the_cache_of_the_hub_is_one_tree(tmp_path):

@@ -132,7 +132,7 @@ async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig) -> dic
 
 
 def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
-    for flight in allot(named_flights(data), cfg)[0]:
+    for flight in allot(named_flights(data, cfg.flights), cfg)[0]:
         yield from (window for window in flight.windows(cfg) if window.problem is None)
 
 

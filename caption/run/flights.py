@@ -16,7 +16,7 @@ from caption.schema import CaptionConfig, Window, WindowConfig
 from caption.windows import current_frames, cut_windows
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import caption_lines, write_caption_lines
-from cosfly.products.places import flight_ids, place_of
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice, flight_ids, place_of
 from cosfly.products.playback import Flight, find_flights, flight_of, read_flight, read_twin
 
 log = logging.getLogger(__name__)
@@ -76,13 +76,13 @@ def _twin_of(flight: Flight) -> Flight | None:
         return None
 
 
-def named_flights(data: Path) -> list[tuple[str, Path]]:
+def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
     """Give (flight id, folder) in the order of the product.
 
     Raises:
-        InputError: two flights have one place below two folders, so their samples could not be told apart.
+        InputError: none is chosen, or two flights have one place below two folders, so their samples could not be told apart.
     """
-    folders = find_flights(data)
+    folders = find_flights(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])
     named = [(ids[place_of(folder)], folder) for folder in folders]
     return sorted(named, key=lambda pair: f"{pair[0]}_frame_")  # the order of their sample ids

@@ -98,7 +98,7 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
 
 def _forecast(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> Forecast:
     stage = open_stage(cfg, data, out, seed, resume)
-    allotted, _ = allot(named_flights(data), cfg)
+    allotted, _ = allot(named_flights(data, cfg.flights), cfg)
     left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]
     guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
     num_windows = sum(guesses[flight.name] for flight in left)

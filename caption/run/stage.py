@@ -81,7 +81,7 @@ def _run(
     was_whole = stage.is_complete and not _has_more(stage, cfg)
     if was_whole and not (retry_failed and _has_refused(stage, cfg)):
         return out / PRODUCT
-    allotted, is_cut = allot(named_flights(data), cfg)
+    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         asked = Asked(_run_embedded(stage, allotted, cfg, seed, workers, watch))

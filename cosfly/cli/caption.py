@@ -39,6 +39,8 @@ def caption(
         bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
     ] = None,
     data: options.Data = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")
     ] = None,
@@ -77,7 +79,7 @@ def caption(
         "caption.limit": limit,
     }
     chosen |= {"caption.budget.max_cost": max_cost, "caption.budget.max_tokens": max_tokens}
-    chosen |= {"seed": seed, "workers": workers}
+    chosen |= {"seed": seed, "workers": workers} | options.chosen_flights("caption.flights", flights, tracks)
     cfg = options.resolve(config, overrides, chosen)
     tree = options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
@@ -188,6 +190,8 @@ def caption_judge_check(
 def caption_compare_strategies(
     out: Annotated[Path, typer.Option(help="Folder for compare_strategies.json and the answers.")],
     data: options.Data = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     teacher: Annotated[str | None, typer.Option(help="rules, or the URL of an endpoint. [default: rules]")] = None,
     model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
     conflicts: Annotated[int, typer.Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
@@ -201,6 +205,7 @@ def caption_compare_strategies(
     from cosfly.console import console
 
     chosen = {"caption.teacher": teacher, "caption.endpoint.model": model, "seed": seed}
+    chosen |= options.chosen_flights("caption.flights", flights, tracks)
     cfg = options.resolve(config, overrides, chosen)
     options.set_aside(out, repair)
     comparisons = compare.run(cfg.caption, options.data_folder(data), out, seed=cfg.seed, conflicts=conflicts)

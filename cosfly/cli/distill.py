@@ -35,6 +35,8 @@ def distill_prepare(
         list[Path] | None, typer.Option(help="captions.jsonl of a tree; repeat both for several.")
     ] = None,
     data: options.Trees = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     limit: Annotated[
         int | None, typer.Option(help="Windows in all splits together, of each decision and flight its share; 0: all.")
     ] = None,
@@ -54,7 +56,9 @@ def distill_prepare(
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], strict=True)]
-    cfg = options.resolve(config, overrides, {"seed": seed, "distill.prepare.limit": limit})
+    chosen = {"seed": seed, "distill.prepare.limit": limit}
+    chosen |= options.chosen_flights("distill.prepare.flights", flights, tracks)
+    cfg = options.resolve(config, overrides, chosen)
     options.verify_first(verify, *(path for source in sources for path in (source.data, source.captions)), out)
     typer.echo(prepare.run(cfg.distill.prepare, sources, out, seed=cfg.seed, resume=resume))
 

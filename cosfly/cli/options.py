@@ -44,7 +44,19 @@ TimePool = Annotated[
     Path | None, typer.Option(help="YAML file with times of day of yours in the place of those that ship.")
 ]
 Data = Annotated[
-    Path | None, typer.Option("--data", help="Playback tree; by default that of the run folder one stands in.")
+    list[Path] | None,
+    typer.Option("--data", help="Playback tree, one; by default that of the run folder one stands in."),
+]
+Flights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--flights", metavar="GLOB",
+        help="Only flights whose folder in the tree, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; may be repeated.",
+    ),
+]  # fmt: skip
+Tracks = Annotated[
+    Literal["clean", "perturbed", "both"] | None,
+    typer.Option("--tracks", help="Only flights of this track. [default: both]"),
 ]
 
 
@@ -73,7 +85,7 @@ def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str
     from cosfly.store import dump_json
 
     texts = {
-        name: value if isinstance(value, int | float) else str(value)
+        name: value if isinstance(value, int | float | list) else str(value)
         for name, value in given.items()
         if value is not None
     }
@@ -136,10 +148,25 @@ def check_failures(counts_by_stage: dict[str, Tally], where: Path, cfg: RunConfi
         )
 
 
-def data_folder(data: Path | None) -> Path:
+def chosen_flights(section: str, flights: list[str] | None, tracks: str | None) -> dict[str, Any]:
+    """Give what --flights and --tracks say, as settings of a section."""
+    return {
+        f"{section}.match": flights or None,
+        f"{section}.tracks": {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}.get(
+            tracks or ""
+        ),
+    }
+
+
+def data_folder(data: list[Path] | None) -> Path:
     """The playback tree: given, or that of the run folder one stands in."""
-    if data is not None:
-        return data
+    if data is not None and len(data) > 1:
+        raise InputError(
+            "this command takes one playback tree", where="--data", got=f"{len(data)}: {', '.join(map(str, data))}",
+            fix="run it once for each tree; distill and release take the results of several together",
+        )  # fmt: skip
+    if data:
+        return data[0]
     for candidate in (Path("render"), Path()):
         if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
             return candidate

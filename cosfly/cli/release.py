@@ -29,6 +29,8 @@ def release_build(
         list[Path] | None,
         typer.Option(help="Playback tree, also of others; by default that of the run folder one stands in."),
     ] = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     frames: Annotated[
         str | None, typer.Option(metavar="N|all", help="Frames of each flight, in evenly spread runs; or all of them.")
     ] = None,
@@ -52,7 +54,13 @@ def release_build(
                 "give --data and --captions, and --inspect or none, one of each for a tree; or run folders"
             )
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
-    cfg = options.resolve(config, [*(overrides or []), *_frames_setting(frames)], {"workers": workers})
+    given_flights = options.chosen_flights("release", flights, tracks)
+    chosen = {
+        "workers": workers,
+        "release.flights": given_flights["release.match"],
+        "release.tracks": given_flights["release.tracks"],
+    }
+    cfg = options.resolve(config, [*(overrides or []), *_frames_setting(frames)], chosen)
     options.set_aside(out, repair)
     options.verify_first(verify, *(path for source in sources for path in source.files.values()), out)
     given = options.manner(cfg, resume)

@@ -300,16 +300,22 @@ def render_sample(
 def gallery(
     out: Annotated[Path, typer.Option(help="Folder for contact_sheet.png and preview.gif.")],
     data: options.Data = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
 ) -> None:
     """A contact sheet and a preview GIF of a playback tree."""
+    from cosfly.config import build
     from cosfly.gallery import contact_sheet, preview_gif
+    from cosfly.products.places import FlightChoice
 
     options.resolve(config, overrides)
     tree = options.data_folder(data)
-    contact_sheet(tree, out / "contact_sheet.png")
-    preview_gif(tree, out / "preview.gif")
+    given = options.chosen_flights("", flights, tracks)
+    choice = build(FlightChoice, {name.strip("."): value for name, value in given.items() if value}, "the options")
+    contact_sheet(tree, out / "contact_sheet.png", choice)
+    preview_gif(tree, out / "preview.gif", choice)
     typer.echo(out)
 
 
@@ -349,6 +355,8 @@ def inspect(
         Path | None, typer.Option(help="Flights: drone_trace.json; none for a tree of somebody else.")
     ] = None,
     data: options.Data = None,
+    flights: options.Flights = None,
+    tracks: options.Tracks = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     workers: options.Workers = None,
@@ -362,7 +370,8 @@ def inspect(
     from cosfly.inspection import stage
 
     folder = _needed("--out", out)
-    cfg, tree = options.resolve(config, overrides, {"workers": workers}), options.data_folder(data)
+    chosen = {"workers": workers} | options.chosen_flights("inspect.flights", flights, tracks)
+    cfg, tree = options.resolve(config, overrides, chosen), options.data_folder(data)
     options.set_aside(folder, repair)
     options.verify_first(verify, map_, traces, tree, folder)
     product = stage.run(cfg.inspect, map_, traces, tree, folder, **options.manner(cfg, resume))

@@ -8,11 +8,13 @@ from pydantic import Field
 
 from cosfly.config import Config
 from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
+from cosfly.products.places import FlightChoice
 
 
 class InspectConfig(Config):
     """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
 
+    flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
     accel_rms_max_mps2: float = Field(
         ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
     )

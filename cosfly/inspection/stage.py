@@ -79,7 +79,7 @@ def run(
     if stage.is_complete:
         return product
     planned = None if traces is None else read_traces(traces)
-    names = [folder.relative_to(data).as_posix() for folder in find_flights(data)]
+    names = [folder.relative_to(data).as_posix() for folder in find_flights(data, cfg.flights)]
     every = cfg.check_pixels == "all"  # then a frame is a step
     items = [Item(name, name, num_steps=_num_frames(data / name) if every else None) for name in names]
     arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: flights"

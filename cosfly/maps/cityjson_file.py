@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_document, parse_json
+from cosfly.reading.documents import MISSING, parse_document, parse_json
 from cosfly.reading.files import read_unpacked
 from cosfly.reading.limits import limits, over_limit
 
@@ -236,9 +236,11 @@ def _transform(model: dict, path: Path) -> np.ndarray:
         return np.array([[1.0] * 3, [0.0] * 3])
     parts = []
     for name in ("scale", "translate"):
+        if not isinstance(transform, dict) or transform.get(name) is None:
+            raise InputError(MISSING, where=f"{path}: transform.{name}", expected="three finite numbers")
         try:
-            part = np.array(transform[name], dtype=np.float64) if isinstance(transform, dict) else np.empty(0)
-        except (KeyError, TypeError, ValueError):
+            part = np.array(transform[name], dtype=np.float64)
+        except (TypeError, ValueError):
             part = np.empty(0)
         if part.shape != (3,) or not np.isfinite(part).all():
             raise InputError("not a vector", where=f"{path}: transform.{name}", expected="three finite numbers")

@@ -18,7 +18,7 @@ from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
-from cosfly.reading.documents import check_schema, read_json, validation_errors
+from cosfly.reading.documents import MISSING, check_schema, read_json, validation_errors
 from cosfly.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
@@ -283,6 +283,8 @@ def read_boxes(path: Path) -> BoxMap:
         records = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path).pop("boxes", None)
         with validation_errors(path):
             header = MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
+        if records is None:
+            raise InputError(MISSING, where=f"{path}: boxes", expected="a list")
         if not isinstance(records, list):
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
+from cosfly.reading.documents import MISSING
 
 LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
 
@@ -29,7 +30,9 @@ def records(value: dict, name: str, path: Path | str) -> list[dict]:
 
 
 def text_id(record: dict, where: str) -> str:
-    if not isinstance(record.get("id"), str):
+    if record.get("id") is None:
+        raise InputError(MISSING, where=f"{where}.id", expected="text")
+    if not isinstance(record["id"], str):
         raise InputError("not an id", where=f"{where}.id", got=repr(record.get("id")), expected="text")
     return record["id"]
 
@@ -39,7 +42,7 @@ def column(record: dict, name: str, where: str, length: int | None = None) -> np
     try:
         column = np.array(record[name], dtype=np.float64)
     except KeyError:
-        raise InputError("missing", where=f"{where}.{name}", expected="a list of numbers") from None
+        raise InputError(MISSING, where=f"{where}.{name}", expected="a list of numbers") from None
     except (TypeError, ValueError):
         column = np.empty((0, 0))
     if column.ndim != 1 or len(column) == 0 or not is_in_range(column) or length not in (None, len(column)):
@@ -50,11 +53,13 @@ def column(record: dict, name: str, where: str, length: int | None = None) -> np
 
 def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
     """Read a list of vectors of finite numbers, (n, width) float64."""
+    if record.get(name) is None:
+        raise InputError(MISSING, where=f"{where}.{name}", expected=f"a list of {width} finite numbers each")
     try:
-        matrix = np.array(record.get(name), dtype=np.float64)
+        matrix = np.array(record[name], dtype=np.float64)
     except (TypeError, ValueError):
         matrix = np.empty((0, 0))
     if matrix.ndim != 2 or matrix.shape[1] != width or not is_in_range(matrix):
-        got, expected = repr(record.get(name))[:60], f"{width} finite numbers each"
+        got, expected = repr(record[name])[:60], f"{width} finite numbers each"
         raise InputError("not a list of vectors", where=f"{where}.{name}", got=got, expected=expected)
     return matrix

@@ -8,16 +8,45 @@ inspections of such a tree fit the same tree under the newer name, and the other
 
 from __future__ import annotations
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Literal, get_args
 
+from pydantic import Field
+
+from cosfly.config import Config
 from cosfly.errors import InputError
+from cosfly.reading.files import is_below
 from cosfly.store import inside
 
 TOWN = "Town"  # what the name of a town's folder begins with
+
+
+Track = Literal["clean", "perturbed"]
+TRACKS: tuple[Track, ...] = get_args(Track)
+
+
+class FlightChoice(Config):
+    """Which flights of a tree a stage takes."""
+
+    match: tuple[str, ...] = Field(
+        (), description="patterns for their folders in the tree, as Town01/trajectory_17*/ORI or Town0[12]; empty: all"
+    )
+    tracks: tuple[Track, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
+
+    def names(self, folder: str) -> bool:
+        """Tell whether a pattern names a flight by its folder in the tree, or by a folder above it."""
+        parts = folder.split("/")
+        heads = ["/".join(parts[:count]) for count in range(1, len(parts) + 1)]
+        return not self.match or any(fnmatchcase(head, pattern.strip("/")) for pattern in self.match for head in heads)
+
+
+ALL_FLIGHTS = FlightChoice()
 
 
 @dataclass(frozen=True, order=True)
@@ -42,15 +71,21 @@ def town_folder(name: str) -> str:
 
 
 def place_of(folder: Path, run: str = "") -> Place:
-    """Tell a flight's place from its folder."""
-    town, trajectory, variant = ("", "", *folder.resolve().parts)[-3:]
+    """Tell a flight's place from its folder, as it is called in its tree, where it may be a link."""
+    town, trajectory, variant = ("", "", *Path(os.path.abspath(folder)).parts)[-3:]
     return Place(run, town, trajectory, variant)
 
 
 def tree_of_flight(folder: Path) -> Path:
-    """Give the tree that a flight's folder stands in by its name: no link in it may lead out of that."""
+    """Give the tree that a flight's folder stands in by its name: no link in it may lead out of that.
+
+    Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its files must be its own.
+    """
     parents = folder.absolute().parents
-    return parents[min(2, len(parents) - 1)]
+    tree = parents[min(2, len(parents) - 1)]
+    real, root = os.path.realpath(folder), os.path.realpath(tree)
+    is_beside = not is_below(real, root) and is_below(real, os.path.dirname(root))
+    return Path(real) if is_beside else tree
 
 
 def stand(root: Path, folder: str) -> Path:
@@ -59,12 +94,12 @@ def stand(root: Path, folder: str) -> Path:
     Returns:
         the folder under the given name where it stands under neither.
     Raises:
-        InputError: the name leads out of the tree.
+        InputError: the name leads out of the tree, or a link there out of the tree's parent folder.
     """
-    found = inside(root, folder)
+    found = inside(root, folder, beside=True)
     *above, town, trajectory, variant = ("", "", "", *Path(folder).parts)
     others = (town_folder(town), town.removeprefix(f"{TOWN}_"))
-    places = [found, *(inside(root, str(Path(*above, other, trajectory, variant))) for other in others)]
+    places = [found, *(inside(root, str(Path(*above, other, trajectory, variant)), beside=True) for other in others)]
     return next((place for place in places if place.exists()), found)
 
 

@@ -12,7 +12,10 @@ project sees the right-handed frame. Keys that we do not know are kept in `Fligh
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,7 +25,7 @@ from pydantic import ValidationError
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
-from cosfly.products.places import tree_of_flight
+from cosfly.products.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track, place_of, tree_of_flight
 from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
     BBOX,
@@ -39,6 +42,7 @@ from cosfly.products.trajectory import (
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import read_json
+from cosfly.reading.files import files_named
 from cosfly.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
@@ -225,17 +229,15 @@ def flight_of(sample_id: str) -> str:
     return sample_id.rpartition("_frame_")[0]
 
 
-def find_flights(root: Path) -> list[Path]:
-    """Find the folders that hold a `trajectory.json`, sorted.
+def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
+    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen.
 
     Raises:
-        InputError: the folder is missing or holds no flight.
+        InputError: the folder is missing or holds no flight, or none is chosen.
     """
     if not root.is_dir():
         raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check --data")
-    folders = sorted(
-        p.parent for p in root.rglob("trajectory.json") if not any(q.startswith(".") for q in p.relative_to(root).parts)
-    )
+    folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
         raise InputError(
             "not a playback tree",
@@ -244,7 +246,40 @@ def find_flights(root: Path) -> list[Path]:
             expected="Town*/trajectory_*/ORI/trajectory.json",
             fix="check --data",
         )
-    return folders
+    return chosen_flights(folders, root, choice)
+
+
+def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
+    """Give the flights of a tree that are chosen.
+
+    Raises:
+        InputError: none is.
+    """
+    chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
+    if folders and not chosen:
+        raise InputError(
+            "no flight of the tree has such a name", where=root, got=", ".join(choice.match),
+            expected=f"a pattern for {folders[0].relative_to(root).as_posix()} and its like", fix="check --flights",
+        )  # fmt: skip
+    if len(choice.tracks) < len(TRACKS):
+        chosen = [folder for folder in chosen if track_of(folder) in choice.tracks]
+        if not chosen:
+            raise InputError(
+                "no flight of the tree is of this track", where=root, got=", ".join(choice.tracks), fix="check --tracks"
+            )
+    return chosen
+
+
+def track_of(folder: Path) -> Track:
+    """Tell a flight's track: by its folder's name, and where that is another, by what its file says; one that cannot be read is perturbed."""
+    if folder.name == ORIGINAL:
+        return "clean"
+    if re.fullmatch(r"aug_\d+", folder.name):
+        return "perturbed"
+    try:
+        return "clean" if read_flight(folder, strict=False).is_original else "perturbed"
+    except InputError:
+        return "perturbed"
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -264,7 +299,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     if not isinstance(raw, dict):
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
     reader = FieldReader(path, strict)
-    trajectory, variant = folder.resolve().parent.name, folder.resolve().name
+    _, town, trajectory, variant = astuple(place_of(folder))
     reader.header(raw, (variant, trajectory))
     points = reader.points(raw)
     time_s, poses = reader.times(points), reader.poses(points)
@@ -280,7 +315,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     )
     camera = reader.camera(raw.get("camera"))
     return Flight(
-        town=folder.resolve().parent.parent.name,
+        town=town,
         trajectory=trajectory,
         variant=variant,
         camera=camera,
@@ -319,7 +354,7 @@ def read_twin(flight: Flight) -> Flight | None:
     """
     if flight.is_original or flight.folder is None:
         return None
-    own = flight.folder.resolve()
+    own = Path(os.path.abspath(flight.folder))
     named = own.parent / ORIGINAL
     has_named = named != own and (named / "trajectory.json").exists()
     for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):

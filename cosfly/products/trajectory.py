@@ -14,7 +14,7 @@ from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import check_pixels
-from cosfly.reading.documents import validation_errors
+from cosfly.reading.documents import MISSING, validation_errors
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
@@ -30,6 +30,8 @@ class FieldReader:
         self.issues: list[str] = []
 
     def error(self, message: str, where: str, got: object, expected: str) -> InputError:
+        if str(got) in ("None", "NoneType"):
+            return InputError(MISSING, where=f"{self.path}: {where}", expected=expected)
         return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
 
     def issue(self, where: str, got: object, expected: str) -> None:

@@ -213,6 +213,9 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
         yield line, content
 
 
+MISSING = "the field is missing"
+
+
 def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dict:
     """Check that a JSON value is an object of the wanted schema and major version."""
     if not isinstance(value, dict):
@@ -220,6 +223,11 @@ def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dic
             "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"
         )
     kind, found = value.get("schema"), value.get("schema_version")
+    if kind is None or (kind == schema and found is None):
+        raise InputError(
+            MISSING, where=f"{path}: {'schema' if kind is None else 'schema_version'}",
+            expected=repr(schema if kind is None else version), fix="check that this is the file that was meant",
+        )  # fmt: skip
     if kind != schema:
         raise InputError(
             "not the expected kind of file", where=f"{path}: schema", got=repr(kind)[:80], expected=repr(schema)

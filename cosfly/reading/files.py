@@ -10,6 +10,7 @@ import errno
 import gzip
 import hashlib
 import io
+import logging
 import os
 import stat
 import zlib
@@ -18,6 +19,8 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.reading.limits import MB, limits, over_limit
+
+log = logging.getLogger(__name__)
 
 CHECK_PATH = "check the path"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -183,11 +186,41 @@ def sha256_file(path: Path, *, tree: Path | None = None) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def files_named(tree: Path, name: str) -> list[Path]:
+    """Find the files of a name below a tree, sorted; what begins with a dot is left out, and nothing is looked for below a folder that has one.
+
+    A folder that is a link is gone into where it leads to a place inside the tree's parent folder, or anywhere with `reading.follow_links`;
+    of others the log tells.
+    """
+    found: list[Path] = []
+    waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (os.path.realpath(tree),))]
+    parent = os.path.dirname(os.path.realpath(tree))
+    while waiting:
+        folder, above = waiting.pop()
+        with disk_errors(folder, "folder"), os.scandir(folder) as listed:
+            entries = {entry.name: entry for entry in listed if not entry.name.startswith(".")}
+        if name in entries:
+            found.append(folder / name)
+            continue
+        for entry in entries.values():
+            if entry.is_dir(follow_symlinks=False):
+                waiting.append((folder / entry.name, above))
+            elif entry.is_symlink() and entry.is_dir():
+                real = os.path.realpath(entry.path)
+                if not (limits().follow_links or is_below(real, parent)):
+                    log.warning(
+                        "%s: leads to %s, which is not looked at; --set reading.follow_links=true", entry.path, real
+                    )
+                elif real not in above and real != parent:  # a link to a folder above would go round for ever
+                    waiting.append((folder / entry.name, (*above, real)))
+    return sorted(found)
+
+
 # --- links ------------------------------------------------------------------------------------------------------------
 
 
-def check_stays_below(path: Path, tree: Path) -> None:
-    """Check that no symbolic link leads from a tree to a file outside.
+def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
+    """Check that no symbolic link leads from a tree to a file outside; `beside`: out of the folder that the tree stands in.
 
     The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to blobs, these are
     part of it.
@@ -201,14 +234,15 @@ def check_stays_below(path: Path, tree: Path) -> None:
         real, root = os.path.realpath(path), os.path.realpath(tree)
     except ValueError as error:  # a NUL in a name
         raise InputError("not a name of a file", where=tree, got=str(error)) from None
-    if not any(_is_below(real, allowed) for allowed in (root, *_blobs(Path(root)))):
+    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *_blobs(Path(root)))):
         raise InputError(
             "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
             fix="if you trust it, --set reading.follow_links=true",
         )  # fmt: skip
 
 
-def _is_below(path: str, root: str) -> bool:
+def is_below(path: str, root: str) -> bool:
+    """Tell of two real paths whether the first is the second or stands below it."""
     return path == root or path.startswith(root.rstrip(os.sep) + os.sep)
 
 

@@ -10,7 +10,7 @@ import logging
 import os
 from collections import Counter
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -51,6 +51,10 @@ FROM_ONE_RUN = "give the others.json that was written beside the walks' path.jso
 
 class RenderConfig(WeatherConfig):
     """Camera, tracks, weather and files of the frames."""
+
+    formerly: ClassVar[dict[str, str]] = {
+        "png_compression": "it went with zlib: pictures are packed by an encoder of cosfly's own, which has no levels; take the line out",
+    }
 
     backend: Literal["gl", "pyrender"] = Field(
         "gl",

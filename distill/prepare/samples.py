@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from cosfly.errors import InputError
 from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, parse_answer
+from cosfly.products.places import FlightChoice
 from cosfly.store import dump_json
 from distill.prepare.splitting import SplitConfig
 from distill.schema import Sample
@@ -19,6 +20,7 @@ Rung = Literal["hint", "multi_sample", "anchored", "fix_label"]
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
+    flights: FlightChoice = Field(FlightChoice(), description="which flights of the trees")
     languages: tuple[Language, ...] = Field(
         ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
     )

@@ -14,8 +14,8 @@ from cosfly.frame_views import VIEW_FILES, View
 from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.frames import frame_name
-from cosfly.products.places import Place, flight_ids, folder_name, stand
-from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, stand
+from cosfly.products.playback import find_flights, read_flight, sample_id, track_of
 from cosfly.provenance import was_made_of
 from cosfly.reading.files import check_stays_below
 from cosfly.splits import Course, walks_of
@@ -112,6 +112,12 @@ class CaptionedFlight:
     @property
     def folder(self) -> Path:
         return self.source.data / self.town / self.trajectory / self.variant
+
+    def is_chosen(self, choice: FlightChoice) -> bool:
+        """Tell whether a flight is one of those that are chosen."""
+        return choice.names(f"{self.town}/{self.trajectory}/{self.variant}") and (
+            len(choice.tracks) == len(TRACKS) or track_of(self.folder) in choice.tracks
+        )
 
     def sample_id(self, caption: Caption) -> str:
         return caption.sample_id if self.flight_id is None else sample_id(self.flight_id, caption.frame_index)

@@ -56,6 +56,7 @@ class _Windows:
         self._cfg, self._sources = cfg, sources
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
+        self._is_chosen = lru_cache(maxsize=16)(lambda flight: flight.is_chosen(cfg.flights))
         self.walks: Mapping[str, str] = {}
         self.count = 0
 
@@ -70,6 +71,9 @@ class _Windows:
             raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
         caption.town = flight.town  # the tree may have been converted since
         window = _Window(flight, flight.sample_id(caption), [], [])
+        if not self._is_chosen(flight):
+            window.left_out.extend(["not_chosen"] * len(self._cfg.languages))
+            return window
         walk = self.walks.get(flight.key, "")
         for language in self._cfg.languages:
             sample = make_sample(caption, language, self._cfg, run=source.run, walk=walk, sample_id=window.sample_id)

@@ -7,8 +7,8 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.config import Config
 from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.products.places import Track
 from release.columns import SplitName
-from release.package.sources import Track
 from release.record import DepthCodingName, Pairs, SplitBy
 
 MB = 1024 * 1024
@@ -26,6 +26,10 @@ class ReleaseConfig(Config):
         400,
         ge=1,
         description="frames per flight, in evenly spread runs that keep captions' windows whole; shorter flights are whole, never padded; null: all",
+    )
+    flights: tuple[str, ...] = Field(
+        (),
+        description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI or Town0[12]; empty: all",
     )
     tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
     pairs: Pairs = Field(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
+from cosfly.products.places import FlightChoice
 from cosfly.stage_folder import StageFolder, Tally
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
@@ -113,7 +114,12 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
         InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight. ConfigError: no licence.
     """
     findings = Findings(stage)
-    material = gather(sources, include_review=cfg.include_review, accept_unbound=cfg.unbound == "accept")
+    material = gather(
+        sources,
+        include_review=cfg.include_review,
+        accept_unbound=cfg.unbound == "accept",
+        choice=FlightChoice(match=cfg.flights),
+    )
     flights, walks, left_out = survey(material.candidates, cfg.tracks, findings.tell)
     flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, findings.tell)
     left_out = left_out + without_twin

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
-from cosfly.products.places import Place, flight_ids, folder_name, stand, town_folder
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.playback import find_flights
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
@@ -21,7 +20,7 @@ from cosfly.reading.files import check_stays_below, read_text
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
-Track = Literal["clean", "perturbed"]
+NOT_CHOSEN = "not chosen"  # why a flight is left out that `release.flights` does not name
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,10 @@ class Material:
     trajectories: TrajectoryFunnel | None
 
 
-def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool) -> Material:
-    """Read the inspections of the runs, and list their flights; of a tree without one all.
+def gather(
+    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: FlightChoice = ALL_FLIGHTS
+) -> Material:
+    """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen are left out.
 
     Raises:
         InputError: a file cannot be read, two runs or flights cannot be told apart, or nobody says of which tree the captions were made.
@@ -149,24 +150,32 @@ def gather(sources: list[Source], *, include_review: bool, accept_unbound: bool)
             )  # fmt: skip
         if source.inspect is None:
             for folder in find_flights(source.data):
-                found.append((number, _place(source, folder.relative_to(source.data)), folder, None, None, None))
+                inner = folder.relative_to(source.data)
+                found.append((number, _place(source, inner), folder, _not_chosen(choice, inner.as_posix()), None, None))
             continue
         inspection = read_settled(source.inspect)
         inspections.append(inspection)
         saw_older = was_made_of(source.inspect, "data") not in (None, fingerprint(source.data))
         for flight in inspection.flights:
             left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
+            left_out = left_out or _not_chosen(choice, flight.folder)
             folder = stand(source.data, flight.folder)
             sha256 = None if saw_older else flight.sha256
             five_ray = flight.metrics.get("five_ray_mean")
             found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256, five_ray))
+    # What is left out makes no name longer: `release verify` knows the released ones alone.
     ids = flight_ids([place for _, place, *_ in found])
+    ids |= flight_ids([place for _, place, _, left_out, *_ in found if left_out is None])
     candidates = [
         Candidate(number, place, folder, ids[place], left_out, sha256, five_ray)
         for number, place, folder, left_out, sha256, five_ray in found
     ]
     num_inspected = sum(len(inspection.flights) for inspection in inspections)
     return Material(candidates, num_inspected, _sum_of(inspections) if inspections else None)
+
+
+def _not_chosen(choice: FlightChoice, folder: str) -> str | None:
+    return None if choice.names(folder) else NOT_CHOSEN
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:

@@ -11,10 +11,11 @@ import numpy as np
 from cosfly.console import progress_bar
 from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
+from cosfly.products.places import Track
 from cosfly.products.playback import Flight, read_flight
 from cosfly.splits import Course, town_family, walks_of
 from release.columns import SplitName
-from release.package.sources import Candidate, Track
+from release.package.sources import Candidate
 from release.record import Pairs, SplitBy
 from release.splits import split_groups
 
