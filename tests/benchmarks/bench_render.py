@@ -34,13 +34,12 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.products import frames
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.frames import Camera
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.render import flight
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
-from cosfly.render.perturbation import Perturbed, Poses
+from cosfly.render.perturbation import Surroundings
 from cosfly.render.stage import RenderConfig, open_renderer, script_flight
 
 SIZE = (1280, 720)
@@ -265,10 +264,8 @@ def memory(num_frames: int) -> list[list[Any]]:
     renderer = open_renderer("gl", box_map, small.width_px, small.height_px)
     writing = Writing(tuple(small.modalities), small.visible_threshold)
     rows, done = [], 0
-    camera = Camera(small.width_px, small.height_px, intrinsic_matrix(small.width_px, small.height_px, 90.0))
-    nothing = Perturbed.nothing(Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m))
     while done < num_frames:
-        script = replace(script_flight(trace, 0, "clean", "Town", None, small, 0), camera=camera, perturbed=nothing)  # type: ignore[arg-type]
+        script = script_flight(trace, 0, "clean", "Town", Surroundings(simple), small, 0)
         with tempfile.TemporaryDirectory() as scratch:
             done += len(render_flight(renderer, script, Path(scratch), writing))
         if not rows or done - rows[-1][0] >= num_frames // 10:
