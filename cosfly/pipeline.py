@@ -25,10 +25,10 @@ import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
 from cosfly import estimate
+from cosfly.ahead import compiled_ahead
 from cosfly.errors import CosflyError, InputError
 from cosfly.folder_lock import hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
-from cosfly.planners.ahead import compiled_ahead
 from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
 from cosfly.reading.limits import use_limits
@@ -165,12 +165,11 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
     for stage in todo:
         refuse_link(out / stage.name)
     with _run_folder(cfg, out):
-        to_plan = not (out / "plan/manifest.json").exists()
+        undone = {stage.name for stage in todo if not (out / stage.name / "manifest.json").exists()}
         results = []
-        with compiled_ahead(cfg.plan.planner, needed=to_plan) as wait_for_compiled:
+        with compiled_ahead(cfg.plan.planner, undone) as wait_for_compiled:
             for number, stage in enumerate(todo, 1):
-                if stage.name == "plan" and to_plan:
-                    wait_for_compiled()
+                wait_for_compiled(stage.name)
                 results.append(_do(stage, out, f"{number}/{len(todo)}", left))
         tree = out / "render"
         if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():

@@ -28,6 +28,7 @@ SHARED = (
 ASSEMBLY = (
     "cli",
     "pipeline",
+    "ahead",
     "settings",
     "runs",
     "estimate",

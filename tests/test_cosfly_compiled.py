@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import cosfly
-from cosfly import compiled
-from cosfly.planners import ahead
+from cosfly import ahead, compiled
 
 DAY_S = 86400.0
 
@@ -78,29 +77,44 @@ def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
 # --- ahead of use -----------------------------------------------------------------------------------------------------
 
 
+FOUND = """
+from numba.core import event
+class Compiled(event.Listener):
+    def on_start(self, e): print("compiles", e.data["dispatcher"].py_func)
+    def on_end(self, e): pass
+event.register("numba:compile", Compiled())
+import cosfly.planners.stage as s
+s.warm_up(s.PlanConfig(planner='muco'))
+from cosfly import ahead
+ahead.compile_encoders()
+ahead.compile_inspection()
+print("done")
+"""
+
+
 @pytest.mark.slow
-def test_what_is_compiled_ahead_is_found_by_the_planner(tmp_path, monkeypatch):
+def test_what_is_compiled_ahead_is_found_by_the_stages(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the spare process
     monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(ahead, "WAIT_MAX_S", 600.0)
-    with ahead.compiled_ahead("muco") as wait:
-        wait()
-    assert (tmp_path / ahead._mark("muco")).exists()
-    code = "import cosfly.planners.stage as s\ns.warm_up(s.PlanConfig(planner='muco'))\nfrom cosfly.planners.muco.step import descend as d\nprint(len(d.stats.cache_hits), len(d.stats.cache_misses))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["1", "0"]
+    monkeypatch.setattr(ahead, "WAIT_MAX_S", 900.0)
+    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
+        for stage in ("maps", *ahead.STAGES, "release"):
+            wait(stage)
+            assert stage not in ahead.STAGES or (tmp_path / ahead._mark(stage, "muco")).exists()
+    done = subprocess.run([sys.executable, "-c", FOUND], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["done"]
     monkeypatch.setattr(ahead.subprocess, "Popen", None)
-    with ahead.compiled_ahead("muco") as wait:  # nothing is started where it was done before
-        wait()
+    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:  # nothing is started where it was done before
+        wait("plan")
 
 
 def test_the_spare_process_ends_with_the_one_that_started_it(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "cosfly.planners.ahead", "muco"]
+    command = [sys.executable, "-m", "cosfly.ahead", "muco"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as spare:
         spare.stdin.close()
         assert spare.wait(60) == 1
-    assert not (tmp_path / ahead._mark("muco")).exists()
+    assert not (tmp_path / ahead._mark("plan", "muco")).exists()
 
 
 def test_a_spare_process_that_takes_too_long_is_ended(tmp_path, monkeypatch):
@@ -109,21 +123,21 @@ def test_a_spare_process_that_takes_too_long_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(ahead, "WAIT_MAX_S", 0.0)
     monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[0])
-    with ahead.compiled_ahead("muco") as wait:
-        wait()
+    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
+        wait("plan")
         assert started[0].wait(60) == -signal.SIGKILL
 
 
-def test_nothing_is_compiled_ahead_where_nothing_is_to_be_planned(tmp_path, monkeypatch):
+def test_nothing_is_compiled_ahead_where_no_stage_needs_it(tmp_path, monkeypatch):
     monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(ahead.subprocess, "Popen", None)
-    with ahead.compiled_ahead("muco", needed=False) as wait:
-        wait()
+    with ahead.compiled_ahead("muco", {"maps", "release"}) as wait:
+        wait("plan")
 
 
 def test_a_run_goes_on_without_a_spare_process(tmp_path, monkeypatch):
     monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
     for broken in ("/nowhere/python", "false"):
         monkeypatch.setattr(ahead.sys, "executable", broken)
-        with ahead.compiled_ahead("muco") as wait:
-            wait()
+        with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
+            wait("plan")
