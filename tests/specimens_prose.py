@@ -330,4 +330,11 @@ CASES = [
     Case("zh", FOLLOW, R, "爬升 0.8 米之后高度为 20.4 米。", (("20.4", "18.9"),)),
     Case("en", FOLLOW, R, "Altitude twenty decimal four metres, over.", (("twenty decimal", "thirty decimal"),)),
     Case("en", FOLLOW, R, "At the end it is 3.4 m/s, against the walker's 1.4 m/s.", (("3.4", "1.4"), ("1.4", "2.9"))),
+    Case("en", FOLLOW, R, "We are 20.4 m above the street now and were at 18.0 m when the clip opened.", (("20.4", "28.4"), ("18.0", "28.0"))),
+    Case("en", DIVE, "descend", "Height lost so far, 5.0 m (30.0 to 25.0).", ()),
+    Case("en", FOLLOW, R, "v_drone 3.4 m/s (prev 2.9).", (("3.4", "2.4"), ("2.9", "6.9"))),
+    Case("en", FOLLOW, R, "Up we went by 0.8 m in half a second.", ()),
+    Case("en", HOLD, "search_to_reacquire_target", "Plain at t0, in view at t1, gone at t3, gone now.", ()),
+    Case("zh", FOLLOW, R, "人比中心高14像素。", (("14", "34"),)),
+    Case("en", FOLLOW, R, "Speeds: ours rose from 2.0 to 3.4 m/s, theirs fell from 1.5 to 1.4.", (("3.4", "6.4"),)),
 ]  # fmt: skip

@@ -59,6 +59,8 @@ def test_the_report_adds_up_and_repairs_stay_on_record(done):
     assert all(c.repair.strategy == "anchored" and c.en.flight_decision == c.label for c in repaired)
     first = sum(count for row in report["confusion_label_to_first_decision"].values() for count in row.values())
     assert first == sum(report["verdicts_of_first_answers"].values()) == 54
+    read = Counter((name, state) for c in captions for name, states in c.checks.sentences.items() for state in states)
+    assert {(name, state): n for name, row in report["sentences"].items() for state, n in row.items() if n} == read
     assert not (done / "parts").exists()
 
 

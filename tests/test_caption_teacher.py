@@ -91,11 +91,12 @@ def test_a_lasting_fault_drops_windows_with_its_reason(tree, tmp_path, fault, re
     assert windows == {"input": 2, "kept": 0, "dropped": {reason: 2}, "failed": {}}
 
 
-def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path):
+@pytest.mark.parametrize("writing", ["slots", "claims", "prose"])
+def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path, writing):
+    """In every way of writing the action that the reasoning came to stands before the decision."""
     with TeacherServer(first("wrong_therefore"), decision=lambda body: "ascend") as server:
-        captions = list(
-            read_captions(run(settings(server.url, limit=1, repair={"hard_conflict": "keep"}), tree, tmp_path / "out"))
-        )
+        cfg = settings(server.url, limit=1, repair={"hard_conflict": "keep"}, writing=writing)
+        captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert [c.status for c in captions] == ["accepted"]
     assert captions[0].checks.refused == ["decision_against_reasoning"]
     assert captions[0].therefore == captions[0].en.flight_decision == "ascend"

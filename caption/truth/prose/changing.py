@@ -46,6 +46,7 @@ class Changing:
             self.language == "zh"
             and (more := ZH_MORE.search(self.text[: numeral.start]))
             and self.clause.has("link", "than")
+            and not (numeral.unit == "px" and self.clause.has("quantity", "centre"))  # "比中心低 49 像素"
         ):
             return "change", -1 if more.group()[0] in "低近窄慢少小短" else 1
         if self._is_done(numeral):

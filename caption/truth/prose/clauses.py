@@ -200,13 +200,23 @@ def _is_in_list(at: int, found: list[Numeral]) -> bool:
     return sum(n.group == before.group for n in found) >= 3
 
 
+_OF_TIME = re.compile(
+    r"(?:\W|\b(?:at|in|by|on|the|then|and|from|during|over|for|of|so|now|but|only|just|as|already|still|here|this|that|very|first|last)\b)*"
+)
+
+
 def _is_time_alone(text: str, start: int, end: int, tokens: list[Token], found: list[Numeral]) -> bool:
     inside = [t for t in tokens if start <= t.start < end]
     is_time = any(t.kind == "time" and t.value != "past" for t in inside) and all(
         t.kind in ("time", "link", "position") for t in inside
     )
     is_free = not any(start <= n.start < end and n.unit not in ("s", "frames") for n in found)
-    return is_time and is_free and end - start <= (28 if text.isascii() else 9)
+    part, at = "", start
+    for t in sorted(tokens, key=lambda t: t.start):
+        if at <= t.start and t.end <= end:
+            part, at = part + text[at : t.start], t.end
+    is_alone = not text.isascii() or _OF_TIME.fullmatch(part + text[at:end]) is not None
+    return is_time and is_free and is_alone and end - start <= (28 if text.isascii() else 9)
 
 
 def _cut(text: str, tokens: list[Token], found: list[Numeral], language: Language) -> list[Clause]:

@@ -18,6 +18,10 @@ OVER_OTHER = re.compile(
 OVER_MOMENT = re.compile(
     r"\s*(?:above|over|below|beneath|under|higher than|lower than) (?:that of |that in |what it was |the value )?(?:at |in |of )?(?:the |our |its )?"
 )
+# "比画面中心低 49 像素": above or below it.
+OFF_CENTRE = re.compile(
+    r"比(?:画面|图像|镜头)?的?(?:中心|正中|中央|中点|画心)[点线]?(?:要|还|略|稍|偏|靠)*[高低上下](?:约|出|了)*\s*$"
+)
 _WAY_MORE = re.compile(r"[多少](?:走|飞)(?:出|了)?(?:约|大约)?\s*$")
 _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
@@ -43,6 +47,8 @@ class Naming:
             owner = ""
         if numeral.unit == "m" and OVER_OTHER.match(self.text, numeral.end):
             return ("height_over_target",), True
+        if numeral.unit == "px" and OFF_CENTRE.search(self.text, 0, numeral.start):
+            return ("offset_y",), True
         if self.differs_by_way(numeral):
             return ("way_difference",), True
         if self.over_moment(numeral) is not None:

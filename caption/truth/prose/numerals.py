@@ -174,7 +174,7 @@ def _side_of(match: re.Match[str], text: str, language: Language) -> int:
 
 
 EVERY_SECOND = re.compile(
-    r"\s*(?:of \w+ |in \w+ |in )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
+    r"\s*(?:of \w+ |in (?!half)\w+ |in )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
 )
 _PER_SECOND = re.compile(r"(?:每秒|一秒钟?(?=[能可]?[走飞跑移挪]))[^,#;。]*$")
 

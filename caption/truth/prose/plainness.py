@@ -36,6 +36,9 @@ _TURNS = re.compile(
 )
 
 
+_BACK = {"en": re.compile(r"\bback (?:at|to|up|down|on)\b"), "zh": re.compile(r"回到|又回|复又")}
+
+
 def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause, is_reasoning: bool) -> bool:
     """Tell whether a word that the window does not bear out is a contradiction."""
     text, language = sentence.text, sentence.language
@@ -44,6 +47,8 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
         return False
     if is_reasoning and clause.has("action") and not _is_told(part, clause, language):
         return False  # what to do
+    if found.kind == "trend" and _BACK[language].search(text, clause.start):
+        return False  # "went from 10.7 m down to 9.8 m and is back at 10.8 m"
     match found.kind:
         case "state":
             return (

@@ -69,9 +69,17 @@ class NumberReader:
             if numeral.unit not in ("s", "frames"):
                 groups.setdefault(numeral.group, []).append(i)
         for members in groups.values():
+            self._share_unit(members)
             self._read_group(members)
         self._join_courses()
         self._speeds()
+
+    def _share_unit(self, members: list[int]) -> None:
+        """Give the unit of the first number of a row to those of it that have none."""
+        first = self.sentence.numerals[members[0]]
+        for i in members[1:]:
+            if not self.sentence.numerals[i].unit:
+                self.sentence.numerals[i] = replace(self.sentence.numerals[i], unit=first.unit, factor=first.factor)
 
     def _speeds(self) -> None:
         """Read two speeds that are set against each other: one is the drone's, the other the target's."""

@@ -78,7 +78,7 @@ class StateReader(ClauseWords):
         if self._owner(token) == "drone" and not self._is_sight():
             return
         measured = self.clause.has(
-            "quantity", "yaw", "turn", "speed", "distance", "slant", "altitude", "yaw_rate", "heading"
+            "quantity", "yaw", "turn", "speed", "distance", "slant", "altitude", "height", "over", "yaw_rate", "heading"
         )
         if measured and re.search(r"vanish|disappear|lost|missing|blind|gone|fade|消失|丢|covered|screened", text):
             return

@@ -12,7 +12,7 @@ from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import GOES_TO, Context, names_of, without_mean
 from caption.truth.prose.moments import Moments
-from caption.truth.prose.naming import OVER_OTHER
+from caption.truth.prose.naming import OFF_CENTRE, OVER_OTHER
 from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.owners import BEHIND, GOES_ON, LINK, Owners
 from caption.truth.prose.statements import NOW, Mode
@@ -72,6 +72,8 @@ class Sureness:
             return ("offset_x",) if beside["x"] else ("offset_y",)
         if numeral.unit == "px" and numeral.side and not self.clause.has("quantity", "box", "width", "tall", "height"):
             return ("offset_x",)
+        if numeral.unit == "px" and OFF_CENTRE.search(self.text, 0, numeral.start):
+            return ("offset_y",)
         cues = self._cues(numeral)
         if numeral.unit == "m" and OVER_OTHER.match(self.text, numeral.end):
             return ("height_over_target",)
@@ -291,6 +293,8 @@ class Sureness:
                 return False  # "17 m higher than the walker"
             if after and after["word"] not in ("above", "below", "more", "less", "up", "down", "further"):
                 return True
+        elif numeral.unit == "px" and self.clause.has("quantity", "centre"):
+            return False  # "比中心低 49 像素"
         elif ZH_MORE.search(self.text[: numeral.start]):
             thans = self.clause.of("link", "than")
             return bool(thans) and not any(thans[0].start <= t.start for t in self.clause.of("who", "target", "drone"))

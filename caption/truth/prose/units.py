@@ -15,7 +15,11 @@ _IMPLIED = {
     "depression": "deg", "bearing": "deg", "box": "px", "width": "px", "tall": "px", "centre": "px", "climb_rate": "mps",
     "yaw_rate": "dps", "travelled": "m", "displacement": "m", "target_heading": "deg",
 }  # fmt: skip
-_KNOWN = re.compile(r"[\s,，、才只有仅还在也是为约的了又、]*")
+# What may stand before such a number beside words of the lexicon.
+_KNOWN = {
+    "en": re.compile(r"(?:[\s,:]|\b(?:and|but|only|just|the|an?|at|of|to|did|does|do|is|are|was|were|then|still|so|with|in|on|it|that|has|had|have|as)\b)*"),
+    "zh": re.compile(r"[\s,，、才只有仅还在也是为约的了又]*"),
+}  # fmt: skip
 _AT_PACE = re.compile(r"(?:\b(?:at|doing|does|do|did|making|makes|our|their|his|her)|\w's|只有|为|是|有) ?$")
 _PLACED = re.compile(r"\s*(?:below|above|under|beneath|left|right|down|up)\b")
 _IS_DONE = re.compile(r"已经|一共|飞出|走出|了")  # a way, not a pace
@@ -67,7 +71,7 @@ class Units:
 
     def _only_unit(self, numeral: Numeral) -> tuple[str, float] | None:
         """Give the unit of all other numbers of the sentence: "we pass 17.3 metres, and left 12.8 two seconds ago"."""
-        if self.sentence.language == "zh" and not _KNOWN.fullmatch(self._unread_before(numeral)):
+        if not _KNOWN[self.sentence.language].fullmatch(self._unread_before(numeral)):
             return None
         told = {(n.unit, n.factor) for n in self.sentence.numerals if n.unit not in ("", "s", "frames")}
         is_later = any(n.unit and n.start < numeral.start for n in self.sentence.numerals)
