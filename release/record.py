@@ -118,12 +118,14 @@ class MadeBy(Strict):
 
 
 class SourceRecord(Strict):
-    """One source of the release: fingerprints of its tree, captions and inspection (null: without), and the stages that made them."""
+    """One source of the release: fingerprints of its tree, captions, inspection and what people decided of that (null: without), and the
+    stages that made them."""
 
     run: str
     tree_sha256: str
     captions_sha256: str
     inspect_sha256: str | None
+    review_sha256: str | None = None
     stages: list[MadeBy]
 
 

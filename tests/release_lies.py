@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import math
 import re
+import struct
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -565,6 +567,144 @@ def pair_lost(rows):
         row["pair"] = None
 
 
+# --- told without having seen the checks ------------------------------------------------------------------------------
+
+
+def middle(rows: list[Row]) -> Row:
+    own = clean(rows)
+    return own[len(own) // 2]
+
+
+def set_colours(row: Row, pixels: np.ndarray) -> None:
+    row["image"]["bytes"] = png(pixels)
+
+
+def person_of(pixels: np.ndarray) -> np.ndarray:
+    return (pixels[..., 1] == 255) & (pixels[..., 2] == 255)
+
+
+def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
+    """Give `target_mask_bbox` of an instance image."""
+    rows, columns = np.nonzero(person_of(pixels))
+    if not len(rows):
+        return None
+    edges = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    return dict(zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, edges), strict=True))
+
+
+def grey_picture(rows):
+    pixels = pixels_of(middle(rows), "image")
+    set_colours(middle(rows), np.repeat(pixels.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8))
+
+
+def blurred_picture(rows):
+    import cv2
+
+    pixels = pixels_of(middle(rows), "image")
+    height, width = pixels.shape[:2]
+    small = cv2.resize(pixels, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
+    set_colours(middle(rows), cv2.resize(small, (width, height)))
+
+
+def picture_that_one_sees_through(rows):
+    import cv2
+
+    pixels = pixels_of(middle(rows), "image")[..., ::-1]
+    nothing = np.zeros(pixels.shape[:2], np.uint8)
+    middle(rows)["image"]["bytes"] = cv2.imencode(".png", np.dstack([pixels, nothing]))[1].tobytes()
+
+
+def bytes_behind_a_picture(rows):
+    middle(rows)["image"]["bytes"] += b"something else " * 100
+
+
+def add_chunk(row: Row, name: bytes, data: bytes) -> None:
+    png_bytes, crc = row["image"]["bytes"], struct.pack(">I", zlib.crc32(name + data))
+    row["image"]["bytes"] = png_bytes[:33] + struct.pack(">I", len(data)) + name + data + crc + png_bytes[33:]
+
+
+def words_in_a_picture(rows):
+    add_chunk(middle(rows), b"tEXt", b"Author\0somebody")
+
+
+def colours_meant_darker(rows):
+    add_chunk(middle(rows), b"gAMA", struct.pack(">I", 200_000))
+
+
+def weather_that_nobody_drew(rows):
+    for row in rows:
+        row["weather"] = "HardRainNoon"
+
+
+def night_that_nobody_drew(rows):
+    for row in rows:
+        row["time_of_day"] = "night"
+
+
+def headings_lost(rows):
+    for row in clean(rows):
+        row["target_heading_deg"] = None
+
+
+def window_with_a_frame_twice(rows):
+    row = captioned(rows)[0]
+    row["caption_window"] = [row["caption_window"][0], *row["caption_window"][:-1]]
+
+
+def depth_of_the_twin(rows):
+    row = shifted(rows)
+    twin = next(r for r in clean(rows) if r["frame_index"] == row["frame_index"])
+    swap(row, twin, "depth")
+
+
+def frame_mirrored_with_its_boxes(rows):
+    row = seen(rows)[len(seen(rows)) // 2]
+    instance, width = pixels_of(row, "instance")[:, ::-1].copy(), row["width_px"]
+    row["instance"]["bytes"], row["target_mask_bbox"] = png(instance), box_of_person(instance)
+    set_colours(row, pixels_of(row, "image")[:, ::-1].copy())
+    set_depth(row, depth_of(row)[:, ::-1].copy())
+    row["target_uv"]["u_px"] = width - row["target_uv"]["u_px"]
+    box = row["target_bbox"]
+    box["xmin_px"], box["xmax_px"] = width - box["xmax_px"], width - box["xmin_px"]
+
+
+def depth_a_hundredth_farther(rows):
+    depth = depth_of(middle(rows))
+    depth[depth < 999] *= np.float32(1.01)
+    set_depth(middle(rows), depth)
+
+
+def depth_in_decimetres_called_lossless(rows):
+    for row in clean(rows):
+        depth = depth_of(row)
+        set_depth(row, np.where(depth < 999, np.maximum(np.round(depth, 1), 0.1), depth).astype(np.float32))
+
+
+def obstacle_that_is_not_there(rows):
+    depth = depth_of(middle(rows))
+    depth[5:25, 5:25] = 3.0
+    set_depth(middle(rows), depth)
+
+
+def second_person_far_away(rows):
+    row = seen(rows)[len(seen(rows)) // 2]
+    pixels = pixels_of(row, "instance")
+    pixels[-4:, -4:] = (12, 255, 255)
+    row["instance"]["bytes"], row["target_mask_bbox"] = png(pixels), box_of_person(pixels)
+
+
+def ids_of_things_exchanged(rows):
+    row = middle(rows)
+    pixels = pixels_of(row, "instance")
+    ids = pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
+    known = [own for own in np.unique(ids) if own not in (0, 65534, 65535)]
+    new = ids.copy()
+    for own, other in zip(known, [*known[1:], known[0]], strict=True):
+        new[ids == own] = other
+    pixels[..., 1], pixels[..., 2] = new & 255, new >> 8
+    row["instance"]["bytes"] = png(pixels)
+
+
 LIES: dict[str, tuple[Lie, bool]] = {
     lie.__name__: (lie, is_of_pixels)
     for is_of_pixels, lies in (
@@ -579,7 +719,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             number_wrong_in_both_languages, captions_of_two_windows_exchanged, texts_of_two_windows_exchanged,
             decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
             all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
-            walk_of_nobody, clock_that_starts_late,
+            walk_of_nobody, clock_that_starts_late, weather_that_nobody_drew, night_that_nobody_drew, headings_lost, window_with_a_frame_twice,
             time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
         )),
         (True, (
@@ -588,7 +728,10 @@ LIES: dict[str, tuple[Lie, bool]] = {
             instances_of_neighbours_exchanged, instances_exchanged_with_their_boxes, depth_doubled, depth_doubled_but_at_the_person,
             depth_not_a_number, distance_along_the_ray, depth_in_centimetres, empty_instances, person_painted_over,
             person_without_an_instance_of_a_person, jpeg_under_a_png_name, smaller_picture, black_picture, mirrored_picture,
-            colours_swapped_red_and_blue, one_picture_in_two_rows, other_visibility,
+            colours_swapped_red_and_blue, one_picture_in_two_rows, other_visibility, grey_picture, blurred_picture,
+            picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
+            frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
+            second_person_far_away, ids_of_things_exchanged,
         )),
     )
     for lie in lies

@@ -22,10 +22,12 @@ from test_release_package import FREE, all_bytes, make_caption, make_inspection,
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.errors import ConfigError, InputError, NothingKept, VerifyError
+from cosfly.products import review
 from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import Flight, find_flights, read_flight, write_flight
+from cosfly.reading.files import sha256_file
 from release.package.config import ReleaseConfig
 from release.package.depth import encoded
 from release.package.publishable import published, published_name
@@ -125,6 +127,16 @@ def test_neither_twin_goes_without_the_other_unless_asked(material, copy, tmp_pa
     clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
     assert len(clean.flights) == 7
     assert {flight.pair for flight in clean.flights} == {None}
+
+
+def test_what_people_decided_has_its_digest(copy, tmp_path):
+    assert record_of(copy, tmp_path / "before").provenance.sources[0].review_sha256 is None
+    first = find_flights(copy / "tree")[0].relative_to(copy / "tree").as_posix()
+    choice = {"folder": first, "verdict": "rejected", "reason": "blurred"}
+    review.add_decisions(copy / "inspect.json", [review.Choice.model_validate(choice)], "Ann")
+    record = record_of(copy, tmp_path / "after")
+    assert record.provenance.sources[0].review_sha256 == sha256_file(copy / review.REVIEW)
+    assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: review": 1}
 
 
 def test_every_released_caption_has_its_whole_window(tmp_path):

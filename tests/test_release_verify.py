@@ -129,6 +129,8 @@ RECORD_LIES = {
     "captions of another tree": lambda r: _stage(r, "caption")["inputs"].update(data="0" * 64),
     "an inspection of another tree": lambda r: _stage(r, "inspect")["inputs"].update(data="0" * 64),
     "a flight rejected for nothing": lambda r: _one_less(r, "rejected"),
+    "larger pictures": lambda r: _stage(r, "render")["config"].update(width_px=1920, height_px=1080),
+    "longer windows": lambda r: _stage(r, "caption")["config"]["window"].update(num_frames=9),
     "a town of another map": lambda r: r["maps"][0].update(name="Delft"),
 }
 
@@ -144,6 +146,19 @@ def _stage(record: dict, name: str) -> dict:
     return next(stage for stage in record["provenance"]["sources"][0]["stages"] if stage["stage"] == name)
 
 
+def test_another_teacher_in_rows_and_record_is_found(honest, tmp_path):
+    def rows_too(rows):
+        for row in rows:
+            if row["has_caption"]:
+                row["teacher_kind"], row["teacher_model"] = "endpoint", "somebody"
+
+    def teachers(record):
+        for teacher in record["provenance"]["teachers"]:
+            teacher.update(kind="endpoint", model="somebody")
+
+    assert "provenance" in errors_in(forge(honest, tmp_path / "forged", rows_too, teachers), "rows")
+
+
 def _one_less(record: dict, reason: str) -> None:
     """One flight more was found, and left out."""
     flights = record["history"]["flights"]
@@ -156,6 +171,16 @@ def test_rejected_flights_without_a_rejected_trajectory_are_told(honest, tmp_pat
     forged = forge(honest, tmp_path / "forged", change_record=lambda r: _one_less(r, "rejected: jerk"))
     report = verify(forged, level="structure")
     assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "sum")]
+
+
+def test_decisions_of_people_have_a_digest(honest, tmp_path):
+    def rejected(record, digest=None):
+        _one_less(record, "rejected: review")
+        record["provenance"]["sources"][0]["review_sha256"] = digest
+
+    for digest, codes in ((None, ["provenance", "sum"]), ("0" * 64, ["sum"])):
+        forged = forge(honest, tmp_path / "forged", change_record=lambda r, digest=digest: rejected(r, digest))
+        assert [kind.code for kind in verify(forged, level="structure").kinds] == codes
 
 
 @pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])

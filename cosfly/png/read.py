@@ -19,17 +19,21 @@ from cosfly.png.inflate import inflate
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
+MOST_NAMED = 8  # chunks
 CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
 
 
 @dataclass
 class Png:
-    """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left them."""
+    """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left them. others: names of
+    the chunks that are no pixels (colours meant, words); num_behind: bytes behind its end."""
 
     width_px: int
     height_px: int
     channels: int
     lines: np.ndarray
+    others: tuple[str, ...] = ()
+    num_behind: int = 0
     _is_undone: bool = False
 
     def rows(self, wanted: np.ndarray) -> np.ndarray:
@@ -62,7 +66,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     Raises:
         InputError: it is none, damaged, of another kind, or larger than pictures may be.
     """
-    width, height, kind, packed = _chunks(data, where)
+    width, height, kind, packed, others, num_behind = _chunks(data, where)
     channels = CHANNELS[kind]
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if len(packed) < 2 or (packed[0] & 15) != 8 or (packed[0] * 256 + packed[1]) % 31 or packed[1] & 32:
@@ -75,22 +79,22 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     lines = out.reshape(height, 1 + width * channels)
     if (lines[:, 0] > 4).any():
         raise _broken(where, "a row with a filter that does not exist")
-    return Png(width, height, channels, lines)
+    return Png(width, height, channels, lines, others, num_behind)
 
 
 def _broken(where: object, got: str) -> InputError:
     return InputError("the image does not decode", where=str(where), got=got, expected="a whole PNG")
 
 
-def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:
-    """Walk through the chunks: width, height, colour type, the packed pixels."""
+def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes, tuple[str, ...], int]:
+    """Walk through the chunks: width, height, colour type, the packed pixels, names of other chunks, bytes behind the end."""
     if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if depth != 8 or kind not in CHANNELS or packing or filters or interlace or not width or not height:
         raise _broken(where, f"{depth} bits, colour type {kind}, interlace {interlace}, {width} x {height} px")
-    position, parts, view = len(PNG_SIGNATURE), list[memoryview](), memoryview(data)
+    position, parts, others, view = len(PNG_SIGNATURE), list[memoryview](), list[str](), memoryview(data)
     while position + 12 <= len(data):
         length, name = CHUNK.unpack_from(data, position)
         end = position + 8 + length
@@ -101,7 +105,9 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
         if name == b"IDAT":
             parts.append(view[position + 8 : end])
         elif name == b"IEND":
-            return width, height, kind, b"".join(parts)
+            return width, height, kind, b"".join(parts), tuple(others), len(data) - end - 4
+        elif name != b"IHDR" and len(others) < MOST_NAMED:
+            others.append(name.decode("latin-1"))
         position = end + 4
     raise _broken(where, f"an end at byte {len(data)}, before the image's")
 

@@ -59,6 +59,7 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
         tree_sha256=sha256["data"],
         captions_sha256=sha256["captions"],
         inspect_sha256=sha256.get("inspect"),
+        review_sha256=sha256.get("review"),
         stages=[
             MadeBy(
                 stage=record.stage,

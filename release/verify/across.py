@@ -32,7 +32,7 @@ LEAST_SECONDS, WALK_SHARE = (
 )  # of the seconds that two flights know, in one cell: they follow one walk; half is enough to build
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
-ROWS_AT_ONCE = 100_000
+ROWS_AT_ONCE = 40_000
 NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
 # What is kept of a row. sample_id, image, depth: digests, 0 where there is none; cell: second, x, y of the clean person; pose: as POSE.
 COMPARED = np.dtype([("sample_id", "u8"), ("image", "u8"), ("depth", "u8"), ("cell", "i8", 3), ("pose", "f4", 6)])

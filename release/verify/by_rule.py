@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 from cosfly.products.places import folder_name, town_folder
 from cosfly.provenance import CONVERSION, CONVERTED
@@ -14,9 +15,12 @@ from release.columns import PLACE
 from release.record import ReleasedFlight, ReleaseRecord, SourceRecord
 from release.splits import NAME_OF, SPLIT_RULE, split_groups
 from release.verify.findings import Findings
+from release.verify.rows import FlightRows
 
 WITHOUT_TWIN = "its twin is not released"  # of flights that were left out after walks had their names
 TIME_S = 1e-3  # times are written with three digits at least
+FOV_DEG = 0.01
+REVIEWED = "rejected: review"  # by people: docs/files.md, "Decisions"
 RULES = "rules"  # the kind of teacher that asks nobody
 
 
@@ -28,6 +32,7 @@ def check_rules(record: ReleaseRecord, findings: Findings) -> None:
     _check_inputs(record, findings)
     _check_asks(record, findings)
     _check_rejected(record, findings)
+    _check_caption_settings(record, findings)
 
 
 def _check_split_rule(record: ReleaseRecord, findings: Findings) -> None:
@@ -121,10 +126,48 @@ def _check_rejected(record: ReleaseRecord, findings: Findings) -> None:
             findings.error(
                 "sum", f"release.json: history.flights.left_out: {reason}", reason, "the result and its reason"
             )
+    if left_out.get(REVIEWED) and not any(source.review_sha256 for source in record.provenance.sources):
+        findings.warn("provenance", "release.json: provenance.sources: review_sha256", "null", f"a digest of the decisions: {left_out[REVIEWED]} flights are {REVIEWED}")  # fmt: skip
     if planned is not None and rejected and not planned.rejected:
         findings.warn("sum", "release.json: history.trajectories.rejected", 0, f"1 or more: {rejected} flights were rejected, unless nobody here planned them")  # fmt: skip
     if planned is not None and rejected < planned.rejected:
         findings.error("sum", "release.json: history.trajectories.rejected", planned.rejected, f"{rejected} or fewer, the flights that were left out for it")  # fmt: skip
+
+
+def _check_caption_settings(record: ReleaseRecord, findings: Findings) -> None:
+    """Who answered and how long windows are stands in the settings of the stage that made the captions."""
+    configs = [stage.config for source in record.provenance.sources for stage in source.stages if stage.stage == "caption"]  # fmt: skip
+    if not configs or len(configs) < len(record.provenance.sources):
+        return
+    windows = {config["window"]["num_frames"] for config in configs if "num_frames" in config.get("window", {})}
+    if windows and record.numbers.captions.frames_with and record.settings.window_frames not in windows:
+        findings.error("provenance", "release.json: settings.window_frames", record.settings.window_frames, f"one of {sorted(windows)}, as captions were made")  # fmt: skip
+    kinds = {teacher.kind for teacher in record.provenance.teachers}
+    if {config.get("teacher") for config in configs} == {RULES} and not kinds <= {RULES}:
+        findings.error("provenance", "release.json: provenance.teachers", sorted(kinds), "rules, as the settings of the captions say")  # fmt: skip
+
+
+def check_drawn(flight: FlightRows, settings: dict[str, Any], findings: Findings) -> None:
+    """What `render` was told is what the rows have: size, field of view, light, weather.
+
+    Args:
+        settings: of the stage `render`; empty where nobody tells.
+    """
+    row = flight.rows[0]
+    size = (settings.get("width_px"), settings.get("height_px"))
+    if None not in size and size != (row.get("width_px"), row.get("height_px")):
+        findings.error("settings", flight.where(0, "width_px"), f"{row.get('width_px')} x {row.get('height_px')} px", f"{size[0]} x {size[1]} px, as render was told")  # fmt: skip
+    fovs, zoom = settings.get("fovs_deg"), settings.get("zoom") or {}
+    if fovs and zoom.get("mode", "fixed") == "fixed" and not any(abs(row.get("fov_deg", fov) - fov) < FOV_DEG for fov in fovs):  # fmt: skip
+        findings.error("settings", flight.where(0, "fov_deg"), row.get("fov_deg"), f"one of {fovs}, as render was told")
+    if not settings or settings.get("weather_mode", "off") != "off":
+        return
+    for name in ("weather", "time_of_day", "weather_mode", "weather_params"):
+        if row.get(name) is not None:
+            findings.error("settings", flight.where(0, name), row[name], "null: render was told of no weather")
+    look = settings.get("look")
+    if look and row.get("look") and row["look"] != look:
+        findings.error("settings", flight.where(0, "look"), row["look"], f"{look}, as render was told")
 
 
 def check_clock(folder: Path, record: ReleaseRecord, findings: Findings) -> None:

@@ -12,6 +12,7 @@ from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
 from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
+from release.verify.by_rule import check_drawn
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
 from release.verify.identity import check_identity
@@ -23,7 +24,7 @@ from release.verify.sources import Entry, FlightSource, flight_rows
 
 Level = Literal["structure", "rows", "pixels"]
 # What a value of no sense does to a check that takes it for one: each value is judged by itself, so that the cause is named too.
-SENSELESS = (ValueError, KeyError, TypeError, IndexError, OverflowError, FloatingPointError, AttributeError)
+SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, AttributeError)
 
 
 LOSSLESS = DepthCoding(
@@ -101,6 +102,7 @@ def check_flight(
         lambda: check_geometry(flight, findings),
         lambda: check_motion(flight, twin, told.of(flight, "render").get("perturbation", {}), findings),
         lambda: check_captions(flight, told.window_frames, findings),
+        lambda: check_drawn(flight, told.of(flight, "render"), findings),
     ]
     if reader is not None:
         checks.append(lambda: _read_captions(flight, twin, told, reader, findings))

@@ -75,13 +75,13 @@ def _check_heading(flight: FlightRows, findings: Findings) -> None:
         index = int(flight.index[k])
         behind = at.get(max(index - HEADING_FRAMES, 0))
         ahead = at.get(index + HEADING_FRAMES if last is None else min(index + HEADING_FRAMES, last))
-        if behind is None or ahead is None or np.isnan(heading[k]):
+        if behind is None or ahead is None or "target_heading_deg" not in flight.rows[k]:
             continue
         x, y = (flight.target_m[ahead] - flight.target_m[behind])[:2]
         if not np.hypot(x, y) >= STANDS_M:
             continue  # who stands keeps the direction of before
         off = abs(float(wrap_deg(heading[k] - np.degrees(np.arctan2(y, x)))))
-        if off > 0.01:
+        if not off <= 0.01:
             findings.error("heading", flight.where(k, "target_heading_deg"), f"{heading[k]:.2f}", f"{np.degrees(np.arctan2(y, x)):.2f}, whither the target goes")  # fmt: skip
 
 

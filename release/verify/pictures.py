@@ -8,7 +8,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.png.read import parse_png
+from cosfly.png.read import Png, parse_png
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
@@ -25,6 +25,7 @@ SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
 BLANK_STD = 2.0  # grey levels: a picture of one colour has 0, fog over a street more than 5
+LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 MOST_RAYS = 900  # through the box of a person: the score is a share of them
 SCORE = 0.12  # of the visibility: three deviations of a share of so many rays, and pixels on an edge
 MOST_KIND = max(KINDS.values())
@@ -55,8 +56,11 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
                 size = (png.width_px, png.height_px)
                 if png.channels < 3:
                     raise InputError("not a colour picture", got=f"{png.channels} channels")
+                _check_cargo(flight, png, where, findings)
                 if file == "rgb":
                     found[file] = png.rows(grid_rows(png.height_px))
+                    if png.channels == 4 and (found[file][..., 3] != 255).any():
+                        findings.error("blank", where, "pixels that one sees through", "a picture that hides what is behind it")  # fmt: skip
                 else:
                     found[file] = np.ascontiguousarray(png.pixels()[..., :3])
         except InputError as error:
@@ -68,6 +72,14 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
     if len(found) < len(files):
         return None
     return found.get("depth", NOTHING), found.get("instance", NO_IDS), found.get("rgb")
+
+
+def _check_cargo(flight: FlightRows, png: Png, where: str, findings: Findings) -> None:
+    """A picture is its pixels: nothing behind its end, and of cosfly's own no words and no other meaning of its colours."""
+    if png.num_behind:
+        findings.error("cargo", where, f"{png.num_behind:,} bytes behind the picture's end", "nothing")
+    if png.others and not flight.is_foreign:
+        findings.error("cargo", where, f"chunks {', '.join(png.others)}", "pixels alone, as cosfly writes them")
 
 
 def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
@@ -187,6 +199,18 @@ def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: n
     share = float(seen.sum() / hits.sum())
     if abs(share - score) > SCORE:
         findings.error("visibility", flight.where(i, "visibility"), f"{score:.2f}", f"{share:.2f}, of the depth image")
+
+
+def look_of(colours: np.ndarray) -> tuple[float, float]:
+    """Tell how colourful and how sharp a picture is, grey levels: how far channels lie from their mean, and pixels from the next.
+
+    Args:
+        colours: (k, w, 3 or 4) uint8, some of its rows.
+    """
+    few = colours[::LOOK_EVERY, :, :3].astype(np.int16)
+    grey = few.sum(axis=2, dtype=np.int16)  # three times the brightness
+    hue = np.abs(3 * few[:, ::LOOK_EVERY] - grey[:, ::LOOK_EVERY, None]).mean() / 3.0
+    return float(hue), float(np.abs(np.diff(grey, axis=1)).mean()) / 3.0
 
 
 def grid_kinds(instance: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from cosfly.items import advance
 from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
-from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, view_of
+from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, look_of, view_of
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -39,6 +39,8 @@ TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
 # How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
 # before as usual in the flight, and of others.
 BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.03, 0.04
+# Of the lesser of both neighbours, in hue and in detail: honest 0.6 and 0.9 of ours; and what these must have for that to mean something.
+LOOKS_LEAST, LOOK_LEAST = (0.2, 0.6), 2.0
 # Flights of others: depth may be rough, but it is equally rough in all frames.
 ROUGH_ERROR, TIMES_ROUGH = 1e-3, 20.0
 
@@ -69,6 +71,7 @@ def check_pictures(
     """
     keys: list[tuple[int, int]] = []
     pairs, kinds = _Pairs(), dict[int, int]()
+    looks = np.full((len(flight), 2), np.nan)
     before: list[tuple[int, View]] = []  # the two frames before
     for i, files in enumerate(pictures):
         advance()
@@ -79,11 +82,15 @@ def check_pictures(
             continue
         if decoded[1].size and not flight.is_foreign:
             _check_kinds(flight, i, decoded[1], kinds, findings)
+        if decoded[2] is not None:
+            looks[i] = look_of(decoded[2])
         view = view_of(flight, i, decoded)
         if decoded[0].size:
             _compare(flight, i, view, before, pairs)
         before = [*before[-1:], (i, view)]
     _judge(flight, pairs, rounded_as, findings)
+    if not flight.is_foreign:
+        _judge_looks(flight, looks, findings)
     return keys
 
 
@@ -124,6 +131,24 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
         pairs.elsewhere[-2] = compare_views(
             before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i], least_contrast=CONTRAST
         ).correlation
+
+
+def _judge_looks(flight: FlightRows, looks: np.ndarray, findings: Findings) -> None:
+    """A frame is about as colourful and as sharp as both frames beside it.
+
+    Args:
+        looks: (n, 2) grey levels, of each row what `look_of` gives; NaN where nobody knows.
+    """
+    gaps = np.diff(flight.index)
+    for k in range(1, len(flight) - 1):
+        least = np.minimum(looks[k - 1], looks[k + 1])
+        zoomed = any(is_zoomed(flight.intrinsics[k], flight.intrinsics[other]) for other in (k - 1, k + 1))
+        if gaps[k - 1] > NEAR_FRAMES or gaps[k] > NEAR_FRAMES or zoomed:
+            continue
+        for name, own, beside, share in zip(("colourful", "sharp"), looks[k], least, LOOKS_LEAST, strict=True):
+            if beside >= LOOK_LEAST and own < share * beside:
+                got = f"{own:.1f} grey levels where the frames beside it have {beside:.1f} and more"
+                findings.error("scene_colour", flight.where(k, "image"), got, f"a picture about as {name} as these")
 
 
 def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
