@@ -12,6 +12,7 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("transformers", reason="needs the extra distill")
 
 from transformers.models.qwen3_5 import modeling_qwen3_5 as library  # noqa: E402
+from transformers.models.qwen3_5.configuration_qwen3_5 import Qwen3_5VisionConfig  # noqa: E402
 
 from distill.student import kernels  # noqa: E402
 
@@ -46,6 +47,26 @@ def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tole
     for found, wanted in zip(computed(fused, dtype, autocast), computed(plain, dtype, autocast), strict=True):
         assert found.dtype == wanted.dtype
         assert (found - wanted).float().norm() <= tolerance * wanted.float().norm()
+
+
+@pytest.mark.parametrize("grids", [[[1, 4, 6]] * 5, [[1, 4, 6], [1, 2, 8], [1, 4, 6]]])
+def test_a_tower_attends_to_pictures_of_one_size_at_once_and_gives_the_same(grids):
+    cfg = Qwen3_5VisionConfig(depth=2, hidden_size=32, intermediate_size=64, num_heads=2, out_hidden_size=48)
+    cfg._attn_implementation = "sdpa"
+    torch.manual_seed(0)
+    towers = [library.Qwen3_5VisionModel(cfg), library.Qwen3_5VisionModel(cfg)]
+    towers[1].load_state_dict(towers[0].state_dict())
+    kernels.look_at_equal_sizes_at_once(towers[1])
+    assert type(towers[1].blocks[0].attn).__name__ == "JoinedAttention"
+    found = []
+    for tower in towers:
+        for seed in (1, 2):  # borders of another call are not those of the one before
+            patches = torch.randn(sum(h * w for _, h, w in grids), 1536, generator=torch.Generator().manual_seed(seed))
+            output = tower(patches, torch.tensor(grids)).pooler_output
+            output.square().sum().backward()
+        found.append([output, *(p.grad for p in tower.parameters())])
+    for ours, wanted in zip(*found, strict=True):
+        assert torch.allclose(ours, wanted, atol=1e-5, rtol=1e-4)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from typing import Any, Literal
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.reading.documents import read_json
 from cosfly.student_chat import TAUGHT
-from distill.student.kernels import fuse_norms, use_kernels_for
+from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 
 INSTALL = 'pip install "cosfly[distill]"'
 MODEL_TYPE = "qwen3_5"
@@ -241,6 +241,7 @@ def load_student(
         ) from error
     if device_name == "cuda":
         fuse_norms(student.core)
+    look_at_equal_sizes_at_once(student.core)
     return student
 
 

@@ -27,7 +27,7 @@ from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLIm
 
 from distill.student.encoding import Encoded, padded
 from distill.student.features import Loaded, Picture, VisionFeatures
-from distill.student.kernels import fuse_norms, use_kernels_for
+from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 from distill.student.model import Student, compute_dtype
 from distill.training.fit import make_optimizer
 from distill.training.loss import answer_loss
@@ -85,6 +85,7 @@ def make_student(shape: dict[str, Any], device: str, dtype: Any, seed: int = 0) 
     images = Qwen2VLImageProcessorPil(
         patch_size=16, merge_size=2, temporal_patch_size=2, size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}
     )
+    look_at_equal_sizes_at_once(model)
     return Student(Words(), images, model, device, dtype)
 
 
