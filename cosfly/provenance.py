@@ -45,7 +45,8 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on.
+    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on, `grown_from` the sha256 of
+    its products before more items were added, which its product now begins with or holds unchanged.
 
     package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
     """
@@ -57,6 +58,7 @@ class StageRecord(_Record):
     code_version: str
     package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
     resumed_with_other: list[str] = Field([], exclude_if=lambda differences: not differences)
+    grown_from: list[str] = Field([], exclude_if=lambda digests: not digests)
 
 
 class Output(_Record):
@@ -104,6 +106,12 @@ def fingerprint(path: Path) -> str:
 def fingerprints(path: Path) -> set[str]:
     """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
     return _lineage(path, fingerprint(path))
+
+
+def has_grown_from(path: Path, digest: str) -> bool:
+    """Tell whether an input is what it was with that fingerprint, and more: its stage was gone on with for more items."""
+    begun = _record_of(path)
+    return begun is not None and digest in begun.grown_from
 
 
 def folder_digests(folder: Path) -> dict[str, str]:

@@ -28,7 +28,10 @@ from cosfly.provenance import (
     Output,
     StageRecord,
     checked_inputs,
+    fingerprint,
+    has_grown_from,
     read_stage_record,
+    recorded_digests,
 )
 from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
 from cosfly.reading.files import sha256_file
@@ -183,8 +186,12 @@ class StageFolder:
         resume: Resume = "if-same",
         package_files: Mapping[str, Path] = MappingProxyType({}),
         audited: Collection[str] = (),
+        grows: Collection[str] = (),
+        begins_anew: bool = False,
     ) -> StageFolder:
         """Start or continue a stage.
+
+        A folder whose inputs have grown, and one whose settings in `grows` have, is gone on with: its items stay, more are added.
 
         Args:
             config: the stage's settings; those that are MayDiffer are not put on record.
@@ -193,6 +200,8 @@ class StageFolder:
                 `force` continues with the finished items in spite of a difference, which stays on record.
             package_files: name -> file or flat folder of the package that decides what is made.
             audited: names of inputs that the stage itself holds against their records, item by item.
+            grows: names of settings of which more means more items, those of before unchanged.
+            begins_anew: with grown inputs all items are other ones, so none of before is kept.
         Raises:
             VerifyError: an input is not what its stage finished, or was made of another one than that which is given with it.
             ResumeError: the folder holds work that may not be continued; names what differs.
@@ -209,12 +218,12 @@ class StageFolder:
             log.debug("%s: reads %s: %s", stage, name, path)
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
-        if (out / "manifest.json").exists() and (complete := cls._complete(out, stage, record, resume)):
+        if (out / "manifest.json").exists() and (complete := cls._complete(out, stage, record, resume, grows)):
             return complete
         lock = hold_folder(out)
         try:
             refuse_links(out)
-            record = _taken_up(out, record, resume)
+            record = _taken_up(out, record, resume, grows, begins_anew)
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
             write_model(out / "stage.json", record, schema=STAGE_SCHEMA, version=VERSION)
@@ -225,10 +234,13 @@ class StageFolder:
         return cls(out, stage, False, lock)
 
     @classmethod
-    def _complete(cls, out: Path, stage: str, record: StageRecord, resume: Resume) -> StageFolder | None:
+    def _complete(
+        cls, out: Path, stage: str, record: StageRecord, resume: Resume, grows: Collection[str]
+    ) -> StageFolder | None:
         """Give a folder that is complete as `record` says, which takes no lock; None where there is something to do."""
         manifest = read_manifest(out)
-        if _may_continue(out, record, resume) or manifest.counts.failed:
+        differing, grown = _may_continue(out, record, resume, grows)
+        if differing or grown or manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
         log.debug("%s: complete for the same settings and inputs: %s", stage, out)
@@ -297,8 +309,8 @@ class StageFolder:
         )
 
 
-def _taken_up(out: Path, record: StageRecord, resume: Resume) -> StageRecord:
-    """Make what stands in a folder ready to be gone on with; gives the record with what was forced noted."""
+def _taken_up(out: Path, record: StageRecord, resume: Resume, grows: Collection[str], begins_anew: bool) -> StageRecord:
+    """Make what stands in a folder ready to be gone on with; gives the record with what was forced, and what has grown, noted."""
     if not (out / "stage.json").exists():
         if any(entry.name != LOCK for entry in out.iterdir()):
             raise ResumeError(
@@ -309,16 +321,31 @@ def _taken_up(out: Path, record: StageRecord, resume: Resume) -> StageRecord:
         for name in BEGUN:
             (out / name).unlink(missing_ok=True)
         return record
-    noted = [*read_stage_record(out).resumed_with_other, *_may_continue(out, record, resume)]
-    return record.model_copy(update={"resumed_with_other": noted})
+    found = read_stage_record(out)
+    differences, grown = _may_continue(out, record, resume, grows)
+    before = list(found.grown_from)
+    if grown:
+        log.info("%s: goes on with more: %s", out, "; ".join(grown))
+        if (out / "manifest.json").exists():
+            before += [fingerprint(out), *recorded_digests(out).values()]
+        if begins_anew:
+            (out / "items.jsonl").unlink(missing_ok=True)
+    return record.model_copy(
+        update={"resumed_with_other": [*found.resumed_with_other, *differences], "grown_from": before}
+    )
 
 
-def _may_continue(out: Path, record: StageRecord, resume: Resume) -> list[str]:
-    """See whether the work that stands in a folder may be continued as `record` says; gives what differs where it is forced."""
+def _may_continue(
+    out: Path, record: StageRecord, resume: Resume, grows: Collection[str]
+) -> tuple[list[str], list[str]]:
+    """See whether the work that stands in a folder may be continued as `record` says; gives what differs where it is forced, and what
+    has only grown.
+    """
     found = read_stage_record(out)
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
-    differences = _differences(found, record)
+    grown = _grown(found, record, grows)
+    differences = [phrase for name, phrase in _differences(found, record) if name not in grown]
     if differences and resume == "if-same":
         raise ResumeError(
             "the folder holds work made with other settings or inputs",
@@ -328,7 +355,7 @@ def _may_continue(out: Path, record: StageRecord, resume: Resume) -> list[str]:
         )
     if found.code_version != record.code_version:
         log.warning("%s: continued by version %s, begun by %s", out, record.code_version, found.code_version)
-    return differences
+    return differences, list(grown.values())
 
 
 def _holds_work(out: Path) -> bool:
@@ -341,23 +368,40 @@ def _holds_work(out: Path) -> bool:
     )
 
 
-def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
-    """Say which settings, inputs or seed differ, one phrase each."""
+def _grown(found: StageRecord, wanted: StageRecord, grows: Collection[str]) -> dict[str, str]:
+    """Name what is more than it was and else the same: settings in `grows`, inputs whose stage has grown from what they were."""
+    before, after = flattened(found.config), flattened(wanted.config)
+    grown = {
+        name: f"{name} was {before[name]!r}, is {after[name]!r}"
+        for name in grows
+        if isinstance(before.get(name), int) and isinstance(after.get(name), int) and after[name] > before[name]
+    }
+    for name in found.inputs.keys() & wanted.inputs.keys():
+        old, new = found.inputs[name], wanted.inputs[name]
+        if old.sha256 != new.sha256 and has_grown_from(Path(new.path), old.sha256):
+            grown[f"input {name}"] = f"the input {name} has grown"
+    return dict(sorted(grown.items()))
+
+
+def _differences(found: StageRecord, wanted: StageRecord) -> list[tuple[str, str]]:
+    """Say which settings, inputs or seed differ: a name and a phrase each."""
     before, after = flattened(found.config), flattened(wanted.config)
     changed = [
-        f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
+        (key, f"{key} was {before.get(key)!r}, is {after.get(key)!r}")
         for key in sorted(before.keys() | after.keys())
         if before.get(key) != after.get(key)
     ]
     if found.seed != wanted.seed:
-        changed.append(f"seed was {found.seed}, is {wanted.seed}")
+        changed.append(("seed", f"seed was {found.seed}, is {wanted.seed}"))
     for name in sorted(found.inputs.keys() | wanted.inputs.keys()):
         old, new = found.inputs.get(name), wanted.inputs.get(name)
         if old is None or new is None or old.sha256 != new.sha256:
-            changed.append(f"the input {name} ({new.path if new else 'none'}) has changed")
+            changed.append((f"input {name}", f"the input {name} ({new.path if new else 'none'}) has changed"))
     both = found.package_files.keys() & wanted.package_files.keys()
     changed += [
-        f"the {name} changed" for name in sorted(both) if found.package_files[name] != wanted.package_files[name]
+        (name, f"the {name} changed")
+        for name in sorted(both)
+        if found.package_files[name] != wanted.package_files[name]
     ]
     return changed
 

@@ -587,3 +587,39 @@ def test_shares_of_a_town_replace_those_of_the_run():
     assert (town.plan.styles, town.plan.segment_s) == ({"top": 1.0}, 20.0)
     assert (town.pedestrians.pace, town.pedestrians.traffic) == ({"hurry": 1.0}, 2)
     assert cfg.of_town("b").plan == cfg.plan
+
+
+# --- more walks -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_more_walks_are_added_to_a_finished_run_and_leave_the_others_as_they_were(base, tmp_path):
+    run = shutil.copytree(base, tmp_path / "run")
+    frames = {path.relative_to(run): path.read_bytes() for path in (run / "render").rglob("*.png")}
+    paths = [walk.as_json() for walk in read_walks(run / "pedestrians/path.json")]
+    captions = list(read_captions(run / "caption/captions.jsonl"))
+    more = tiny(**{"pedestrians.num_paths": 3})
+    results = pipeline.run(more, run)
+    assert [walk.as_json() for walk in read_walks(run / "pedestrians/path.json")][:2] == paths
+    assert {path: (run / path).read_bytes() for path in frames} == frames
+    assert len(find_flights(run / "render")) == 6
+    found = {caption.sample_id: caption for caption in read_captions(run / "caption/captions.jsonl")}
+    assert all(found[caption.sample_id] == caption for caption in captions)
+    assert len(found) > len(captions)
+    assert verify(run / "release/dataset", level="rows").is_ok
+    assert results[-1].manifest.counts.kept == 6
+    assert load(RunConfig, run / "run.yaml").pedestrians.num_paths == 3
+    assert all(result.was_complete for result in pipeline.run(more, run))  # and again: nothing to do
+    with pytest.raises(ResumeError, match=r"num_paths was 3, is 2"):
+        pipeline.run(tiny(), run)
+    with pytest.raises(ResumeError, match="seed was 0, is 1"):
+        pipeline.run(tiny(**{"pedestrians.num_paths": 4, "seed": 1}), run)
+
+
+def test_a_walk_that_was_changed_is_no_walk_that_was_added(base, tmp_path):
+    run = shutil.copytree(base, tmp_path / "run")
+    work(tiny(**{"pedestrians.num_paths": 3}), run, "pedestrians")
+    record = read_json(run / "pedestrians/stage.json")
+    write_json(run / "pedestrians/stage.json", {**record, "grown_from": ["0" * 64]})
+    with pytest.raises(ResumeError, match="the input paths"):
+        work(tiny(**{"pedestrians.num_paths": 3}), run, "plan")

@@ -227,7 +227,7 @@ def run(
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     settings = cfg.model_dump(mode="json")
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume, grows=("num_paths",))
     product = out / "path.json"
     if stage.is_complete:
         return product
