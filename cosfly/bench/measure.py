@@ -91,7 +91,7 @@ def _measured(
     cfg = cfg.model_copy(update={"workers": workers})
     todo = next(s for s in stages(cfg, run_folder, into=folder) if s.name == stage)
     kind = faults.kind if faults else "none"
-    log.info("bench: %s with %d workers, faults: %s", stage, workers, kind)
+    log.info("bench: %s with %d worker%s, faults: %s", stage, workers, "s" if workers > 1 else "", kind)
     begin_s, attempts = time.monotonic(), 0
     with planted(faults, folder / stage) as moments_s:
         while attempts == 0 or not (folder / stage / "manifest.json").exists():
@@ -103,7 +103,10 @@ def _measured(
     row = row.model_copy(update=about | {"seconds": round(time.monotonic() - begin_s, 1)})
     os.replace(folder / stage / EVENTS, folder.with_suffix(".events.jsonl"))
     shutil.rmtree(folder)
-    write_bytes(folder.with_suffix(".png"), draw_events(events, f"{stage}, {workers} workers, faults: {kind}"))
+    write_bytes(
+        folder.with_suffix(".png"),
+        draw_events(events, f"{stage}, {workers} worker{'s' if workers > 1 else ''}, faults: {kind}"),
+    )
     return row, {output.path: output.sha256 for output in manifest.outputs}
 
 
