@@ -25,6 +25,7 @@ from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.window_loop import Trial, try_strategy
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
+from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Coc
 from cosfly.store import refuse_links, write_json
@@ -83,7 +84,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
     with own_files(cfg):
-        num_windows, trials = asyncio.run(_try_all(cfg, data, out, seed, conflicts))
+        num_windows, trials = run_until_interrupted(_try_all(cfg, data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
     comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]

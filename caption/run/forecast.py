@@ -27,6 +27,7 @@ from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer
+from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.products.captions import Caption
 from cosfly.products.playback import flight_of
@@ -105,7 +106,7 @@ def _forecast(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resu
     windows = _trial_windows([flight for flight in left if guesses[flight.name]], guesses, cfg)
     if not windows:
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
-    captions, seconds, image_tokens = asyncio.run(_rehearse(cfg, out, seed, windows))
+    captions, seconds, image_tokens = run_until_interrupted(_rehearse(cfg, out, seed, windows))
     return _scaled(captions, seconds, image_tokens, num_windows, sum(guesses.values()) - num_windows, cfg)
 
 

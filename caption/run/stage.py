@@ -24,6 +24,7 @@ from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
 from caption.window_loop import caption_window
 from cosfly.chat.answers import refuse_one_file
+from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
 from cosfly.products.playback import flight_of
@@ -88,7 +89,9 @@ def _run(
     else:
         if retry_failed:
             _take_back(stage, allotted)
-        asked = asyncio.run(Asking(stage, cfg, seed, retry_failed=retry_failed, was_whole=was_whole).run(allotted))
+        asked = run_until_interrupted(
+            Asking(stage, cfg, seed, retry_failed=retry_failed, was_whole=was_whole).run(allotted)
+        )
     ledger = _merge(stage, allotted, foreign, with_gaps=bool(asked.unanswered))
     tally = ledger.tally(len(asked.unanswered))
     is_whole = not (asked.unanswered or asked.num_flights_left)
