@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from caption.run.progress import duration
+from cosfly.config import load
 from cosfly.errors import CosflyError
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.products.captions import read_captions
@@ -19,7 +20,7 @@ from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths
 from cosfly.runs import STAGES, StageLook, find, look
 from cosfly.settings import RunConfig, manner_of_work
-from cosfly.stage_folder import Failed, StageFolder
+from cosfly.stage_folder import Failed, StageFolder, flattened
 
 UNITS = {
     "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames", "caption": "windows", "release": "frames",
@@ -172,6 +173,17 @@ def _amounts(cfg: RunConfig, out: Path, rates: Rates) -> dict[str, int]:
     return {"map": 1, "walks": walks, "frames": sum(frames), "windows": num_windows(cfg, frames)}
 
 
+def other_settings(cfg: RunConfig, out: Path) -> list[str]:
+    """Name the settings of stages that the work in a run folder was made with otherwise, by their dotted paths."""
+    if not (out / "run.yaml").is_file():
+        return []
+    sections = {"seed", "towns", "roi", *STAGES}
+    found, wanted = (
+        flattened(one.model_dump(mode="json", include=sections)) for one in (load(RunConfig, out / "run.yaml"), cfg)
+    )
+    return sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
+
+
 def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
     """Estimate each stage of a run, of several towns each town's under its name; a stage that is finished costs nothing more.
 
@@ -191,11 +203,14 @@ def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
 
 def _stages(cfg: RunConfig, out: Path, rates: Rates, names: tuple[str, ...]) -> Iterator[StageEstimate]:
     amounts = _amounts(cfg, out, rates)
-    return (_stage(name, amounts[UNITS[name]], cfg, out, rates) for name in names)
+    changed = {name.partition(".")[0] for name in other_settings(cfg, out)}
+    fresh = 0 if changed - set(names) else min((names.index(name) for name in changed), default=len(names))
+    return (_stage(name, amounts[UNITS[name]], cfg, out, rates, place < fresh) for place, name in enumerate(names))
 
 
-def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates) -> StageEstimate:
-    rate, is_done, tokens = rates.stages[name], _is_complete(out / name), (0.0, 0.0)
+def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates, stands: bool = True) -> StageEstimate:
+    """Estimate a stage; `stands`: what is finished of it was made with these settings."""
+    rate, is_done, tokens = rates.stages[name], stands and _is_complete(out / name), (0.0, 0.0)
     units = count * (_mpx(cfg) if name in BY_PIXELS else 1)
     seconds: float | None = rate.seconds * units
     known: tuple[float, float] | None = tokens

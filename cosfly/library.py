@@ -44,6 +44,8 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     Raises:
         ConfigError: an unknown source or setting. InputError: the file is malformed.
     """
+    if not isinstance(seed, int):
+        raise ConfigError("not a seed", where="load_map", got=repr(seed)[:40], expected="a whole number")
     if source is None and path is not None and Path(path).suffix == ".json" and not settings:
         return read_boxes(Path(path))
     source = source or ("synthetic" if path is None else "boxes")
@@ -83,16 +85,21 @@ def plan(
     if way_m is None:
         person = make_walk("path_00000", walkable_ground(box_map, walking), walking, rng).walk
     else:
-        route_m = np.asarray(way_m, dtype=np.float64)
-        if route_m.ndim != 2 or route_m.shape[1] != 2 or len(route_m) < 2 or not np.isfinite(route_m).all():
-            raise InputError(
-                "not a way",
-                where="way_m",
-                got=f"an array of shape {route_m.shape}",
-                expected="(k, 2) finite places, two or more",
-            )
+        route_m = _way(way_m)
         person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
     return plan_flight(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
+
+
+def _way(way_m: Any) -> np.ndarray:
+    expected = "(k, 2) finite places in m, two or more, no two alike one after the other"
+    try:
+        route_m = np.asarray(way_m, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("not a way", where="way_m", got=repr(way_m)[:60], expected=expected) from None
+    is_way = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
+    if not is_way or not np.diff(route_m, axis=0).any(axis=1).all():
+        raise InputError("not a way", where="way_m", got=f"an array of shape {route_m.shape}", expected=expected)
+    return route_m
 
 
 def render_frames(

@@ -143,6 +143,18 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     return towns
 
 
+def check_files(cfg: RunConfig) -> None:
+    """Check that the files of all maps are there.
+
+    Raises:
+        InputError: one is missing, or none is named.
+    """
+    for one in [cfg.of_town(name) for name in cfg.towns] or [cfg]:
+        for name, path in getattr(one.maps, one.maps.source).inputs().items():
+            if not path.exists():
+                raise InputError("there is no such file", where=f"maps.{one.maps.source}: {name}", got=str(path))
+
+
 class _TimeLeft:
     """How long a run will still take, in words, by the figures of runs before it."""
 

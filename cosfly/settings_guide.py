@@ -16,7 +16,8 @@ PAGE_HEAD = """# Settings
 
 Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > docs/settings.md`.
 `--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them. `cosfly config schema`
-gives the JSON schema, with which an editor completes and checks such a file.
+gives the JSON schema, with which an editor completes and checks such a file: `cosfly config schema > schema.json`, and in many
+editors `# yaml-language-server: $schema=schema.json` as the file's first line.
 """
 
 

@@ -44,6 +44,10 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
     [
         (("config", "check", "quikstart"), ("quikstart", "did you mean 'quickstart'", "simworld")),
         (("config", "check", "quickstart", "--set", "a..b=1"), ("--set", "a..b=1", "key=value")),
+        (
+            ("config", "check", "quickstart", "--set", "maps={source: boxes, boxes: {path: none.csv}}"),
+            ("no such file", "maps.boxes", "none.csv"),
+        ),
         (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
         (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),

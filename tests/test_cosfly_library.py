@@ -96,6 +96,11 @@ def test_files_and_sources_are_loaded(town, tmp_path):
         (lambda: cosfly.load_map(source="carla"), ConfigError, "no such source of maps; got carla; expected synthetic"),
         (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
         (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
+        (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "not a seed; got 'x'"),
+        *[
+            (lambda way=way: cosfly.plan(cosfly.load_map(**TOWN), way), InputError, "way_m: not a way")
+            for way in ("abc", [[0, 0, 0]], [[0, "a"], [1, 2]], [[0, 0], [9, 9], [9, 9]])
+        ],
         (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 0, 9]), InputError, "nobody says where to look"),
         (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 9], [0, 0, 0]), InputError, "position_m: not places"),
         (lambda: cosfly.plan(cosfly.load_map(**TOWN), planer="muco"), ConfigError, "plan: planer: unknown setting"),

@@ -19,7 +19,7 @@ from cosfly.bench import measure
 from cosfly.cli import app
 from cosfly.config import load
 from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
-from cosfly.estimate import estimate, rates_near, time_left
+from cosfly.estimate import estimate, other_settings, rates_near, time_left
 from cosfly.folder_lock import hold_folder
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
@@ -183,6 +183,15 @@ def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base
     exact = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
     assert rows[-1].count == exact
     assert "quickstart" in rows[-1].basis  # nothing beside it is finished
+
+
+def test_what_was_made_with_other_settings_is_not_done(base):
+    wider = tiny(**{"render.width_px": 320, "render.height_px": 180})
+    rows = estimate(wider, base, rates_near(base))
+    assert [row.name for row in rows if row.is_done] == ["maps", "simplify", "pedestrians", "plan"]
+    assert other_settings(wider, base) == ["render.height_px", "render.width_px"]
+    shown = CliRunner().invoke(app, ["run", str(base), "--set", "render.width_px=320", "--dry-run"])
+    assert "made with other settings (render.width_px)" in shown.output
 
 
 def test_what_a_teacher_will_take_is_not_made_up(base, tmp_path):

@@ -49,6 +49,7 @@ def run(
     out = out or Path("runs") / cfg.name
     if dry_run:
         pipeline.check(cfg)
+        pipeline.check_files(cfg)
         return _tell_estimate(cfg, out)
     options.set_aside(out, repair)
     options.verify_first(
@@ -91,6 +92,11 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     )
     if any(row.tokens is None for row in rows):
         answer_console.print(f"tokens are {estimate.UNKNOWN_TOKENS}", soft_wrap=True)
+    if others := estimate.other_settings(cfg, out):
+        answer_console.print(
+            f"{out} was made with other settings ({', '.join(others[:6])}{' ...' if len(others) > 6 else ''}): its finished stages refuse "
+            "them, and only a greater pedestrians.num_paths goes on there; choose another --out", soft_wrap=True,
+        )  # fmt: skip
     if needed > free:
         answer_console.print(
             "there is not enough space for it: choose another --out, or fewer walks or pixels", soft_wrap=True
@@ -204,8 +210,10 @@ def config_check(
     config: Annotated[Path, typer.Argument(help="YAML file, or the name of one that ships.")],
     overrides: options.Overrides = None,
 ) -> None:
-    """Check a configuration without running it; reports all problems at once."""
-    options.resolve(config, overrides)
+    """Check a configuration without running it; reports all problems at once, and a map's file that is not there."""
+    from cosfly import pipeline
+
+    pipeline.check_files(options.resolve(config, overrides))
     typer.echo(f"{config}: ok")
 
 

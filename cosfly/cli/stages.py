@@ -16,7 +16,7 @@ app = typer.Typer()
 def maps(
     out: options.Out,
     source: Annotated[
-        str | None, typer.Option(help="synthetic, simworld or cityjson; short for --set maps.source=...")
+        str | None, typer.Option(help="synthetic, simworld, cityjson or boxes; short for --set maps.source=...")
     ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,

@@ -68,7 +68,10 @@ class MucoConfig(Config):
 
     formerly: ClassVar = {"gradient": "it goes with the step: muco.step=paper takes differences, newton does not"}
     track_distance_m: float = Field(
-        28.0, gt=0, description="wanted slant distance to the target (through the air, not over ground), m"
+        28.0,
+        gt=0,
+        description="wanted slant distance to the target (through the air, not over ground), m; of muco alone: foresight keeps "
+        "plan.behind_distance_m over ground and plan.altitude_preferred_m",
     )
     weight_tracking: float = Field(2.0, ge=0, description="weight of (distance - track_distance_m)^2")
     weight_smoothness: float = Field(4.0, ge=0, description="weight of the squared second difference")
@@ -155,7 +158,7 @@ class PlanConfig(Config):
     """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walker."""
 
     formerly: ClassVar = {"visibility_min": "did you mean 'five_ray_mean_min'?"}
-    planner: str = Field("foresight", description="which planner flies: a name in PLANNERS")
+    planner: str = Field("foresight", description="which planner flies: foresight, muco or track_astar")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(
         RELAXED_SAFETY_M, gt=0, description="distance that must be kept where the nominal one cannot, m"
@@ -163,7 +166,11 @@ class PlanConfig(Config):
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude, m")
     altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
-    behind_distance_m: float = Field(20.0, gt=0, description="horizontal distance behind the target at the start, m")
+    behind_distance_m: float = Field(
+        20.0,
+        gt=0,
+        description="horizontal distance to the target, m: wanted all along by foresight, at the start by muco and track_astar",
+    )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     heading_smoothing_s: float = Field(
         4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
