@@ -147,7 +147,7 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     # Frame 6 is observed by the windows at 6..10, of those at 4..12.
     assert report["windows"] == {"input": 18, "kept": 13, "dropped": {"missing_frame": 5}, "failed": {}}
     failures = (out / "failures.jsonl").read_text()
-    assert "points[3].drone_pose.x: not a number" in failures
+    assert "points[3].drone_pose.x: the field is missing or null" in failures
     assert "not valid JSON" in failures
 
 

@@ -180,7 +180,7 @@ def test_a_missing_field_is_called_missing(tree, tmp_path):
     del value["points"][3]["drone_pose"]["z"]
     (flight / "trajectory.json").write_text(json.dumps(value))
     with pytest.raises(
-        InputError, match=r"points\[3\]\.drone_pose\.z: the field is missing; expected a finite number"
+        InputError, match=r"points\[3\]\.drone_pose\.z: the field is missing or null; expected a finite number"
     ) as told:
         read_flight(flight)
     assert "None" not in str(told.value)

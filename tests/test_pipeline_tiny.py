@@ -235,8 +235,8 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_pat
     shutil.copy(base / "run.yaml", out)
     before = (out / "run.yaml").read_bytes()
     caplog.set_level("INFO")
-    with pytest.raises(ResumeError, match=r"num_paths was 2, is 5"):
-        pipeline.run(tiny(**{"pedestrians.num_paths": 5}), out)
+    with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):  # more are added, fewer are not
+        pipeline.run(tiny(**{"pedestrians.num_paths": 1}), out)
     assert (out / "run.yaml").read_bytes() == before
     assert "pedestrians: already complete" not in caplog.text
     assert not (out / ".lock").exists(), "who failed holds nobody up"

@@ -213,7 +213,7 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
         yield line, content
 
 
-MISSING = "the field is missing"
+MISSING = "the field is missing or null"
 
 
 def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dict:

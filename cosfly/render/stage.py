@@ -27,7 +27,7 @@ from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
-from cosfly.provenance import fingerprint
+from cosfly.provenance import checked_inputs, fingerprint
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.others import NOBODY, Cast, cast_of
@@ -227,6 +227,7 @@ def run(
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
     read_pools(cfg)  # presets that cannot be are told before anything is written
     inputs |= cfg.pool_files()
+    checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
