@@ -245,12 +245,16 @@ def test_an_outline_whose_parts_are_not_in_the_file_is_kept(tmp_path: Path):
 def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
     """99 buildings of 3D BAG, CityJSON 1.1: outlines at level 0, parts at 1.2, 1.3 and 2.2."""
     path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"
-    box_map = load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path)))
+    box_map, coarse = (
+        load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, solids=solids)))
+        for solids in (True, False)
+    )
     assert box_map.header.num_objects == 199
     assert box_map.header.dropped_objects == {"outline_of_parts": 99}
     assert box_map.header.building_covered_share > 0.995
     assert set(box_map.kinds) == {KINDS["Buildings"]}
-    assert box_map.maxs[:, 2].max() == pytest.approx(26.396 + 0.075, abs=1e-3)  # at level 1.2; 76.2 m at 2.2
+    assert coarse.maxs[:, 2].max() == pytest.approx(26.396 + 0.075, abs=1e-3)  # at level 1.2
+    assert box_map.maxs[:, 2].max() == pytest.approx(76.224 + 0.075, abs=1e-3)  # as drawn, at level 2.2
 
 
 # --- grounds ---
