@@ -27,7 +27,9 @@ AGREE_LEAST = 0.5  # honest 0.81 and more
 THROUGH_MOST = 0.02  # points in front of what is drawn: honest 0.001
 ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of planes; honest below 1e-5 as float32
 SAME_LEAST = 0.95  # of the instances; honest 0.985
-COLOUR_DROP = 0.15  # below the median of a flight's frames of one zoom; honest 0.08
+# Below the median of a flight's frames of one zoom; honest 0.08, and under heavy rain by night, whose streaks and wet ground are other ones in
+# every frame, 0.152.
+COLOUR_DROP, COLOUR_DROP_RAIN = 0.15, 0.25
 COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
     0.82,
     0.65,
@@ -165,7 +167,10 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             return
         limit, least = max(limit, TIMES_ROUGH * usual), AGREE_LEAST
     colours = np.array([pair.correlation for pair in pairs.found])
-    usuals, drops = usual_correlations(colours, flight.intrinsics[pairs.rows, 0], COLOUR_DROP)
+    skies = flight.column("weather_params")
+    rains = any(isinstance(sky, dict) and sky.get("precipitation") for sky in skies)
+    drop_most = COLOUR_DROP_RAIN if rains else COLOUR_DROP
+    usuals, drops = usual_correlations(colours, flight.intrinsics[pairs.rows, 0], drop_most)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
     least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
