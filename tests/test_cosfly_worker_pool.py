@@ -173,7 +173,8 @@ def test_progress_is_told_in_steps_where_all_items_know_theirs(tmp_path, monkeyp
 
 
 def test_events_tell_what_happened_and_a_damaged_line_is_no_harm(tmp_path):
-    work_on(tmp_path, ["nothing", "once-die"], workers=1, watch=Watch(probe_s=0.3))
+    # Probed all the time: at longer intervals all may be over before a worker that has loaded anything is looked at.
+    work_on(tmp_path, ["nothing", "once-die"], workers=1, watch=Watch(probe_s=0.01))
     path = tmp_path / "s" / EVENTS
     kinds = [event.event for event in read_events(tmp_path / "s") if event.event != "probe"]
     assert kinds == [
