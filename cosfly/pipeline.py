@@ -160,6 +160,7 @@ class _TimeLeft:
 
     def __init__(self, cfg: RunConfig, out: Path) -> None:
         self._cfg, self._out, self._rates = cfg, out, estimate.rates_near(out)
+        self._begun: set[str] = set()  # in this call: run.yaml has the settings of before until all stages are done
 
     def told(self, place: str, folder: Path) -> str:
         """Say of a stage what it will take, and all that is not done: `[5/8] render: about 1 min; about 3 min with all that follows`."""
@@ -168,7 +169,10 @@ class _TimeLeft:
         except CosflyError as error:  # the stage itself will say so, and what to do
             log.debug("no estimate: %s", error)
             return f"[{place}] {folder.name}"
-        own = [row for row in rows if row.name == folder.relative_to(self._out).as_posix()]
+        name = folder.relative_to(self._out).as_posix()
+        rows = [row for row in rows if row.name not in self._begun]
+        self._begun.add(name)
+        own = [row for row in rows if row.name == name]
         return f"[{place}] {folder.name}: about {estimate.time_left(own)}; with all that follows about {estimate.time_left(rows)}"
 
 

@@ -13,7 +13,9 @@ from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
 
-@pytest.mark.parametrize(("rain", "worst", "is_found"), [(0.0, 0.81, True), (80.0, 0.81, False), (80.0, 0.70, True)])
+@pytest.mark.parametrize(
+    ("rain", "worst", "is_found"), [(0.0, 0.81, True), (10.0, 0.81, True), (80.0, 0.81, False), (80.0, 0.75, True)]
+)
 def test_colours_may_differ_more_from_frame_to_frame_where_it_rains(rain, worst, is_found):
     camera = {"fx": 400.0, "fy": 400.0, "cx": 240.0, "cy": 135.0}
     sky, box = {"precipitation": rain}, dict.fromkeys(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), 9.0)

@@ -29,7 +29,7 @@ ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of pl
 SAME_LEAST = 0.95  # of the instances; honest 0.985
 # Below the median of a flight's frames of one zoom; honest 0.08, and under heavy rain by night, whose streaks and wet ground are other ones in
 # every frame, 0.152.
-COLOUR_DROP, COLOUR_DROP_RAIN = 0.15, 0.25
+COLOUR_DROP, COLOUR_DROP_RAIN = 0.15, 0.2  # dry; where it rains as hard as it can
 COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
     0.82,
     0.65,
@@ -168,16 +168,17 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
         limit, least = max(limit, TIMES_ROUGH * usual), AGREE_LEAST
     colours = np.array([pair.correlation for pair in pairs.found])
     skies = flight.column("weather_params")
-    rains = any(isinstance(sky, dict) and sky.get("precipitation") for sky in skies)
-    drop_most = COLOUR_DROP_RAIN if rains else COLOUR_DROP
+    told = [sky.get("precipitation") for sky in skies if isinstance(sky, dict)]
+    rain = min(max((one for one in told if isinstance(one, int | float)), default=0.0), 100.0) / 100.0
+    drop_most = COLOUR_DROP + rain * (COLOUR_DROP_RAIN - COLOUR_DROP)
     usuals, drops = usual_correlations(colours, flight.intrinsics[pairs.rows, 0], drop_most)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
     least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
     if np.isfinite(usuals).any() and not flight.is_foreign and np.nanmedian(usuals) < least_colour:
         findings.error("scene_colour", flight.name, f"colours that agree by {np.nanmedian(usuals):.2f} from frame to frame", "pictures of this flight")  # fmt: skip
-    told = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, usuals, drops, strict=True)
-    for i, gap, pair, elsewhere, usual_colour, drop in told:
+    compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, usuals, drops, strict=True)
+    for i, gap, pair, elsewhere, usual_colour, drop in compared:
         if pair.seen < LEAST_SEEN:
             continue
         share, through = pair.agree / pair.seen, pair.through / pair.seen
