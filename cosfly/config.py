@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.errors import ConfigError, InputError, nearest, plain
 from cosfly.reading.files import read_text
 from cosfly.reading.settings_text import MOST_DEPTH, parse_yaml
 
@@ -123,7 +123,7 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
     kind = detail["type"]
     if kind in ("list_type", "tuple_type"):
         return f"{field}: not a list, got {detail['input']!r}; write [{detail['input']}]"
-    what = "not a group of settings" if kind == "model_type" else detail["msg"].removeprefix("Value error, ")
+    what = "not a group of settings" if kind == "model_type" else plain(detail["msg"])
     return f"{field}: {what}{got}"
 
 

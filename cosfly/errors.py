@@ -17,13 +17,16 @@ A *fatal* error ends the stage; any other, raised inside one item, is recorded f
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from difflib import get_close_matches
+import re
+from collections.abc import Iterable, Sequence
+from difflib import SequenceMatcher
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from cosfly.escaping import for_terminal
+
+MOST_TOLD = 12  # problems in a message
 
 
 class CosflyError(Exception):
@@ -63,6 +66,13 @@ class CosflyError(Exception):
         return " ".join(
             "; ".join(map(for_terminal, parts)).split()
         )  # one line that a terminal prints, whatever the parts held
+
+    @classmethod
+    def of_all(cls, problems: Sequence[str], *, where: str | Path, expected: str | None = None) -> Self:
+        """Give one error of all that is wrong with a file: the first of them, and how many there are."""
+        more = f"; and {len(problems) - MOST_TOLD} more" if len(problems) > MOST_TOLD else ""
+        count = f"{len(problems)} to mend" if len(problems) > 1 else None
+        return cls("; ".join(problems[:MOST_TOLD]) + more, where=where, expected=expected, fix=count)
 
     def __reduce__(self) -> tuple:
         # Errors cross process borders; the default reduction would drop the keyword arguments.
@@ -113,7 +123,23 @@ class VerifyError(CosflyError):
     code = "verify"
 
 
+# Names of settings that share words are nearer than their letters tell: goal_min_m is min_distance_m, not resolution_m.
+NEAR, SHARED_WORD = 0.6, 0.15
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Give ' (did you mean X?)' for the nearest known name, or the empty string."""
-    matches = get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" (did you mean {matches[0]!r}?)" if matches else ""
+    found = max(known, key=partial(_nearness, name), default="")
+    return f" (did you mean {found!r}?)" if found and _nearness(name, found) >= NEAR else ""
+
+
+def _nearness(name: str, known: str) -> float:
+    """How near two names are: the share of letters in common, and more for each word, where one of them is no unit."""
+    shared = {*re.split(r"[\W_]+", name)} & {*re.split(r"[\W_]+", known)}
+    counts = len(shared) if any(len(word) > 2 for word in shared) else 0
+    return SequenceMatcher(None, name, known).ratio() + SHARED_WORD * counts
+
+
+def plain(message: str) -> str:
+    """Give what a validator of ours said, without what pydantic puts before it."""
+    return message.removeprefix("Value error, ")

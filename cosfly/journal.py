@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from cosfly.errors import InputError
+from cosfly.errors import InputError, plain
 from cosfly.reading.documents import parse_json
 from cosfly.reading.files import open_file, read_lines
 from cosfly.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
@@ -68,7 +68,7 @@ class Journal:
         return InputError(
             "a line that cannot be used",
             where=f"{self.path}:{self.line_num}",
-            got=f"{field}: {detail['msg'][:200]}",
+            got=f"{field}: {plain(detail['msg'])[:200]}",
             fix=f"run the same command with --repair: such lines go into {self.path.name}{ASIDE}, and what stood in them is done again",
         )
 

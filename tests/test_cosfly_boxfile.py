@@ -129,7 +129,7 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("text", "settings", "words"),
     [
-        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {}, r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are NONE, Roads.*2 to mend"),
+        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {}, r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are Roads.*2 to mend"),
         (PLAIN.replace(",yaw_deg", ",yaw_dge"), {}, r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
         (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]}, r"no column for type \(type, category, kind, class\)"),
         (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
@@ -152,12 +152,22 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, settings, words)
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")), "feature 0: not a geometry that has a place here; got LineString"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")), "feature 0: its coordinates are not rings"),
-        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")), "not rings of places"),
-        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)), r"feature 0: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
-        (collection(feature("Point", [5, 5], type="Vegetation", height=3)), "feature 0: neither length nor half_length"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")), "feature 0: neither height nor half_height"),
+        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")), "feature 1: a geometry that has no place here, LineString; there are Point"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")), "feature 1: its coordinates are not places: at least four finite"),
+        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")), "not places: at least four"),
+        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)), r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
+        (collection(feature("Point", [5, 5], type="Vegetation", height=3)), "feature 1: neither length nor half_length"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")), "feature 1: neither height nor half_height"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height=3)), "the last the first again"),
+        (
+            collection(
+                {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
+                feature("Point", [5, 5], type="Vegetation", name="old oak", height="tall"),
+                feature("Point", [5, 5], type="house", levels=3, length=4, width=4, height=6),
+            ),
+            r"properties: column 'levels' has no meaning.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): height is not a finite number: 'tall'"
+            r".*feature 3: unknown type 'house'.*expected columns .*types are .*4 to mend",
+        ),
         (json.dumps({"type": "Topology"}), "not GeoJSON"),
         (collection(), "holds no boxes"),
     ],

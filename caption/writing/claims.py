@@ -20,6 +20,7 @@ from caption.truth.prose.lexicon import load_lexicon
 from caption.truth.references import QUANTITIES
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
+from cosfly.errors import plain
 from cosfly.products.captions import Claim, Language, Modality, Parsed
 from cosfly.products.sentences import sentences_of
 
@@ -138,7 +139,7 @@ def _claim(item: Any) -> Claim | str:
         return Claim(**given)
     except (ValidationError, TypeError) as error:
         first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
-        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+        return f"{'.'.join(str(part) for part in first['loc'])}: {plain(str(first['msg']))}"
 
 
 _NUMBER = re.compile(r"[-+]?\d{1,9}(?:\.\d{1,9})?")

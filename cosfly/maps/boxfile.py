@@ -51,6 +51,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "yaw_rad": ("yaw_rad",),
     "type": ("type", "category", "kind", "class"),
     "id": ("id",),
+    "name": ("name",),  # tells a person which one is meant
 }
 FIELDS = {name: field for field, names in NAMES.items() for name in names}
 SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
@@ -59,7 +60,6 @@ FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
 TALL_M = 400.0  # the usual building is lower
 DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
-MOST_TOLD = 12  # problems in a message
 
 
 class BoxesConfig(Config):
@@ -112,11 +112,12 @@ class BoxesConfig(Config):
 
 
 class _Row(NamedTuple):
-    """One row or feature: what its columns say, by field; `outline` of a feature that has one, in metres."""
+    """One row or feature: what its columns say, by field; `outline` of a feature that has one, in metres; what is `wrong` with it already."""
 
     where: str
     values: Mapping[str, Any]
     outline: Polygon | None = None
+    wrong: str = ""
 
 
 class _Wrong(Exception):
@@ -150,17 +151,23 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         except _Wrong as wrong:
             problems.append(f"{row.where}: {wrong}")
         ids.append(row.values.get("id"))
-    types = (
-        f"types are {', '.join(KINDS)}; maps.boxes.types translates others"
-        if any("type" in told for told in problems)
-        else None
-    )
-    _raise_all(problems, path, types)
+    if problems:
+        raise InputError.of_all(problems, where=path, expected=_hint(problems))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
     box_map = boxes.box_map(header)
     if len(box_map) == len(rows) and all(ids):
         box_map = replace(box_map, ids=_ids(ids, path))
     return _told(box_map, cfg, path)
+
+
+def _hint(problems: Sequence[str]) -> str | None:
+    """Say what would have been right, where names are what is wrong."""
+    hints = {
+        "has no meaning": f"columns {', '.join(FIELDS)}; maps.boxes.ignore leaves others out",
+        "type": f"types are {', '.join(kind for kind in KINDS if kind != 'NONE')}; maps.boxes.types translates others",
+    }
+    found = [hint for word, hint in hints.items() if any(word in problem for problem in problems)]
+    return "; ".join(found) or None
 
 
 def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
@@ -206,10 +213,17 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 continue
             if not names:
                 names = line
-                fields = _fields(names, cfg, path)
+                fields, problems = _fields(names, cfg)
+                problems += [
+                    f"no column for {f} ({', '.join(NAMES[f])})" for f in ("x", "y", "type") if f not in fields
+                ]
+                if problems:
+                    raise InputError.of_all(problems, where=path, expected=_hint(problems))
                 continue
             if len(line) != len(names):
-                _raise_all([f"line {lines.line_num}: {len(line)} cells, where the first line has {len(names)}"], path)
+                wrong = f"{len(line)} cells, where the first line has {len(names)}"
+                yield _Row(f"line {lines.line_num}", {}, wrong=wrong)
+                continue
             cells = ((field, cell.strip()) for field, cell in zip(fields, line, strict=True) if field)
             yield _Row(f"line {lines.line_num}", {field: cell for field, cell in cells if cell})
     except csv.Error as error:
@@ -219,12 +233,16 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
 def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
     features = read_features(path, what="map")
     names = list(dict.fromkeys(name for feature in features for name in feature.properties))
-    fields = dict(zip(names, _fields(names, cfg, path, is_needed=False), strict=True))
+    found, problems = _fields(names, cfg)
+    fields = dict(zip(names, found, strict=True))
+    yield from (_Row("properties", {}, wrong=problem) for problem in problems)
     project = _projection([ring for feature in features for part in feature.parts for ring in part])
     for feature in features:
         row = {
             field: value for name, value in feature.properties.items() if value is not None and (field := fields[name])
         }
+        if feature.wrong:
+            yield _Row(feature.where, row, wrong=feature.wrong)
         for part in feature.parts:
             rings = [project(ring) for ring in part]
             if len(rings[0]) == 1:
@@ -247,8 +265,8 @@ def _projection(rings: list[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda ring: np.radians(ring - middle) * [east_m, north_m]
 
 
-def _fields(names: Sequence[str], cfg: BoxesConfig, path: Path, *, is_needed: bool = True) -> list[str | None]:
-    """Give the field that each column holds, None of those that are not read; tells all that is wrong with the names."""
+def _fields(names: Sequence[str], cfg: BoxesConfig) -> tuple[list[str | None], list[str]]:
+    """Give the field that each column holds, None of those that are not read, and what is wrong with the names."""
     fields = [None if name in cfg.ignore else FIELDS.get(name.strip().lower()) for name in names]
     problems = []
     if "*" not in cfg.ignore:
@@ -256,25 +274,12 @@ def _fields(names: Sequence[str], cfg: BoxesConfig, path: Path, *, is_needed: bo
             f"column {name!r} has no meaning here{nearest(name.strip().lower(), FIELDS)}"
             for name, field in zip(names, fields, strict=True) if field is None and name not in cfg.ignore
         ]  # fmt: skip
-    hint = f"columns {', '.join(FIELDS)}; maps.boxes.ignore leaves others out" if problems else None
     for field, count in Counter(field for field in fields if field).items():
         if count > 1:
             problems.append(
                 f"{count} columns are the {field}: {', '.join(n for n, f in zip(names, fields, strict=True) if f == field)}"
             )
-    if is_needed:
-        problems += [
-            f"no column for {field} ({', '.join(NAMES[field])})" for field in ("x", "y", "type") if field not in fields
-        ]
-    _raise_all(problems, path, hint)
-    return fields
-
-
-def _raise_all(problems: list[str], path: Path, hint: str | None = None) -> None:
-    if problems:
-        more = f"; and {len(problems) - MOST_TOLD} more" if len(problems) > MOST_TOLD else ""
-        count = f"{len(problems)} to mend" if len(problems) > 1 else None
-        raise InputError("; ".join(problems[:MOST_TOLD]) + more, where=path, expected=hint, fix=count)
+    return fields, problems
 
 
 def _ids(given: list[Any], path: Path) -> np.ndarray:
@@ -286,7 +291,8 @@ def _ids(given: list[Any], path: Path) -> np.ndarray:
         if not (text.isascii() and text.isdecimal() and int(text) < 2**63)
     ]
     problems += [f"id {text} occurs {count} times" for text, count in Counter(texts).items() if count > 1]
-    _raise_all(problems, path)
+    if problems:
+        raise InputError.of_all(problems, where=path)
     return np.array([int(text) for text in texts], dtype=np.uint64)
 
 
@@ -294,8 +300,9 @@ def _ids(given: list[Any], path: Path) -> np.ndarray:
 
 
 def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
-    kind = _kind(row.values, cfg)
-    numbers = {name: _number(name, value) for name, value in row.values.items() if name not in ("type", "id")}
+    if row.wrong:
+        raise _Wrong(row.wrong)
+    kind, numbers = _read(row.values, cfg)
     if "yaw_deg" in numbers and "yaw_rad" in numbers:
         raise _Wrong("yaw twice, in degrees and in radians")
     yaw_deg = numbers.pop("yaw_deg", math.degrees(numbers.pop("yaw_rad", 0.0)))
@@ -315,6 +322,24 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
         raise _Wrong(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
     for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):
         boxes.add(kind, rectangle.center, rectangle.size, low_m, high_m, rectangle.yaw_deg)
+
+
+def _read(values: Mapping[str, Any], cfg: BoxesConfig) -> tuple[str, dict[str, float]]:
+    """Give the type and the numbers of a row; says all that is wrong with them."""
+    wrong, kind, numbers = list[str](), "", dict[str, float]()
+    try:
+        kind = _kind(values, cfg)
+    except _Wrong as error:
+        wrong.append(str(error))
+    for name, value in values.items():
+        if name not in ("type", "id", "name"):
+            try:
+                numbers[name] = _number(name, value)
+            except _Wrong as error:
+                wrong.append(str(error))
+    if wrong:
+        raise _Wrong(", ".join(wrong))
+    return kind, numbers
 
 
 def _kind(values: Mapping[str, Any], cfg: BoxesConfig) -> str:

@@ -276,6 +276,9 @@ def read_boxes(path: Path) -> BoxMap:
     Raises:
         InputError: names the file, the box and the field.
     """
+    if path.suffix.lower() in (".csv", ".geojson"):
+        fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
+        raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
     value = read_json(path, what="map")
     header = MapHeader(name=path.stem)
     records: Any = value

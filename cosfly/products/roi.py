@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
 from cosfly.reading.documents import read_json, validation_errors
-from cosfly.reading.geojson import features_of, is_geojson
+from cosfly.reading.geojson import Feature, features_of, is_geojson
 from cosfly.reading.limits import limits, over_limit
 
 SMALLEST_M = 1.0  # nobody walks in less; a region drawn in degrees is smaller
@@ -44,11 +44,7 @@ def read_roi(path: Path) -> Roi:
     """
     value = read_json(path, what="region of interest")
     if is_geojson(value):
-        value = {
-            "polygons": [
-                _polygon_of(part, feature.where, path) for feature in features_of(value, path) for part in feature.parts
-            ]
-        }
+        value = {"polygons": _polygons_of(features_of(value, path), path)}
     with validation_errors(path):
         roi = Roi.model_validate(value)
     if not roi.closed:
@@ -75,13 +71,19 @@ def read_roi(path: Path) -> Roi:
     return roi
 
 
-def _polygon_of(rings: list[np.ndarray], where: str, path: Path) -> dict[str, Any]:
-    """Give a polygon of GeoJSON, whose rings repeat their first point, in the form of this file."""
-    spread = np.ptp(rings[0], axis=0).max()
-    if len(rings[0]) < 4 or spread < SMALLEST_M:
-        raise InputError(
-            "not a region in metres", where=f"{path}: {where}", got=f"{len(rings[0])} points within {spread:.3g}",
-            expected="a polygon in the map's world metres, x east and y north; longitude and latitude are not",
-        )  # fmt: skip
-    points, *holes = (ring[:-1].tolist() for ring in rings)
-    return {"points_world": points, "holes": holes}
+def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
+    """Give polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is wrong with them."""
+    problems, polygons = [], []
+    for feature in features:
+        if feature.wrong:
+            problems.append(f"{feature.where}: {feature.wrong}")
+        for rings in feature.parts:
+            spread = np.ptp(rings[0], axis=0).max()
+            if len(rings[0]) < 4 or spread < SMALLEST_M:
+                problems.append(f"{feature.where}: not a region in metres, {len(rings[0])} points within {spread:.3g}")
+            points, *holes = (ring[:-1].tolist() for ring in rings)
+            polygons.append({"points_world": points, "holes": holes})
+    if problems:
+        expected = "polygons in the map's world metres, x east and y north; longitude and latitude are not"
+        raise InputError.of_all(problems, where=path, expected=expected)
+    return polygons

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from cosfly.errors import InputError
+from cosfly.errors import InputError, plain
 from cosfly.reading.files import CHECK_PATH, decoded, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -184,7 +184,7 @@ def validation_errors(where: str | Path) -> Iterator[None]:
         detail = error.errors()[0]
         places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field = "".join(places).removeprefix(".") or "top level"
-        what = "not an object" if detail["type"] == "model_type" else detail["msg"].removeprefix("Value error, ")
+        what = "not an object" if detail["type"] == "model_type" else plain(detail["msg"])
         raise InputError(what, where=f"{where}: {field}", got=repr(detail["input"])[:80]) from None
 
 

@@ -18,13 +18,15 @@ class Feature(NamedTuple):
     """One feature.
 
     Attributes:
-        where: which one, for messages.
+        where: which one, for messages: counted from 1, with its id or name.
         parts: polygons of rings, the outer one first, (n, 2); a point is a ring of one.
+        wrong: what is wrong with its geometry, in words; it has no parts then.
     """
 
     where: str
     properties: dict[str, Any]
     parts: list[list[np.ndarray]]
+    wrong: str = ""
 
 
 def is_geojson(value: Any) -> bool:
@@ -33,10 +35,10 @@ def is_geojson(value: Any) -> bool:
 
 
 def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
-    """Read a FeatureCollection, a Feature or a bare geometry.
+    """Read a FeatureCollection, a Feature or a bare geometry. What is wrong with a feature stands in it, so that all can be told at once.
 
     Raises:
-        InputError: names the feature; a geometry of another kind, or coordinates that are no finite places.
+        InputError: the document is not GeoJSON.
     """
     return features_of(read_json(path, what=what), path)
 
@@ -50,35 +52,37 @@ def features_of(value: Any, path: Path) -> list[Feature]:
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise InputError("no list of features", where=f"{path}: features", expected="a list of Feature")
-    return [_feature(item, number, path) for number, item in enumerate(items)]
+    return [_feature(item, number) for number, item in enumerate(items, 1)]
 
 
-def _feature(item: dict[str, Any], number: int, path: Path) -> Feature:
+def _feature(item: dict[str, Any], number: int) -> Feature:
     geometry = item.get("geometry") if item.get("type") == "Feature" else item
+    given = item.get("properties")
+    properties: dict[str, Any] = given if isinstance(given, dict) else {}
+    name = next(
+        (value for value in (properties.get("name"), item.get("id"), properties.get("id")) if value not in (None, "")),
+        None,
+    )
+    where = f"feature {number}" + ("" if name is None else f" ({str(name)[:40]})")
     kind, places = (geometry.get("type"), geometry.get("coordinates")) if isinstance(geometry, dict) else (None, None)
-    where = f"feature {number}"
     if kind not in GEOMETRIES:
-        raise InputError(
-            "not a geometry that has a place here",
-            where=f"{path}: {where}",
-            got=str(kind)[:40],
-            expected=", ".join(GEOMETRIES),
+        return Feature(
+            where,
+            properties,
+            [],
+            f"a geometry that has no place here, {str(kind)[:40]}; there are {', '.join(GEOMETRIES)}",
         )
     nested: Any = {"Point": [[[places]]], "Polygon": [places], "MultiPolygon": places}[kind]
-    least = 1 if kind == "Point" else 4
     try:
         parts = [[np.array([place[:2] for place in ring], dtype=np.float64) for ring in part] for part in nested]
         is_good = all(parts) and all(
-            ring.shape == (len(ring), 2) and len(ring) >= least for part in parts for ring in part
-        )
+            ring.shape == (len(ring), 2) and (kind == "Point" or (len(ring) > 3 and (ring[0] == ring[-1]).all()))
+            for part in parts for ring in part
+        )  # fmt: skip
         is_good = is_good and all((np.abs(ring) <= LARGEST).all() for part in parts for ring in part)  # NaN is not
     except (TypeError, ValueError, OverflowError):
         is_good = False
     if not is_good:
-        raise InputError(
-            "its coordinates are not rings of places",
-            where=f"{path}: {where}",
-            expected="at least four finite [x, y], the last the first again",
-        )
-    properties = item.get("properties")
-    return Feature(where, properties if isinstance(properties, dict) else {}, parts)
+        needs = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last the first again"
+        return Feature(where, properties, [], f"its coordinates are not places: {needs}")
+    return Feature(where, properties, parts)
