@@ -14,6 +14,7 @@ import os
 import socket
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import IO
 from weakref import WeakValueDictionary
@@ -31,8 +32,8 @@ MAX_HOLDER_BYTES = 2_000
 class FolderLock:
     """Holds a folder until it is released, or nobody refers to it any more, or the process ends."""
 
-    def __init__(self, path: Path, file: IO[str] | None) -> None:
-        self.path, self._file = path, file
+    def __init__(self, path: Path, file: IO[str] | None, made: Collection[Path], nothing: Collection[str]) -> None:
+        self.path, self._file, self._made, self._nothing = path, file, made, nothing
 
     def __enter__(self) -> FolderLock:
         return self
@@ -48,6 +49,19 @@ class FolderLock:
                 self.path.unlink()
             file.close()
 
+    def give_up(self) -> None:
+        """Let others in, and leave a folder in which nothing was done as it was before."""
+        others = [entry for entry in self.path.parent.iterdir() if entry != self.path] if self._file is not None else []
+        if self._file is None or any(entry.name not in self._nothing for entry in others):
+            return self.release()
+        with contextlib.suppress(OSError):
+            for entry in others:
+                entry.unlink()
+        self.release()
+        with contextlib.suppress(OSError):  # somebody who waited is there already
+            for folder in self._made:
+                folder.rmdir()
+
     def __del__(self) -> None:
         self.release()
 
@@ -56,9 +70,12 @@ class FolderLock:
 _held: WeakValueDictionary[Path, FolderLock] = WeakValueDictionary()
 
 
-def hold_folder(folder: Path) -> FolderLock:
+def hold_folder(folder: Path, nothing: Collection[str] = ()) -> FolderLock:
     """Hold a folder, which is made where there is none.
 
+    Args:
+        nothing: names of files that are no work: where only these stand in the folder when it is given up, they go too, and so does
+            a folder that was made for them.
     Raises:
         ResumeError: another process holds it; names its id, machine, command and since when.
         StorageError: the folder cannot be written to.
@@ -66,8 +83,16 @@ def hold_folder(folder: Path) -> FolderLock:
     path = folder.resolve() / LOCK
     held = _held.get(path)
     if held is None or held._file is None:
-        held = _held[path] = FolderLock(path, _locked(path))
+        made = [place for place in path.parents if not place.exists()]
+        held = _held[path] = FolderLock(path, _locked(path), made, nothing)
     return held
+
+
+def give_up(below: Path | None = None) -> None:
+    """Let go of all folders that this process holds, or those below one, the innermost first: a command ends with an error."""
+    for path, held in sorted(_held.items(), key=lambda one: len(one[0].parts), reverse=True):
+        if below is None or path.is_relative_to(below.resolve()):
+            held.give_up()
 
 
 def is_held(folder: Path) -> bool:

@@ -27,7 +27,7 @@ import release.package.stage
 from cosfly import estimate
 from cosfly.ahead import compiled_ahead
 from cosfly.errors import CosflyError, InputError
-from cosfly.folder_lock import hold_folder
+from cosfly.folder_lock import give_up, hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
@@ -122,11 +122,15 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
 @contextlib.contextmanager
 def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
     """Hold a run folder, and keep `run.yaml` in it: other settings replace it when every stage has taken them, not before."""
-    with hold_folder(out):
+    with hold_folder(out, nothing=("run.yaml",)):
         is_new = not (out / "run.yaml").exists()
         if is_new:
             _save_run(cfg, out)
-        yield
+        try:
+            yield
+        except BaseException:
+            give_up(out)  # so that a run that was refused before anything was done leaves nothing
+            raise
         if not is_new:
             _save_run(cfg, out)
 

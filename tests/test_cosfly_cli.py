@@ -30,6 +30,25 @@ def _own_log():
     root.handlers[:], root.level = before
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("run", "quickstart", "--resume", "maybe"), "'maybe' is not one of 'never', 'if-same', 'force'"),
+        (("run", "quickstart", "--workers", "two"), "valid integer, unable to parse string as an integer, got 'two'"),
+        (("caption", "--tracks", "x"), "'x' is not one of 'clean', 'perturbed', 'both'"),
+    ],
+)
+def test_what_an_option_does_not_take_is_told_in_words_for_people(capfd, monkeypatch, words, told):
+    monkeypatch.setattr(sys, "argv", ["cosfly", *words])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    error = capfd.readouterr().err
+    assert end.value.code == 2
+    assert told in error
+    assert "Value error" not in error
+
+
 def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
     """Run a command in this process; gives its exit code and its last line on the error stream."""
     monkeypatch.setattr(sys, "argv", ["cosfly", *words])
@@ -49,13 +68,15 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
             ("no such file", "maps.boxes", "none.csv"),
         ),
         (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
+        (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
         (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
     ],
 )
 def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, parts):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").write_text("a file")
+    for name in ("taken", "town.csv"):
+        (tmp_path / name).write_text("a file")
     status, line = answer(capfd, monkeypatch, *words)
     assert status == 1
     assert line.startswith("error: ")

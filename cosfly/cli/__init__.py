@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,7 +24,7 @@ from cosfly.cli.release import app as release_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
-from cosfly.errors import CosflyError
+from cosfly.errors import CosflyError, plain
 
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
@@ -33,7 +33,25 @@ FLAGS = ("-v", "--verbose", "-q", "--quiet")  # of all commands; no command has 
 
 log = logging.getLogger(__name__)
 
+
+class _Root(typer.core.TyperGroup):
+    """The command of commands. What it says of a value that an option does not take is for people: Typer hands on what pydantic says."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            from pydantic import ValidationError
+
+            if isinstance(error.__cause__, ValidationError):
+                detail = error.__cause__.errors()[0]
+                got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
+                error.message = f"{plain(error.message)}{got}"
+            raise
+
+
 app = typer.Typer(
+    cls=_Root,
     help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -100,7 +118,10 @@ def main() -> None:
 
 
 def _fail(message: str, status: int) -> None:
+    from cosfly.folder_lock import give_up
+
     typer.echo(f"error: {message}", err=True)
+    give_up()
     _end(status)
 
 
