@@ -164,13 +164,25 @@ def num_windows(cfg: RunConfig, frames: list[int]) -> int:
     return sum(math.ceil(max(0, count) / window.stride) for count in whole)
 
 
-def _amounts(cfg: RunConfig, out: Path, rates: Rates) -> dict[str, int]:
-    walks = cfg.pedestrians.num_paths
-    frames = _frames_of(cfg, out) if _walks_of(out) == walks else []
-    if not frames:
-        each = round(rates.frames_a_metre * _steps(cfg.pedestrians))
-        frames = [each] * (walks * len(cfg.render.tracks))
+def _amounts(cfg: RunConfig, out: Path, rates: Rates, more: int) -> tuple[dict[str, int], dict[str, int]]:
+    """Count what a run is of in all, and what `more` walks are of alone."""
+    walks, tracks = cfg.pedestrians.num_paths, len(cfg.render.tracks)
+    each = round(rates.frames_a_metre * _steps(cfg.pedestrians))
+    made = _walks_of(out)
+    known = _frames_of(cfg, out) if made in (walks, walks - more) else []
+    frames = known + [each] * ((walks - made if known else walks) * tracks)
+    return _counts(cfg, walks, frames), _counts(cfg, more, [each] * (more * tracks))
+
+
+def _counts(cfg: RunConfig, walks: int, frames: list[int]) -> dict[str, int]:
     return {"map": 1, "walks": walks, "frames": sum(frames), "windows": num_windows(cfg, frames)}
+
+
+def more_walks(cfg: RunConfig, out: Path) -> int:
+    """Count the walks that these settings add to what stands in a run folder; 0 where anything else differs."""
+    if other_settings(cfg, out) != ["pedestrians.num_paths"]:
+        return 0
+    return max(0, cfg.pedestrians.num_paths - load(RunConfig, out / "run.yaml").pedestrians.num_paths)
 
 
 def other_settings(cfg: RunConfig, out: Path) -> list[str]:
@@ -202,10 +214,13 @@ def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
 
 
 def _stages(cfg: RunConfig, out: Path, rates: Rates, names: tuple[str, ...]) -> Iterator[StageEstimate]:
-    amounts = _amounts(cfg, out, rates)
+    more = more_walks(cfg, out)
+    whole, added = _amounts(cfg, out, rates, more)
     changed = {name.partition(".")[0] for name in other_settings(cfg, out)}
     fresh = 0 if changed - set(names) else min((names.index(name) for name in changed), default=len(names))
-    return (_stage(name, amounts[UNITS[name]], cfg, out, rates, place < fresh) for place, name in enumerate(names))
+    for place, name in enumerate(names):
+        is_added_to = place >= fresh and more > 0 and name != "release" and _is_complete(out / name)
+        yield _stage(name, (added if is_added_to else whole)[UNITS[name]], cfg, out, rates, place < fresh)
 
 
 def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates, stands: bool = True) -> StageEstimate:

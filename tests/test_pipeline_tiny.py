@@ -18,7 +18,7 @@ from cosfly import pipeline, provenance
 from cosfly.bench import measure
 from cosfly.cli import app
 from cosfly.config import load
-from cosfly.errors import ConfigError, ResumeError, StorageError, VerifyError
+from cosfly.errors import ConfigError, InputError, ResumeError, StorageError, VerifyError
 from cosfly.estimate import estimate, other_settings, rates_near, time_left
 from cosfly.folder_lock import hold_folder
 from cosfly.journal import Journal
@@ -192,6 +192,27 @@ def test_what_was_made_with_other_settings_is_not_done(base):
     assert other_settings(wider, base) == ["render.height_px", "render.width_px"]
     shown = CliRunner().invoke(app, ["run", str(base), "--set", "render.width_px=320", "--dry-run"])
     assert "made with other settings (render.width_px)" in shown.output
+
+
+def test_of_more_walks_a_dry_run_counts_what_is_added(base):
+    more = tiny(**{"pedestrians.num_paths": 3})
+    rows = {row.name: row for row in estimate(more, base, rates_near(base))}
+    frames = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
+    assert [name for name, row in rows.items() if row.is_done] == ["maps", "simplify"]
+    assert (rows["pedestrians"].count, rows["plan"].count) == (1, 1)
+    assert rows["render"].count == pytest.approx(frames / 2, abs=4)
+    assert rows["release"].count == frames + rows["render"].count  # made anew, of all
+    shown = CliRunner().invoke(app, ["run", str(base), "--set", "pedestrians.num_paths=3", "--dry-run"])
+    assert "goes on with 1 more walks" in " ".join(shown.output.split())
+    assert "refuse" not in shown.output
+
+
+def test_a_run_that_is_refused_before_anything_is_done_leaves_nothing(tmp_path):
+    (tmp_path / "town.csv").write_text("type,x,y\nBuildings,1,1\n")
+    cfg = tiny(**{"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"})
+    with pytest.raises(InputError, match="neither height nor half_height"):
+        pipeline.run(cfg, tmp_path / "runs/mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["town.csv"]
 
 
 def test_what_a_teacher_will_take_is_not_made_up(base, tmp_path):

@@ -92,7 +92,12 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     )
     if any(row.tokens is None for row in rows):
         answer_console.print(f"tokens are {estimate.UNKNOWN_TOKENS}", soft_wrap=True)
-    if others := estimate.other_settings(cfg, out):
+    if more := estimate.more_walks(cfg, out):
+        answer_console.print(
+            f"{out} goes on with {more} more walks; what stands there is kept and not counted, but for the release, which is built anew",
+            soft_wrap=True,
+        )
+    elif others := estimate.other_settings(cfg, out):
         answer_console.print(
             f"{out} was made with other settings ({', '.join(others[:6])}{' ...' if len(others) > 6 else ''}): its finished stages refuse "
             "them, and only a greater pedestrians.num_paths goes on there; choose another --out", soft_wrap=True,
