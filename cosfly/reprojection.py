@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.compiled import njit, words_of
 
 COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M = 0.3
+FAR_M = np.float32(1000.0)  # of the sky
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
 LEAST_CONTRAST = 4.0  # grey levels: less is a wall or a fog
 LEAST_PAIRS = 4  # of frames, for one to be unusual among them
@@ -145,28 +146,30 @@ def survey(
         pixels.
     """
     limits = np.array([depth.min(), depth.max()]) if depth.size else np.zeros(2)
-    return limits if np.isfinite(limits).all() else np.full(2, np.nan), *_survey(depth, instance, sky_kind, person_id)
+    instance = np.ascontiguousarray(instance)
+    found = _survey(depth, instance, words_of(instance.reshape(-1)), sky_kind, person_id)
+    return limits if np.isfinite(limits).all() else np.full(2, np.nan), *found
 
 
 @njit(cache=True, nogil=True)
-def _survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-def]
-    """Count run by run: of a mask's row most neighbours are the same."""
+def _survey(depth, instance, words, sky_kind, person_id):  # type: ignore[no-untyped-def]
+    """Count run by run: of a mask's row most neighbours are the same, which words of their bytes tell faster than pixels."""
     counts, kinds = np.zeros(3, np.int64), np.zeros(256, np.int64)
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
     height, width = instance.shape[:2]
-    has_depth = depth.shape[0] > 0
     for y in range(height):
-        begin = np.int64(0)
+        begin, row, stop = np.int64(0), y * width * 3, (y + 1) * width * 3
         while begin < width:
             kind, low, high = instance[y, begin, 0], instance[y, begin, 1], instance[y, begin, 2]
-            end = begin + 1
+            at = row + 3 * (begin + 1)
+            while at + 8 <= stop and words[at] == words[at - 3]:
+                at += 8
+            end = (at - row) // 3
             while end < width and instance[y, end, 0] == kind and instance[y, end, 1] == low and instance[y, end, 2] == high:  # fmt: skip
                 end += 1
             kinds[kind] += end - begin
-            if has_depth:
-                num_far = np.int64(0)
-                for x in range(begin, end):
-                    num_far += depth[y, x] == 1000.0
+            if depth.shape[0] > 0:
+                num_far = _num_far(depth[y, begin:end])
                 counts[0] += end - begin - num_far if kind == sky_kind else num_far
             if low == (person_id & 255) and high == (person_id >> 8):
                 counts[1] += end - begin
@@ -175,6 +178,15 @@ def _survey(depth, instance, sky_kind, person_id):  # type: ignore[no-untyped-de
                 box[2], box[3] = max(box[2], end), max(box[3], y + 1)
             begin = end
     return counts, box, kinds
+
+
+@njit(cache=True, nogil=True)
+def _num_far(depth):  # type: ignore[no-untyped-def]
+    """How many of a run's depths are the sky's."""
+    num = np.int64(0)
+    for k in range(len(depth)):
+        num += depth[k] == FAR_M
+    return num
 
 
 @njit(cache=True, nogil=True)

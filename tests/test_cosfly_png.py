@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cosfly.errors import InputError
+from cosfly.png.checksum import adler32
 from cosfly.png.deflate import deflate
 from cosfly.png.read import parse_png
 from cosfly.png.write import areas_png, colours_png
@@ -86,6 +87,27 @@ def test_a_changed_byte_is_found_or_changes_nothing(seed, is_mended):
         return
     assert is_mended
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("size", [0, 1, 4095, 4096, 4097, 3 * 4096, 300_001])
+@pytest.mark.parametrize("value", [0, 1, 255, None])
+def test_the_checksum_is_zlibs(size, value):
+    """Bytes of 255 come nearest to what 32 bits hold."""
+    data = (
+        np.random.default_rng(size).integers(0, 256, size, dtype=np.uint8)
+        if value is None
+        else np.full(size, value, np.uint8)
+    )
+    assert adler32(data) == zlib.adler32(data.data)
+
+
+@pytest.mark.parametrize("back", [1, 2, 3, 5, 7, 8, 9, 31, 32, 33, 300])
+def test_repetitions_of_every_distance_are_undone(back):
+    period = np.random.default_rng(back).integers(0, 256, back, dtype=np.uint8)
+    lines = np.resize(period, (40, 1 + 3 * 101))
+    lines[:, 0] = 0
+    data = png_of(lines, 3, 9, zlib.Z_DEFAULT_STRATEGY, 1 << 20)
+    np.testing.assert_array_equal(parse_png(data, "x").pixels().reshape(40, -1), lines[:, 1:])
 
 
 @pytest.mark.parametrize("cut", [0, 7, 20, 33, 60, -1, -12, -20])

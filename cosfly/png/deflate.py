@@ -6,11 +6,10 @@ which each block has of its own.
 
 from __future__ import annotations
 
-import zlib
-
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.compiled import njit, words_of
+from cosfly.png.checksum import adler32
 from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY, code_lengths, codes_of
 
 BLOCK_TOKENS = 1 << 16
@@ -36,13 +35,8 @@ def deflate(lines: np.ndarray, near: int, above: int) -> bytes:
     # Codes of one optimal code take 9 bits a byte at most.
     out = np.empty(lines.size * 9 // 8 + BLOCK_HEAD_BYTES * (2 + lines.size // BLOCK_TOKENS), np.uint8)
     out[:2] = 0x78, 0x01
-    end = _pack(data, _words_of(data), near, above if above < WINDOW else 0, _words_of(out))
-    return b"".join((out[:end].data, zlib.adler32(lines.data).to_bytes(4, "big")))
-
-
-def _words_of(data: np.ndarray) -> np.ndarray:
-    """The eight bytes from each place on as one number, least byte first."""
-    return np.ndarray(len(data) - 7, "<u8", data.data, strides=(1,))
+    end = _pack(data, words_of(data), near, above if above < WINDOW else 0, words_of(out))
+    return b"".join((out[:end].data, adler32(lines).to_bytes(4, "big")))
 
 
 @njit(cache=True, nogil=True)

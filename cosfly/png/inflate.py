@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import int64, njit
+from cosfly.compiled import int64, njit, words_of
 from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY
 
-LOOK_BITS = 11
+LOOK_BITS = 12
 LOOK = np.uint64((1 << LOOK_BITS) - 1)
 LOOKS = 56 // LOOK_BITS  # in the bits that one fetch has at least
+MOST_AT_ONCE = 3  # literals of a look
 SPARE = 32  # bytes behind what a stream fills, which looks and copies may write
 STORED, FIXED, OWN = 0, 1, 2  # forms of a block
 END = 256
@@ -42,8 +43,7 @@ def inflate(packed: bytes, start: int, size: int) -> tuple[np.ndarray, int]:
     source, room = np.frombuffer(packed, np.uint8), out[:size]
     if len(source) < 8:
         return room, -1
-    words, out_words = (np.ndarray(len(data) - 7, "<u8", data.data, strides=(1,)) for data in (source, out))
-    return room, int(_blocks(source, words, start, out, out_words))
+    return room, int(_blocks(source, words_of(source), start, out, words_of(out)))
 
 
 @njit(cache=True, nogil=True)
@@ -133,18 +133,17 @@ def _fill(code, lengths):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _find_runs(table, runs):  # type: ignore[no-untyped-def]
-    """Of the next bits, the one or two literals that they begin with: bits, how many (256s), first, second byte; 0 where there is none."""
+    """Of the next bits, the up to three literals that they begin with: bits, how many (16s), the bytes (256s); 0 where there is none."""
     for at in range(len(table)):
-        first = np.int64(table[at])
-        runs[at] = 0
-        if first == 0 or first >> 4 >= END:
-            continue
-        used = first & 15
-        second = np.int64(table[at >> used])
-        if second != 0 and second >> 4 < END and used + (second & 15) <= LOOK_BITS:
-            runs[at] = second >> 4 << 24 | first >> 4 << 16 | 2 << 8 | used + (second & 15)
-        else:
-            runs[at] = first >> 4 << 16 | 1 << 8 | used
+        word, used, num, rest = np.int64(0), np.int64(0), 0, np.int64(at)
+        while num < MOST_AT_ONCE:
+            entry = np.int64(table[rest])
+            width = entry & 15
+            if entry == 0 or entry >> 4 >= END or used + width > LOOK_BITS:
+                break
+            word |= entry >> 4 << (8 + 8 * num)
+            used, num, rest = used + width, num + 1, rest >> width
+        runs[at] = word | num << 4 | used
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -250,7 +249,7 @@ def _symbols(source, words, position, hold, held, out, out_words, at, room, lite
     """Unpack a block's symbols up to its end."""
     broken = BROKEN, hold, held, at
     while True:
-        position, hold, held, at = _literals(words, position, hold, held, out, at, room, runs)
+        position, hold, held, at = _literals(words, position, hold, held, out_words, at, room, runs)
         position, hold, held = _fetch(source, words, position, hold, held)
         entry = _next(hold, literal)
         s = entry >> 4
@@ -273,28 +272,27 @@ def _symbols(source, words, position, hold, held, out, out_words, at, room, lite
             back, hold, held = _more(hold, held, BASE_WAY[s], MORE_WAY[s])
             if held < 0 or back > at or at + n > room:
                 return broken
-            _repeat(out, out_words, at, back, n)
+            _repeat(out_words, at, back, n)
             at += n
         if at > room:
             return broken
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _literals(words, position, hold, held, out, at, room, runs):  # type: ignore[no-untyped-def]
+def _literals(words, position, hold, held, out_words, at, room, runs):  # type: ignore[no-untyped-def]
     """Unpack literals while their codes are short."""
     while position < len(words) and at <= room:
         hold |= words[position] << np.uint64(held)
         position += 63 - held >> 3
         held |= 56
         for _ in range(LOOKS):
-            run = np.int64(runs[np.int64(hold & LOOK)])
+            run = runs[hold & LOOK]
             if run == 0:
                 return position, hold, held, at
-            out[at] = run >> 16 & 255
-            out[at + 1] = run >> 24
-            at += run >> 8 & 255
-            hold >>= np.uint64(run & 255)
-            held -= run & 255
+            out_words[at] = run >> 8  # zeros behind them, where the next ones come
+            at += np.int64(run >> 4 & 3)
+            hold >>= np.uint64(run & 15)
+            held -= np.int64(run & 15)
     return position, hold, held, at
 
 
@@ -306,14 +304,22 @@ def _more(hold, held, base, num_bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _repeat(out, out_words, at, back, n):  # type: ignore[no-untyped-def]
-    """Write again the `n` bytes that stand so far back; up to seven more are written behind them."""
-    begin = np.int64(0)
-    if back < 8:  # repeated until a word is
-        step = back * ((7 + back) // back)
-        begin = min(n, step)
-        for k in range(begin):
-            out[at + k] = out[at + k - back]
-        back = step
-    for k in range(begin, n, 8):
-        out_words[at + k] = out_words[at + k - back]
+def _repeat(out_words, at, back, n):  # type: ignore[no-untyped-def]
+    """Write again the `n` bytes that stand so far back; some more are written behind them.
+
+    What stands less than a word back is written from a register: reading bytes that were written just now waits until they are in the cache.
+    """
+    if back >= 32:
+        for k in range(at, at + n, 32):
+            one, two, three, four = out_words[k - back], out_words[k - back + 8], out_words[k - back + 16], out_words[k - back + 24]  # fmt: skip
+            out_words[k], out_words[k + 8], out_words[k + 16], out_words[k + 24] = one, two, three, four
+    elif back >= 8:
+        for k in range(at, at + n, 8):
+            out_words[k] = out_words[k - back]
+    else:
+        pattern, filled = out_words[at - back] & (np.uint64(1) << np.uint64(8 * back)) - np.uint64(1), back
+        while filled < 8:
+            pattern |= pattern << np.uint64(8 * filled)
+            filled *= 2
+        for k in range(at, at + n, back * (8 // back)):  # whole repetitions
+            out_words[k] = pattern

@@ -15,6 +15,7 @@ import numpy as np
 
 from cosfly.compiled import njit
 from cosfly.errors import InputError
+from cosfly.png.checksum import adler32
 from cosfly.png.inflate import inflate
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 
@@ -42,10 +43,7 @@ class Png:
             stand_alone = self.lines[:, 0] <= 1
             first = np.maximum.accumulate(np.where(stand_alone, np.arange(self.height_px), 0))[wanted]
             if (wanted - first + 1).sum() < self.height_px // 2:
-                parts = [self.lines[begin : row + 1].copy() for begin, row in zip(first, wanted, strict=True)]
-                for part in parts:
-                    _undo(part, self.channels)
-                found = np.stack([part[-1, 1:] for part in parts])
+                found = _undone_alone(self.lines, first, wanted, self.channels)
                 return found.reshape(len(wanted), self.width_px, self.channels)
         return self._undone()[wanted, 1:].reshape(len(wanted), self.width_px, self.channels)
 
@@ -74,7 +72,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     out, used = inflate(packed, 2, height * (1 + width * channels))
     if used < 0:
         raise _broken(where, "a compressed stream that does not unpack to the picture")
-    if used + 4 > len(packed) or zlib.adler32(out.data) != int.from_bytes(packed[used : used + 4], "big"):
+    if used + 4 > len(packed) or adler32(out) != int.from_bytes(packed[used : used + 4], "big"):
         raise _broken(where, "pixels that do not agree with their checksum")
     lines = out.reshape(height, 1 + width * channels)
     if (lines[:, 0] > 4).any():
@@ -143,6 +141,17 @@ def _undo(lines, channels):  # type: ignore[no-untyped-def]
                     left, corner = (np.int64(row[x]) + guess) & 255, up
                     row[x] = left
         row[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _undone_alone(lines, first, wanted, channels):  # type: ignore[no-untyped-def]
+    """Undo a copy of some rows, (k, w * channels): of each those from its first on, as it leans on these."""
+    found = np.empty((len(wanted), lines.shape[1] - 1), np.uint8)
+    for k in range(len(wanted)):
+        part = lines[first[k] : wanted[k] + 1].copy()
+        _undo(part, channels)
+        found[k] = part[-1, 1:]
+    return found
 
 
 @njit(cache=True, nogil=True)
