@@ -94,6 +94,15 @@ def compile_encoders() -> dict[str, bytes]:
     }
 
 
+def compile_render() -> None:
+    """Compile what draws and writes frames."""
+    from cosfly.render.camera import spheres_in_view
+
+    spheres = [np.ones(shape, np.float32) for shape in ((1, 3), 1, 1, 1, 3, (3, 3))]
+    spheres_in_view(*spheres, np.ones(2), np.ones(2), 1.0)
+    compile_encoders()
+
+
 def compile_inspection() -> None:
     """Compile what looks at pictures: at two frames, each from its files, as the inspection does."""
     from cosfly.inspection.pixels import NUM_IDS, unpack
@@ -114,7 +123,7 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     steps: dict[str, Callable[[], object]] = {
         "plan": lambda: compile_planner(planner),
-        "render": compile_encoders,
+        "render": compile_render,
         "inspect": compile_inspection,
     }
     for stage in STAGES:

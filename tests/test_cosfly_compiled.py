@@ -86,7 +86,7 @@ event.register("numba:compile", Compiled())
 import cosfly.planners.stage as s
 s.warm_up(s.PlanConfig(planner='muco'))
 from cosfly import ahead
-ahead.compile_encoders()
+ahead.compile_render()
 ahead.compile_inspection()
 print("done")
 """

@@ -46,6 +46,7 @@ from cosfly.render.contract import (
 from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
+from cosfly.render.gl.parts import Boxes, PartBuilder
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.view import View
 from cosfly.render.others import NOBODY, cast_of
@@ -71,6 +72,31 @@ def without_gl() -> str:
 
 NO_GL = without_gl()
 needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
+
+
+def test_what_is_drawn_is_what_the_slow_way_finds():
+    rng, count = np.random.default_rng(0), 20_000
+    centers = rng.uniform(-600, 600, (count, 3))
+    half, ids = rng.uniform(0.05, 20.0, (count, 3)), np.ones(count, np.uint16)
+    builder = PartBuilder()
+    for layer, (low_px, high_px) in enumerate([(0.0, 14.0), (14.0, 1e9)]):
+        boxes = Boxes(centers, half, np.broadcast_to(np.eye(3), (count, 3, 3)), ids, np.zeros(count), 1)
+        builder.add(boxes, 0, half, 0, (1.0, 1.0, 1.0), min_px=low_px, max_px=high_px, layer=layer)
+    parts = builder.finish()
+    pose = world_from_camera(np.array([10.0, -20.0, 40.0]), np.array([5.0, -25.0, 130.0]))
+    view = View(pose[:3, :3], pose[:3, 3], intrinsic_matrix(320, 180, 70.0), 320, 180)
+    in_camera = (parts.object_centers - view.eye) @ view.world_from_camera
+    size_px = view._size_px(in_camera, parts.object_radii)
+    inside = (
+        view._is_inside(in_camera, parts.object_radii)
+        & (size_px >= np.maximum(parts.min_px, 0.4))
+        & (size_px < parts.max_px)
+    )
+    expected = np.flatnonzero(inside)
+    away = (in_camera[:, 2] - parts.object_radii)[expected]
+    expected = expected[np.lexsort((away, -parts.records["bias"][expected]))]
+    assert 1000 < len(expected) < count
+    np.testing.assert_array_equal(view.rows(parts), expected)
 
 
 # --- scene ------------------------------------------------------------------------------------------------------------

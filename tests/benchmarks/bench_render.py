@@ -7,7 +7,7 @@
     python tests/benchmarks/bench_render.py memory --frames 5000
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one flight a process.
-On a machine with a GPU the same commands use it (the device is printed); `disk --workers 16` is then what a host of 16 cores gives.
+On a machine with a GPU the same commands use it (the device is printed); `bench_render_workers.py` is made for a host of many cores.
 """
 
 from __future__ import annotations

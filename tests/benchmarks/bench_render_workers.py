@@ -31,7 +31,7 @@ import cv2
 import scenes
 from bench_render import FILES, make_inputs
 
-from cosfly.ahead import compile_encoders
+from cosfly.ahead import compile_render
 from cosfly.products import frames
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import read_traces
@@ -243,7 +243,7 @@ def main() -> None:
         given.inputs.mkdir(parents=True)
         make_inputs(given.inputs, NUM_FLIGHTS)
         return
-    compile_encoders()  # or all workers would compile the same
+    compile_render()  # or all workers would compile the same
     for name in given.maps:
         run_map(name, given.inputs / name, given)
 

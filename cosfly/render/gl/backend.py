@@ -347,8 +347,9 @@ class GlRenderer:
             "sky_tag": KINDS["Sky"],
             **frame_values,
         }
+        packed = {name: _packed(value) for name, value in common.items()}
         for program in (*programs, self._sky_program):
-            for name, value in common.items():
+            for name, value in packed.items():
                 _set(program, name, value)
 
     def _bones(self, body: Body | None) -> np.ndarray:
@@ -376,8 +377,7 @@ class GlRenderer:
             padded = np.zeros((most, 2, 4), np.float32)
             padded[: len(capsules)] = capsules
             for program in self._near_movers:
-                if name in program:
-                    program[name].write(padded.tobytes())
+                _set(program, name, padded.tobytes())
                 _set(program, count, len(capsules))
         parts = self._parts
         away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
@@ -390,9 +390,15 @@ class GlRenderer:
         """Draw standing things before the ground, near before far: what is hidden costs nothing. moving: records and meshes."""
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
+        order = np.argsort(groups, kind="stable")
+        records, starts = (
+            records[order],
+            np.searchsorted(groups[order], np.arange(part_tables.NUM_MATERIALS * MESH_STRIDE + 1)),
+        )
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
-                self._draw(programs[material], mesh, records[groups == material * MESH_STRIDE + mesh])
+                group = material * MESH_STRIDE + mesh
+                self._draw(programs[material], mesh, records[starts[group] : starts[group + 1]])
             for loose in self._loose:
                 loose.draw(programs[material], material)
 
@@ -442,11 +448,18 @@ def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return centers.min(axis=0) + scene.origin_m, centers.max(axis=0) + scene.origin_m
 
 
+def _packed(value: Any) -> Any:
+    """The bytes of an array as a uniform has them: matrices are given row by row and stored column by column; other values as they are."""
+    return np.ascontiguousarray(value.T, dtype=np.float32).tobytes() if isinstance(value, np.ndarray) else value
+
+
 def _set(program: Any, name: str, value: Any) -> None:
-    """Set a uniform that the program uses; matrices are given row by row and stored column by column."""
-    if name not in program:
+    """Set a uniform that the program uses, to a number, an array or its bytes."""
+    uniform = program.get(name, None)  # `in` would look through all of them
+    if uniform is None:
         return  # the compiler leaves out what a material does not need
-    if isinstance(value, np.ndarray):
-        program[name].write(np.ascontiguousarray(value.T, dtype=np.float32).tobytes())
+    value = _packed(value)
+    if isinstance(value, bytes):
+        uniform.write(value)
     else:
-        program[name].value = value
+        uniform.value = value

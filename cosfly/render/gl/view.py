@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosfly.render.camera import spheres_in_view
 from cosfly.render.contract import FAR_M, NEAR_M
 from cosfly.render.gl.parts import Parts
 
@@ -24,13 +25,12 @@ class View:
 
     def rows(self, parts: Parts) -> np.ndarray:
         """Rows of the parts to draw, nearest objects first."""
-        in_camera = self._in_camera(parts.object_centers)
-        z, radius = in_camera[:, 2], parts.object_radii
-        size_px = self._size_px(in_camera, radius)
-        inside = self._is_inside(in_camera, radius)
-        inside &= (size_px >= np.maximum(parts.min_px, SMALLEST_PX)) & (size_px < parts.max_px)
-        rows = np.flatnonzero(inside)
-        return rows[np.lexsort(((z - radius)[rows], -parts.records["bias"][rows]))]
+        tangents, slants = self._cone()
+        rows, away = spheres_in_view(
+            parts.object_centers, parts.object_radii, np.maximum(parts.min_px, np.float32(SMALLEST_PX)), parts.max_px,
+            self.eye.astype(np.float32), np.ascontiguousarray(self.world_from_camera, np.float32), tangents, slants, float(self.intrinsic[0, 0]),
+        )  # fmt: skip
+        return rows[np.lexsort((away, -parts.records["bias"][rows]))]
 
     def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Which of some spheres may be seen, the nearest first; centers: (n, 3), radii (n,) float32, relative to the scene's origin."""
@@ -61,12 +61,17 @@ class View:
 
     def _is_inside(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
         x, y, z = in_camera.T
-        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
-        tan_x, tan_y = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]  # the largest in the image
+        tangents, slants = self._cone()
         inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
-        inside &= np.abs(x) - z * tan_x < radius * np.sqrt(1.0 + tan_x**2)
-        inside &= np.abs(y) - z * tan_y < radius * np.sqrt(1.0 + tan_y**2)
+        inside &= np.abs(x) - z * tangents[0] < radius * slants[0]
+        inside &= np.abs(y) - z * tangents[1] < radius * slants[1]
         return inside
+
+    def _cone(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the image's widest angle to each side, (2,): its tangent, and how much farther off than its radius a sphere's middle may be."""
+        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
+        return tangents, np.sqrt(1.0 + tangents**2)
 
     def _size_px(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """Radius on the image."""
