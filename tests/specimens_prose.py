@@ -127,6 +127,7 @@ THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand 
 # 40 in forty styles on flights of three maps, written before the rules were looked at: `q...` was read while rules were written, then `r...`.
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 FIFTH_SET = Path(__file__).with_name("prose_fifth.jsonl")
+SIXTH_SET = Path(__file__).with_name("prose_sixth.jsonl")  # hard styles, whose wordings are kept from the reader
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 

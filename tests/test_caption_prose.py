@@ -15,18 +15,21 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from retold import misread
-from specimens_prose import CASES, FIFTH_SET, FOLLOW, FOURTH_SET, HOLD, SECOND_SET, THIRD_SET, WINDOWS, Case
+from specimens_prose import CASES, FIFTH_SET, FOLLOW, FOURTH_SET, HOLD, SECOND_SET, SIXTH_SET, THIRD_SET, WINDOWS, Case
+from wordings import FOREIGN, OWN, SETS
 
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
 from caption.truth.gold import GOLD_PROSE, read_gold_prose
+from caption.truth.prose import judging
+from caption.truth.prose.clauses import parse
 from caption.truth.prose.judging import check_evidence, judge_sentences
+from caption.truth.prose.numerals import masked
+from caption.truth.prose.wording import groups_of, met, written
 from cosfly.products.captions import Coc, Language
 from cosfly.products.sentences import sentences_of
 
-FOREIGN = Path(__file__).resolve().parents[2] / "shared" / "data" / "free-prose" / "captions.jsonl"
-OWN = Path(__file__).with_name("prose_true.yaml")
 CFG = EvidenceConfig()
 
 
@@ -82,8 +85,9 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         (THIRD_SET, 0.68, 0.75, 0.7),
         (FOURTH_SET, 0.8, 0.795, 0.89),
         (FIFTH_SET, 0.66, 0.66, 0.79),
+        (SIXTH_SET, 0.3, 0.41, 0.17),  # styles that were not met: little is contradicted, and nothing true
     ],
-    ids=["gold", "second", "third", "fourth", "fifth"],
+    ids=["gold", "second", "third", "fourth", "fifth", "sixth"],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(path: Path, of_all: float, numbers: float, sides: float):
     """Bounds of what is reached on sets that are read by now; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
@@ -102,6 +106,35 @@ def test_true_captions_told_of_other_windows_stay_true():
     found = list(misread([*read_gold_prose(), *read_gold_prose(SECOND_SET)], draws=1))
     assert len(found) > 1_500
     assert len({name for name, _, _, is_wrong in found if is_wrong}) <= 4
+
+
+@pytest.mark.parametrize(
+    ("language", "known", "unmet"),
+    [
+        ("en", "The altitude is {} m.", "The matinee altitude is {} m."),
+        ("en", "The altitude is {} m.", "Section 7 of the manual says that the altitude is {} m."),
+        ("zh", "高度为 {} 米。", "戏台开锣之际高度为 {} 米。"),
+        ("zh", "高度为 {} 米。", "《规程》第 7 条：高度为 {} 米。"),
+    ],
+)
+@pytest.mark.parametrize("value", ["18.9", "35.0"], ids=["of another frame", "of nothing"])
+def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_nothing(language, known, unmet, value, monkeypatch):
+    def state_of(text: str) -> str:
+        coc = Coc(critical_components=text.format(value), reasoning_trace=FILLER[language], flight_decision="ascend")
+        return judge_sentences(coc, FOLLOW, CFG, language)[0].state
+
+    assert state_of(known) == "contradicted"
+    assert state_of(unmet) == "unread"
+    monkeypatch.setattr(judging, "is_met", lambda *_: True)
+    assert state_of(unmet) == "contradicted"  # it is for its wording alone that it is left unread
+
+
+def test_the_wordings_of_all_captions_that_were_read_have_been_met():
+    """Else a lexicon has changed since: run `python tests/wordings.py`."""
+    for path in SETS:
+        for line in read_gold_prose(path):
+            for _, text in sentences_of(line.coc):
+                assert groups_of(written(parse(masked(text, line.language)[0], line.language))) <= met(line.language)
 
 
 FILLER = {"en": "The scene is calm.", "zh": "场面平静。"}

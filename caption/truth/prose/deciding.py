@@ -53,7 +53,8 @@ def actions_of(sentence: Sentence, clause: Clause, *, is_plan: bool) -> list[Sai
     for token in clause.of("action"):
         if not _is_refused(sentence, clause, token) and not _IS_ATTRIBUTE.match(sentence.text, token.end):
             side = _side_of(sentence, clause, token) if token.value in _SIDED else 0
-            found.append(Said(token.value, side, _force(sentence, clause, token, is_plan=is_plan)))
+            force = _force(sentence, clause, token, is_plan=is_plan)
+            found.append(Said(token.value, side, force, (clause.start, clause.end)))
     return found
 
 
@@ -125,8 +126,8 @@ def _side_of(sentence: Sentence, clause: Clause, token: Token) -> int:
     return 1 if side.value in ("left", "ccw") else -1
 
 
-def argues_against(decision: str, said: list[Said], last: list[Said]) -> bool:
-    """Tell whether a text asks for the opposite of its decision and leaves no room for it.
+def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Said]:
+    """Give what a text asks for that is the opposite of its decision; nothing where it leaves room for the decision.
 
     Another action than the decision's is no contradiction: a text may ask for several, and may name the decision's own in words that
     are not known here. said: of the whole reasoning; last: of its last sentence, which is what it asks for where nothing is asked for
@@ -137,11 +138,12 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> bool:
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
     named = {one.action for one in asked if one.side}  # "turning the nose to the left": one turn, not two
     asked = [one for one in asked if one.side or one.action not in named]
-    if decision in _allowed(asked) or not any(_is_opposite(decision, one) for one in asked):
-        return False
+    opposites = [one for one in asked if _is_opposite(decision, one)]
+    if decision in _allowed(asked):
+        return []
     sided = {one.action for one in said if one.side}
     rest = [one for one in said if one.force in ("open", "option", "aim") and (one.side or one.action not in sided)]
-    return decision not in _allowed(rest)
+    return [] if decision in _allowed(rest) else opposites
 
 
 def _is_opposite(decision: str, said: Said) -> bool:
@@ -152,7 +154,7 @@ def _is_opposite(decision: str, said: Said) -> bool:
 
 def _allowed(said: list[Said]) -> set[str]:
     allowed: set[str] = set()
-    for action, side, _ in said:
+    for action, side, *_ in said:
         if action in _SIDED:
             words = {1: ("left",), -1: ("right",), 0: ("left", "right")}[side]
             allowed |= {_SIDED[action].format(word) for word in words}

@@ -16,6 +16,7 @@ from caption.truth.prose.numerals import masked
 from caption.truth.prose.pool import Pool
 from caption.truth.prose.reading import read_form
 from caption.truth.prose.statements import Form, Statement
+from caption.truth.prose.wording import PAIR, TRIPLE, is_met
 from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
@@ -65,8 +66,8 @@ def judge_sentences(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langu
         subject = form.subject
         forms.append(form)
         numbers = NumberJudge(measured, pool, cfg, form, runs)
-        judged.append(_judge(name, text, form, numbers, words))
-    return _against_decision(judged, forms, coc.flight_decision)
+        judged.append(_judge(name, text, language, form, numbers, words))
+    return _against_decision(judged, forms, coc.flight_decision, language)
 
 
 def _after_answer(statements: tuple[Statement, ...]) -> tuple[Statement, ...]:
@@ -75,7 +76,7 @@ def _after_answer(statements: tuple[Statement, ...]) -> tuple[Statement, ...]:
     return tuple([s for s in statements if s.clause != first])
 
 
-def _judge(name: str, text: str, form: Form, numbers: NumberJudge, words: WordJudge) -> Judged:
+def _judge(name: str, text: str, language: Language, form: Form, numbers: NumberJudge, words: WordJudge) -> Judged:
     problems: list[str] = []
     is_proved, is_open = False, form.left_out
     for statement in form.statements:
@@ -83,6 +84,8 @@ def _judge(name: str, text: str, form: Form, numbers: NumberJudge, words: WordJu
         if compares_wrongly(statement, form, numbers) or goes_wrongly(statement, form, numbers):
             holds = False
         elif holds is False and statement.kind not in _NUMBERS and not statement.is_sure:
+            holds = None
+        if holds is False and not _is_worded_as_met(statement, form, numbers, language):
             holds = None
         if holds is None:
             is_open = True
@@ -95,10 +98,22 @@ def _judge(name: str, text: str, form: Form, numbers: NumberJudge, words: WordJu
     return Judged(name, text, state, tuple(dict.fromkeys(problems)))
 
 
-def _against_decision(judged: list[Judged], forms: list[Form], decision: str) -> list[Judged]:
+def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: Language) -> bool:
+    """Tell whether a clause is worded so that what it says wrongly is a contradiction.
+
+    Of a number that the window does not give for anything pairs of words are enough: it is wrong in most readings.
+    """
+    is_nothing = s.kind in _NUMBERS and s.kind != "clock" and not numbers.is_of_the_window(s)
+    return is_met(form.text, language, s.clause, PAIR if is_nothing else TRIPLE)
+
+
+def _against_decision(judged: list[Judged], forms: list[Form], decision: str, language: Language) -> list[Judged]:
     """Compare the decision with what the texts argue for: their plans, or where they name none the last sentence."""
     said = [one for form in forms for one in form.actions]
-    if not argues_against(decision, said, list(forms[-1].actions) if forms else []):
+    opposites = argues_against(decision, said, list(forms[-1].actions) if forms else [])
+    if not any(
+        is_met(form.text, language, one.clause, TRIPLE) for form in forms for one in form.actions if one in opposites
+    ):
         return judged
     last = judged[-1]
     problems = (*last.problems, f"decision: {decision} against {last.text[:_SHOWN]}")

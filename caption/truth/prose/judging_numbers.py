@@ -33,7 +33,7 @@ class NumberJudge(NumberComparison):
             return False
         if s.kind == "course" and self._goes_otherwise(s):
             return False
-        if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self._is_of_the_window(s):
+        if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self.is_of_the_window(s):
             return None
         return found
 
@@ -97,7 +97,7 @@ class NumberJudge(NumberComparison):
                 return True
         return False
 
-    def _is_of_the_window(self, s: Statement) -> bool:
+    def is_of_the_window(self, s: Statement) -> bool:
         """Tell whether all numbers of a statement are values that the window gives for something."""
         if s.kind == "course":
             anything = replace(s, names=(), frames=None, span=None, trend=0)

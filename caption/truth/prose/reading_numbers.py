@@ -228,9 +228,8 @@ class NumberReader:
             s = replace(s, mode="change", frames=None)  # "has bent left by 45 degrees"
         if set(s.names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
             s = replace(s, names=("target_turn",), sure_names=("target_turn",))
-        is_total = (
-            (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not self.clause.has("who", "target")
-        )
+        is_theirs = self.clause.has("who", "target") or self.clause.has("quantity", "target_heading")
+        is_total = (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not is_theirs
         if not is_total or not _FROM_START.search(self.text, self.clause.start, self.clause.end):
             return s
         named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]

@@ -20,12 +20,13 @@ Force = Literal["directive", "aim", "open", "option", "told"]
 class Said(NamedTuple):
     """An action that a text names. side: +1 left, -1 right, 0 where none is named.
 
-    force: what is to be done, what is aimed at only, an option or a supposition, what is told as it happens, or open.
+    force: what is to be done, what is aimed at only, an option or a supposition, what is told as it happens, or open. clause: where.
     """
 
     action: str
     side: int
     force: Force
+    clause: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
