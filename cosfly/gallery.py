@@ -71,7 +71,9 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     Raises:
         InputError: no such frame, one without pictures, or neither `debug.png` nor a map.
     """
-    folder = _best_frame(tree) if frame is None else inside(tree, frame)
+    folder = (
+        best_frame(tree, "rgb.png", "depth.npy", "instance.png", "meta.json") if frame is None else inside(tree, frame)
+    )
     meta, rgb = read_meta(folder), read_rgb(folder)
     if (folder / DEBUG_FILE).exists():
         debug = cv2.cvtColor(read_picture(folder / DEBUG_FILE, tree=tree), cv2.COLOR_BGR2RGB)
@@ -94,10 +96,11 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     return folder.relative_to(tree).as_posix()
 
 
-def _best_frame(tree: Path) -> Path:
+def best_frame(tree: Path, *names: str) -> Path:
+    """Give the folder of a frame of a tree that shows the target whole, of its first clean flight; it has files of these names."""
     folders = find_flights(tree)
     flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
-    frames = _frames_with(flight, "rgb.png", "depth.npy", "instance.png", "meta.json")
+    frames = _frames_with(flight, *names)
     return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.visibility[i]), i)))
 
 

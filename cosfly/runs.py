@@ -12,7 +12,7 @@ from cosfly.config import load
 from cosfly.errors import CosflyError, InputError
 from cosfly.folder_lock import is_held
 from cosfly.settings import RunConfig
-from cosfly.settings_guide import Setting, explain
+from cosfly.settings_guide import Setting, changed
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
@@ -79,12 +79,8 @@ def look(run: Path) -> RunLook:
     cfg = load(RunConfig, run / "run.yaml")
     folders = [(f"{town}/{name}", run / town / name) for town in cfg.towns for name in STAGES[:-1]]
     folders = [*folders, ("release", run / "release")] if cfg.towns else [(name, run / name) for name in STAGES]
-    defaults = {setting.name: setting.value for setting in explain(RunConfig())}
-    differing = [
-        setting for setting in explain(cfg) if not setting.is_group and setting.value != defaults.get(setting.name)
-    ]
     found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
-    return RunLook(run, cfg, is_held(run), [_stage(name, folder) for name, folder in folders], differing, found)
+    return RunLook(run, cfg, is_held(run), [_stage(name, folder) for name, folder in folders], changed(cfg), found)
 
 
 def find(root: Path, *, depth: int = 2) -> Iterator[Path]:

@@ -15,7 +15,8 @@ from cosfly.store import dump_json
 PAGE_HEAD = """# Settings
 
 Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > docs/settings.md`.
-`--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them. `cosfly config schema`
+`--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them, and needs no more than
+`cosfly config show FILE --changed` does: what is not the default. `cosfly config schema`
 gives the JSON schema, with which an editor completes and checks such a file: `cosfly config schema > schema.json`, and in many
 editors `# yaml-language-server: $schema=schema.json` as the file's first line.
 """
@@ -60,6 +61,12 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
             expected="for instance plan or plan.muco; a file, or a configuration that ships, comes before it",
         )
     return found
+
+
+def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
+    """Explain those settings that are not the defaults; raises as `explain`."""
+    defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
+    return [one for one in explain(cfg, section) if not one.is_group and one.value != defaults.get(one.name)]
 
 
 def _explain(

@@ -162,6 +162,7 @@ def test_the_page_of_the_settings_is_up_to_date():
         (("plan.muco",), "track_distance_m: 28.0"),
         (("quickstart", "pedestrians"), "num_paths: "),
         (("--describe", "render.fovs_deg"), "one is drawn for each walk"),
+        (("delft", "--changed"), "name: delft maps: source: cityjson"),
     ],
 )
 def test_a_section_is_shown_alone(words, told):

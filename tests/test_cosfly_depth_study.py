@@ -61,6 +61,9 @@ def test_float32_against_float64(tmp_path):
 def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 3, with_augmented=False)
     frame = find_flights(tree)[0] / frame_name(1)
+    answer = CliRunner().invoke(app, ["depth-study", "--data", str(tree), "--out", str(tmp_path / "any")])
+    assert answer.exit_code == 0, answer.output
+    assert "32-bit float" in (tmp_path / "any/depth_study.md").read_text()
     answer = CliRunner().invoke(app, ["depth-study", "--frame", str(frame), "--out", str(tmp_path / "out")])
     assert answer.exit_code == 0, answer.output
     study = Study.model_validate(

@@ -151,3 +151,13 @@ def test_the_command_tells_what_it_wrote(run, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert f"{len(accepted(run))} written; left out: dropped_hard_conflict 4" in done.output
+
+
+def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):
+    (tmp_path / "c.csv").write_text("mine")
+    with pytest.raises(StorageError, match=r"c\.csv: there is a file already; --overwrite"):
+        export(run, tmp_path / "c.csv", "csv")
+    assert (tmp_path / "c.csv").read_text() == "mine"
+    words = ["export", "captions", str(run), "--format", "csv", "--out", str(tmp_path / "c.csv"), "--overwrite"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert (tmp_path / "c.csv").read_text(encoding="utf-8-sig").startswith("sample_id,")

@@ -451,6 +451,18 @@ def test_two_runs_of_one_name_are_refused(inputs, tmp_path):
         run(CFG, [source_of(inputs), source_of(other)], tmp_path / "r2")
 
 
+def test_two_trees_in_one_folder_go_by_their_own_names(inputs, tmp_path):
+    other = other_run(inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+    (other / "tree").rename(other / "second")
+    trees = [source_of(inputs), replace(source_of(other), data=other / "second")]
+    folder = run(CFG, trees, tmp_path / "r")
+    assert verify(folder).is_ok
+    assert {one.flight.partition("/")[0] for one in read_record(folder / "release.json").flights} == {
+        "one_tree",
+        "one_second",
+    }
+
+
 def test_one_run_keeps_the_ids_of_its_tree(inputs, built):
     flights = [read_flight(folder) for folder in find_flights(inputs / "tree")]
     assert set(ids_of(built)) < {sample_id(flight.flight_id, i) for flight in flights for i in range(NUM_POINTS)}

@@ -28,10 +28,12 @@ def export_captions(
         Literal["all", "last"],
         typer.Option(help="Pictures of a conversation: of all frames of the window, or of the last one alone."),
     ] = "all",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file where there is one.")] = False,
 ) -> None:
     """Write the accepted captions to one file; pictures are named relative to the playback tree."""
     from release.columns import LANGUAGES
     from release.export.captions import export
 
-    told = export(source, out, format, languages=LANGUAGES if language == "both" else [language], shown=frames)
+    languages = LANGUAGES if language == "both" else [language]
+    told = export(source, out, format, languages=languages, shown=frames, overwrite=overwrite)
     typer.echo(f"{out}: {told}")

@@ -234,6 +234,7 @@ def config_show(
     markdown: Annotated[
         bool, typer.Option("--markdown", help="With --describe: as the page docs/settings.md.")
     ] = False,
+    changed: Annotated[bool, typer.Option("--changed", help="Only what is not the default.")] = False,
 ) -> None:
     """Print the resolved configuration: every setting with its value, and with --describe what it means."""
     import yaml
@@ -244,7 +245,7 @@ def config_show(
     if section is None and config is not None and _is_section(config):
         config, section = None, config
     cfg = options.resolve(None if config is None else Path(config), overrides)
-    explained = settings_guide.explain(cfg, section)
+    explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
     if markdown:
         typer.echo(settings_guide.as_page(explained), nl=False)
     elif describe:
@@ -269,7 +270,8 @@ def config_schema() -> None:
     from cosfly.settings import RunConfig
     from cosfly.store import dump_json
 
-    typer.echo(dump_json(RunConfig.model_json_schema(), indent=1))
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "cosfly run"}
+    typer.echo(dump_json(RunConfig.model_json_schema() | dialect, indent=1))
 
 
 @app.command()

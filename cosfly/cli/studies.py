@@ -7,18 +7,25 @@ from typing import Annotated
 
 import typer
 
+from cosfly.cli import options
+
 app = typer.Typer()
 
 
 @app.command("depth-study")
 def depth_study(
-    frame: Annotated[
-        Path, typer.Option(help="Folder of a frame in a playback tree, or a .npy of depth, float32 or float64.")
-    ],
     out: Annotated[Path, typer.Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
+    data: options.Data = None,
+    frame: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of a frame, or a .npy of depth, float32 or float64. [default: a frame of the tree that shows the target whole]"
+        ),
+    ] = None,
 ) -> None:
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
     from cosfly.depth_study import study
+    from cosfly.gallery import best_frame
 
-    study.run(frame, out)
+    study.run(frame or best_frame(options.data_folder(data), "depth.npy"), out)
     typer.echo(out / "depth_study.md")

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from cosfly.errors import InputError, NothingKept
+from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.frame_views import Pictures, frame_label
 from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
@@ -189,15 +189,25 @@ class Told:
 
 
 def export(
-    source: Path, out: Path, format: FormatName, *, languages: Collection[Language] = LANGUAGES, shown: Shown = "all"
+    source: Path,
+    out: Path,
+    format: FormatName,
+    *,
+    languages: Collection[Language] = LANGUAGES,
+    shown: Shown = "all",
+    overwrite: bool = False,
 ) -> Told:
     """Write the accepted captions of a source to one file; a table or JSON lines have a row a window, the others a sample a window and language.
 
     Args:
         shown: pictures of a sample in ShareGPT and LLaVA: those of all frames, or of the last one alone.
+        overwrite: replace a file that stands at `out`.
     Raises:
-        InputError: there is nothing to read. NothingKept: no caption can go out.
+        StorageError: something stands at `out`. InputError: there is nothing to read. NothingKept: no caption can go out.
     """
+    if out.exists() and not (overwrite and out.is_file()):
+        fix = "--overwrite replaces it, or choose another --out" if out.is_file() else "name a file in it"
+        raise StorageError("there is a file already" if out.is_file() else "this is a folder", where=out, fix=fix)
     told = Told()
     lines = read_lines(source, told.left_out)
     wanted = [language for language in LANGUAGES if language in languages]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.errors import ConfigError, InputError
@@ -75,6 +75,17 @@ class Source:
         return cls(folder_name(data.absolute().parent.name), data, captions, inspect)
 
 
+def told_apart(sources: list[Source]) -> list[Source]:
+    """Give runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run by its name alone."""
+    counts = Counter(source.run for source in sources)
+    return [
+        replace(source, run=folder_name(f"{source.run}_{source.data.absolute().name}"))
+        if counts[source.run] > 1
+        else source
+        for source in sources
+    ]
+
+
 def input_names(sources: list[Source]) -> list[dict[str, str]]:
     """Give of each source role -> name among the stage's inputs: of several with a number in front."""
     return [
@@ -135,8 +146,8 @@ def gather(
     name, count = Counter(source.run for source in sources).most_common(1)[0]
     if count > 1:  # rows and records know a run by its name alone
         raise InputError(
-            "two runs have one name", got=f"{count} of {name}", expected="trees in folders of different names",
-            fix="rename the folder that one of the trees stands in",
+            "two runs have one name", got=f"{count} of {name}", expected="trees of different names, or in folders of different names",
+            fix="rename one of the trees, or the folder that it stands in",
         )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
     found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []

@@ -24,7 +24,7 @@ from release.package.origin import provenance_of
 from release.package.plan import Plan, make_plan
 from release.package.rows import ShardPlan
 from release.package.shards import Written, write_shard
-from release.package.sources import Source, input_names
+from release.package.sources import Source, input_names, told_apart
 from release.package.wrong import Findings
 from release.verify.verify import verify
 
@@ -56,6 +56,7 @@ def run(
     Raises:
         InputError, VerifyError: something is wrong with the material; nothing is published, and what was finished stays for the next run.
     """
+    sources = told_apart(sources)
     names = input_names(sources)
     inputs = {
         name: source.files[role] for source, roles in zip(sources, names, strict=True) for role, name in roles.items()
