@@ -31,11 +31,13 @@ _ALIKE = {
     "of": "of in on at by with for over across along during within", "it": "it they we i he she you one",
 }  # fmt: skip
 _SMALL = {word: written for written, words in _ALIKE.items() for word in words.split()}
-# What says nothing of how a clause is built.
-_SILENT: dict[Language, frozenset[str]] = {
-    "en": frozenset(["s", "the", "a", "an", "this", "that", "these", "those", "only", "just", "merely", "even", "still", "now", "already"]),
-    "zh": frozenset("仅只才就还已仍都也的了"),
-}  # fmt: skip
+# What says nothing of how a clause is built, as most adverbs do not.
+_SILENT: dict[Language, re.Pattern[str]] = {
+    "en": re.compile(
+        r"s|an?|the|this|that|these|those|its|itself|own|only|just|mere|merely|even|still|now|already|also|yet|(?!hardly|barely|scarcely)[a-z]+ly"
+    ),
+    "zh": re.compile(r"[仅只才就还已仍都也的了却着地很]"),
+}
 _WORD: dict[Language, re.Pattern[str]] = {
     "en": re.compile(r"[a-z]+"),
     "zh": re.compile(r"[\u4e00-\u9fff]|[a-z]+"),
@@ -68,7 +70,7 @@ def is_met(text: str, language: Language, span: tuple[int, int], size: int) -> b
 
 def words_of(sentence: Sentence, clause: Clause) -> list[str]:
     """Give a clause as words: kinds of the lexicon in angle brackets, numbers by their unit, others as they are written."""
-    text, written = sentence.text, _WORD[sentence.language]
+    text, written, silent = sentence.text, _WORD[sentence.language], _SILENT[sentence.language].fullmatch
     kinds: dict[tuple[int, int], str] = {}
     for token in sorted(clause.tokens, key=_rank):
         kinds.setdefault((token.start, token.end), "" if token.kind == "hedge" else f"<{token.kind}>")
@@ -82,7 +84,7 @@ def words_of(sentence: Sentence, clause: Clause) -> list[str]:
         words += [kind] if kind and end > at else []
         at = max(at, end)
     words += written.findall(text, at, max(at, clause.end))
-    return [_SMALL.get(word, word) for word in words if word not in _SILENT[sentence.language]]
+    return [_SMALL.get(word, word) for word in words if not silent(word)]
 
 
 def _rank(token: Token) -> int:
