@@ -26,7 +26,7 @@ import cosfly.simplify.stage
 import release.package.stage
 from cosfly import estimate
 from cosfly.ahead import compiled_ahead
-from cosfly.errors import CosflyError, InputError
+from cosfly.errors import ConfigError, CosflyError, InputError
 from cosfly.folder_lock import give_up, hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
@@ -139,11 +139,17 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     """Check what the last stage would ask for, before the first; gives the settings of each town, none of a run without towns.
 
     Raises:
-        ConfigError: nobody says under which licence the release goes out.
+        ConfigError: nobody says under which licence the release goes out, or it asks for pictures that are not drawn.
     """
     towns = {name: cfg.of_town(name) for name in cfg.towns}
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
+    for one in towns.values() or [cfg]:
+        if missing := sorted(set(cfg.release.modalities) - set(one.render.modalities)):
+            raise ConfigError(
+                "the release asks for pictures that nobody draws", where="render.modalities", got=f"no {', no '.join(missing)}",
+                fix=f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'",
+            )  # fmt: skip
     return towns
 
 

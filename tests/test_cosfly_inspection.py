@@ -35,7 +35,7 @@ from cosfly.products.playback import find_flights, read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.store import write_checksums, write_json
+from cosfly.store import CHECKSUMS, write_checksums, write_json
 from specimens import make_playback_tree
 
 NUM_POINTS = 10
@@ -112,6 +112,19 @@ def test_clean_flights_are_accepted(workplace):
     assert metrics["rendered_visibility_mean"] == pytest.approx(flight.visibility.mean(), abs=1e-4)
     assert metrics["num_frames_checked"] == NUM_POINTS
     assert 0.5 < metrics["track_quality"] <= 1.0  # the specimen's person fills its box
+
+
+def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
+    """Colours alone were drawn (`render.modalities`): the checksums list nothing else. Files that they list were lost."""
+    lost, never = find_flights(workplace / "tree")[:2]
+    for folder in (lost, never):
+        for path in [*folder.rglob("depth.npy"), *folder.rglob("instance.png")]:
+            path.unlink()
+    names = [p.relative_to(never).as_posix() for p in never.rglob("*") if p.is_file() and p.name != CHECKSUMS]
+    write_checksums(never, {name: sha256_file(never / name) for name in names})
+    found = inspect(workplace)
+    assert codes_of(found, lost)["missing_file"] == "error"
+    assert codes_of(found, never) == {"not_in_this_tree": "note"}
 
 
 def test_smoothness_numbers_are_those_of_a_circle():

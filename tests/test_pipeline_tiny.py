@@ -93,6 +93,12 @@ def test_a_run_that_may_not_be_released_is_refused_before_it_begins(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_release_of_pictures_that_are_not_drawn_is_refused_before_it_begins(tmp_path):
+    with pytest.raises(ConfigError, match=r"render\.modalities.*no depth, no instance.*release\.modalities=\[rgb\]"):
+        pipeline.run(tiny(**{"render.modalities": "[rgb]"}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_every_stage_is_complete_and_adds_up(base):
     for stage in STAGES:
         manifest = read_json(base / stage / "manifest.json")

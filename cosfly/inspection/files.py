@@ -5,7 +5,7 @@ They judge nothing: findings go into a Report; the thresholds that make a flight
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from cosfly.errors import InputError
@@ -21,7 +21,8 @@ from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
 def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
 
-    A tree of somebody else may lack a kind of file altogether: `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone.
+    A tree of somebody else may lack a kind of file altogether: `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone. One of cosfly's
+    lacks what was not drawn (`render.modalities`): its checksums list no such file.
 
     Returns:
         of each frame that is complete so far its annotation, None in a tree without.
@@ -29,7 +30,8 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     assert flight.folder is not None
     size = (flight.camera.width_px, flight.camera.height_px)
     complete: dict[int, FrameMeta | None] = {}
-    absent = [] if flight.is_ours else [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
+    absent = [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
+    absent = [] if absent and flight.is_ours and _lists(flight, absent) else absent
     names = [name for name in FRAME_FILES if name not in absent]
     for name in absent:
         report.add(
@@ -52,6 +54,15 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
         report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
     return complete
+
+
+def _lists(flight: Flight, names: Collection[str]) -> bool:
+    """Tell whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
+    assert flight.folder is not None
+    try:
+        return any(listed.rpartition("/")[2] in names for listed in read_checksums(flight.folder))
+    except InputError:
+        return True
 
 
 def _has_any(flight: Flight, name: str) -> bool:
