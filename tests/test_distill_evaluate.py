@@ -466,8 +466,7 @@ def test_students_of_other_references_are_not_compared(place):
 # --- BERTScore --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory) -> Path:
+def make_encoder(folder: Path) -> Path:
     """A tiny random RoBERTa with a byte-level tokenizer; its files hold no model_max_length, as some do."""
     torch = pytest.importorskip("torch", reason="needs the extra distill")
     pytest.importorskip("bert_score", reason="needs the extra distill")
@@ -486,7 +485,6 @@ def encoder(tmp_path_factory) -> Path:
     )
     tokenizer.train_from_iterator([sample_of(frame).answer for frame in FRAMES], trainer)
     tokenizer.post_processor = processors.RobertaProcessing(("</s>", 2), ("<s>", 0))
-    folder = tmp_path_factory.mktemp("bert") / "encoder"
     PreTrainedTokenizerFast(
         tokenizer_object=tokenizer,
         bos_token="<s>",
@@ -511,6 +509,11 @@ def encoder(tmp_path_factory) -> Path:
         torch.manual_seed(0)
         RobertaModel(config).save_pretrained(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory) -> Path:
+    return make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
 
 
 def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Report:

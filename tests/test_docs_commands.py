@@ -13,8 +13,14 @@ from cosfly.cli import app, options_first
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-VARIABLES = {"trees": "--data work/render", "name": "both", "size": "2B", "DATA": "data"}  # of loops in a page
-COMMAND = re.compile(r"^(?:\$ )?(?:[A-Z_]+=\S+ )*(?:.* -m )?cosfly (.*)$")
+VARIABLES = {
+    "trees": "--data runs/learning/grid/render",
+    "towns": "runs/learning/grid",
+    "name": "both",
+    "size": "2B",
+    "DATA": "data",
+}  # of loops in a page
+COMMAND = re.compile(r"^(?:\$ )?(?:.*; )?(?:[A-Z_]+=\S+ )*(?:.* -m )?cosfly (.*)$")
 
 
 def blocks(text: str) -> Iterator[str]:
@@ -40,7 +46,7 @@ def commands(page: Path) -> list[str]:
     for block in blocks(page.read_text(encoding="utf-8")):
         for line in block.replace("\\\n", " ").splitlines():
             if match := COMMAND.match(line.strip()):
-                text = re.sub(r"\$(\w+)", lambda name: VARIABLES[name[1]], match[1])
+                text = re.sub(r"\$(\w+)", lambda name: VARIABLES[name[1]], match[1].replace('"$@" ', ""))
                 found.append(re.sub(r";? *(?:}|done)$", "", text.partition("  #")[0].strip()))
     return found
 
