@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -85,6 +86,18 @@ def counts_of(out: Path) -> dict:
 
 def told(predictions: list[Prediction]) -> dict[str, str]:
     return {prediction.key: prediction.raw for prediction in predictions}
+
+
+def test_progress_comes_by_batches_not_by_shelves(place, tmp_path, monkeypatch):
+    counts: list[int] = []
+
+    @contextlib.contextmanager
+    def counted(label: str, total: int) -> Iterator[Any]:
+        yield lambda count: counts.append(count)
+
+    monkeypatch.setattr(infer, "progress_bar", counted)
+    answer(place, tmp_path, batch_size=2, max_samples=5)
+    assert [count for count in counts if count] == [2, 2, 1], "five samples are of one shelf"
 
 
 def test_each_sample_has_the_answer_that_it_has_alone(place, clean):

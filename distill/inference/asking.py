@@ -10,6 +10,7 @@ from pathlib import Path
 from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers
 from cosfly.chat.contract import Engine, NoAnswer, Request
 from cosfly.chat.protocol import answer_key
+from cosfly.console import Advance
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import answer_schema
 from cosfly.stage_folder import Failed
@@ -59,8 +60,8 @@ class Asking:
         self._flights = OpenFlights(book)
         self._failed_in_row = 0
 
-    async def answers(self, samples: Iterable[Sample]) -> AsyncGenerator[Answered, None]:
-        """Yield what becomes of each sample, in their order.
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Answered, None]:
+        """Yield what becomes of each sample, in their order; `advance` is told of them as they come.
 
         Raises:
             TeacherError: the engine cannot be used, or too many samples in a row got no answer.
@@ -68,7 +69,7 @@ class Asking:
         waiting: deque[asyncio.Task[Answered]] = deque()
         try:
             for sample in samples:
-                waiting.append(asyncio.create_task(self._answer(sample)))
+                waiting.append(asyncio.create_task(self._answer(sample, advance)))
                 if len(waiting) >= WAITING * self._most:
                     yield await self._next(waiting)
             while waiting:
@@ -84,7 +85,12 @@ class Asking:
         self._flights.done(answered.sample)
         return answered
 
-    async def _answer(self, sample: Sample) -> Answered:
+    async def _answer(self, sample: Sample, advance: Advance) -> Answered:
+        answered = await self._asked(sample)
+        advance(1)
+        return answered
+
+    async def _asked(self, sample: Sample) -> Answered:
         flight = self._flights.begun(sample)
         async with self._slots:
             try:

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from cosfly.chat.answers import Answer, AnswerBook
+from cosfly.console import Advance
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
 from cosfly.products.playback import flight_of
@@ -44,6 +45,12 @@ class _Shelf:
         self.rows: dict[str, Encoded] = {}
         self.damaged: dict[Picture, InputError] = {}
         self.plan = features.plan()
+        self._num_told = 0
+
+    def tell(self, advance: Advance) -> None:
+        """Tell of the samples that something became of since the last time."""
+        advance(len(self.found) - self._num_told)
+        self._num_told = len(self.found)
 
 
 class LocalAnswers:
@@ -82,8 +89,8 @@ class LocalAnswers:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    async def answers(self, samples: Iterable[Sample]) -> AsyncGenerator[Answered, None]:
-        """Yield what becomes of each sample, in their order.
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Answered, None]:
+        """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time.
 
         Raises:
             ConfigError: the memory does not hold even one.
@@ -92,8 +99,9 @@ class LocalAnswers:
         while chosen := list(islice(rest, SHELF_BATCHES * self.batch_size)):
             shelf = _Shelf(chosen, VisionFeatures(self.student, memory_bytes=self._feature_bytes))
             self._take_kept(shelf)
+            shelf.tell(advance)
             if len(shelf.found) < len(shelf.samples):
-                await self._answer(shelf)
+                await self._answer(shelf, advance)
             for sample in shelf.samples:
                 yield shelf.found[sample.key]
                 self._flights.done(sample)
@@ -111,7 +119,7 @@ class LocalAnswers:
             dump_json([self.model, sample.sample_id, asked, self.max_tokens, self.constrain is not None]).encode()
         )
 
-    async def _answer(self, shelf: _Shelf) -> None:
+    async def _answer(self, shelf: _Shelf, advance: Advance) -> None:
         """Answer what is not answered. Pictures of the others are looked at all the same: which are looked at together may tell in the
         last bit."""
         batches = self._batches(shelf)
@@ -124,6 +132,7 @@ class LocalAnswers:
             if any(sample.key not in shelf.found for sample in whole):
                 await self._keep(shelf, whole, self._decode(shelf, whole), begun_s)
             shelf.features.end_step()
+            shelf.tell(advance)
 
     def _batches(self, shelf: _Shelf) -> list[list[Sample]]:
         """Cut a shelf into batches of like length; a sample whose prompt cannot be written has failed."""

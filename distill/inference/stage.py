@@ -18,7 +18,7 @@ from cosfly.chat.contract import Engine, started
 from cosfly.chat.protocol import base_url
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.config import Config, MayDiffer
-from cosfly.console import progress_bar
+from cosfly.console import Advance, progress_bar
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.predictions import PREDICTIONS, Split
 from cosfly.stage_folder import Resume, StageFolder, read_manifest
@@ -111,19 +111,19 @@ class Inputs:
 
 @contextlib.asynccontextmanager
 async def _answering(
-    cfg: InferConfig, inputs: Inputs, book: AnswerBook
+    cfg: InferConfig, inputs: Inputs, book: AnswerBook, advance: Advance
 ) -> AsyncIterator[AsyncGenerator[Answered, None]]:
     """Start who answers; gives what becomes of the samples, in their order."""
     if cfg.engine == "transformers":
         with _local(cfg, inputs, book) as local:
-            yield local.answers(inputs.samples)
+            yield local.answers(inputs.samples, advance)
         return
     engine = _make_engine(cfg, inputs)
     in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
         asking = Asking(engine, book, inputs.trees, cfg.sampling, max_pixels=max_pixels, in_flight=in_flight)
-        yield asking.answers(inputs.samples)
+        yield asking.answers(inputs.samples, advance)
 
 
 def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
@@ -258,17 +258,13 @@ def _is_memory_full(error: Exception) -> bool:
 async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
     begun_s = time.monotonic()
     name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else inputs.name
-    with AnswerBook(out / ANSWERS) as book:
-        async with _answering(cfg, inputs, book) as answers:
+    with AnswerBook(out / ANSWERS) as book, progress_bar(STAGE, total=len(inputs.samples)) as advance:
+        async with _answering(cfg, inputs, book, advance) as answers:
             started_s = time.monotonic()
-            with (
-                writing_results(out, cfg.split, name) as results,
-                progress_bar(STAGE, total=len(inputs.samples)) as advance,
-            ):
+            with writing_results(out, cfg.split, name) as results:
                 async with contextlib.aclosing(answers) as each:
                     async for answered in each:
                         results.add(answered)
-                        advance(1)
             results.speed = {
                 "loading_s": round(started_s - begun_s, 3),
                 "seconds": round(time.monotonic() - started_s, 3),
