@@ -13,9 +13,10 @@ from cosfly.cli import app, options_first
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "city_a", "city_b")]
 VARIABLES = {
-    "trees": "--data runs/learning/grid/render",
-    "towns": "runs/learning/grid",
+    "trees": " ".join(f"--data {town}/render" for town in TOWNS),
+    "towns": " ".join(TOWNS),
     "name": "both",
     "size": "2B",
     "DATA": "data",

@@ -1,0 +1,270 @@
+"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along. Small settings stand in the place of
+large ones, servers of the tests in that of a teacher's and a release's, and what a reader brings (a map, a public tree, a student) is made beforehand.
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import gzip
+import json
+import shlex
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from specimens_foreign import write_foreign_tree
+from specimens_slopes import sloped_city
+from teacher_server import TeacherServer
+from test_caption_doctor import patient
+from test_cosfly_maps import node, write_world
+from test_cosfly_trees import make_older
+from test_distill_evaluate import make_encoder
+from test_docs_commands import ALL, PAGES, blocks
+from test_release_get import served
+from typer.testing import CliRunner
+
+from cosfly import runner
+from cosfly.cli import app, options_first
+from cosfly.config import shipped
+from cosfly.maps.synthetic import SyntheticConfig
+from cosfly.maps.synthetic import load as invent
+from cosfly.products.captions import read_captions
+from cosfly.products.kinds import KIND_NAMES
+from cosfly.runner import Item, Watch
+from cosfly.stage_folder import StageFolder
+from specimens import make_playback_tree
+
+# Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
+FIRST, LAST = ("first-runs.md", "README.md"), ("rendering.md",)
+QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
+# What no machine of the tests can do, or another test does: words of the command, and why.
+NOT_HERE = {
+    "vllm serve ": "a server of real weights, on an accelerator; the teacher's server of the tests stands in for it",
+    "torchrun --nproc-per-node 8": "eight accelerators; the command behind it runs here in one process, tests/test_distill_train_ranks.py starts two",
+    "make quickstart": "it installs first; what it runs then is QUICKSTART",
+    "make test": "that is this",
+    "make fuzz": "an hour; tests/test_fuzz.py begins it",
+    "pip install -e": "the tests stand in that environment",
+    "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
+    "python docs/window_card.py": "a page for the browser of the next line",
+    "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
+    "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
+    "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
+    "--teacher vllm:": "vLLM needs an accelerator; tests/test_caption_vllm.py holds its engine to its documented interface",
+    "--engine vllm": "the same",
+    "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has the same with a student that answers",
+}
+
+
+def _set(*settings: str) -> list[str]:
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+# Command -> options that make it small; the longer one counts.
+SMALL = {
+    "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
+    "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
+    "render": _set("render.width_px=160", "render.height_px=90"),
+    "bench": ["--kills", "1", "--stalls", "0"],
+    "distill train": _set(
+        "distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2", "distill.train.batch_size=1",
+        "distill.train.validation_samples=2", "distill.train.validation_answers=false", "distill.train.data_workers=0",
+    ),
+    "distill infer": _set("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096"),
+    "distill evaluate": _set("distill.evaluate.resamples=100", "distill.evaluate.bertscore.en.layer=2", "distill.evaluate.bertscore.zh.layer=2"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Place:
+    """The folder in which everything runs, and the servers that stand in for a reader's."""
+
+    root: Path
+    teacher: str
+    release: str
+
+    def make(self, text: str) -> None:
+        """Make what a command takes for given and nobody has made yet."""
+        for name, maker in BROUGHT.items():
+            path = self.root / name.removeprefix("file:")
+            if name in text and not path.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                maker(self.root, path)
+
+    def words(self, text: str) -> list[str]:
+        """The words of a command as a shell gives them on, with what is small in place of what is large."""
+        text = text.replace("http://localhost:8000", self.teacher).replace("https://host/release", self.release)
+        words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
+        small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)
+        return options_first([*words, *SMALL.get(small or "", [])])
+
+    def clear(self, text: str) -> None:
+        """Take away what another command of the documents left where this one will write."""
+        words = shlex.split(text, comments=True)
+        if "--out" not in words:
+            return
+        out = self.root / words[words.index("--out") + 1]
+        if out.is_file():
+            out.unlink()
+        elif any((out / name).exists() for name in MADE):
+            shutil.rmtree(out)
+
+
+# What tells that a folder is one command's, so that it may go before the next command makes it.
+MADE = ("stage.json", "export.json", "release.json", "report.json", "system_en.txt", "cosfly_student.json", "config.json")  # fmt: skip
+
+
+def copy_of(path: str) -> Callable[[Path, Path], object]:
+    return lambda root, target: (shutil.copytree if (root / path).is_dir() else shutil.copy)(root / path, target)
+
+
+def _table(root: Path, target: Path) -> None:
+    """A small town as a table of boxes."""
+    town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
+    with target.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["type", "x", "y", "z", "length", "width", "height", "yaw_deg"])
+        for kind, center, half, rotation in zip(
+            town.kinds, town.centers, town.half_extents, town.rotations_deg, strict=True
+        ):
+            writer.writerow([KIND_NAMES[kind], *center, *(2 * half), rotation[1]])
+
+
+def _geojson(root: Path, target: Path) -> None:
+    ring = [[0, 0], [40, 0], [40, 30], [0, 30], [0, 0]]
+    house = {"type": "Feature", "properties": {"type": "Buildings", "height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+
+
+def _world(root: Path, target: Path) -> None:
+    roads = [node("BP_Road1_C", x, y) for x in range(-6000, 6001, 2000) for y in (-3000, 3000)]
+    houses = [node("BP_Building_01_C", x, 0) for x in range(-5000, 5001, 2500)]
+    sizes = {"BP_Building_01_C": (1500, 1000, 3000), "BP_Road1_C": (2000, 1500, 20)}
+    write_world(target.parent, *roads, *houses, sizes=sizes)
+    (target.parent / "world.json").rename(target)
+
+
+def _delft(root: Path, target: Path) -> None:
+    target.write_bytes(gzip.compress(json.dumps(sloped_city()).encode()))
+
+
+def _others_captions(root: Path, target: Path) -> None:
+    lines = [
+        {"sample_id": c.sample_id, "en": c.en.model_dump(), "zh": c.zh.model_dump()}
+        for c in read_captions(root / "work/caption/captions.jsonl")
+        if c.en and c.zh
+    ]
+    target.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def _older(root: Path, target: Path) -> None:
+    make_older(make_playback_tree(root / "old/newer", 1, 6, width_px=96, height_px=54), target)
+
+
+# What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
+BROUGHT: dict[str, Callable[[Path, Path], object]] = {
+    "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
+    "town.csv": _table,
+    "town.geojson": _geojson,
+    "old/render": _older,
+    "file:captions.jsonl": _others_captions,
+    "../shared/data/simworld-progen/progen_world.json": _world,
+    "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
+    "data/a/progen_world.json": _world,
+    "data/b/progen_world.json": _world,
+    "data/a/Bbox.json": _world,
+    "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"),
+    "runs/town1": copy_of("runs/diverse/grid"),
+    "runs/town2": copy_of("runs/diverse/old_town"),
+    "work/unlabelled/render": copy_of("work/render"),
+    "Qwen/Qwen3.5-2B": copy_of("work/student"),
+    "models/Qwen3.5-2B": copy_of("work/student"),
+    "models/roberta-large": lambda root, target: make_encoder(target),
+    "models/bert-base-chinese": lambda root, target: make_encoder(target),
+    "work/evaluation-4B": copy_of("work/evaluation-2B"),
+    "work/text": copy_of("work/both"),
+    "work/pictures": copy_of("work/both"),
+    "work/middle": copy_of("work/both"),
+}
+
+
+def small_run(name: str) -> dict[str, Any]:
+    """A configuration that ships, with two towns, two short walks and pictures of a stamp."""
+    value = yaml.safe_load(shipped(f"{name}.yaml").read_text(encoding="utf-8"))
+    value.setdefault("pedestrians", {}).update(num_paths=2, min_distance_m=25, max_distance_m=40)
+    value.setdefault("render", {}).update(width_px=160, height_px=90)
+    value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)
+    value.get("distill", {}).get("train", {}).pop("random_student", None)  # the smallest there is
+    value["towns"] = dict(list(value.get("towns", {}).items())[:2])
+    return value
+
+
+def answer(body: dict) -> tuple[int, dict] | None:
+    """A judge's verdict, and what `doctor` asks; captions are the server's own."""
+    text = json.dumps(body)
+    if "REJECT_REGEN" in text:
+        verdict = json.dumps({"verdict": "FIX_LABEL", "reason": "the text argues for the label"})
+        return 200, {"choices": [{"message": {"role": "assistant", "content": verdict}, "finish_reason": "stop"}], "usage": {"prompt_tokens": 9, "completion_tokens": 9}}  # fmt: skip
+    return None if "flight_decision" in text else patient()(body)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    root = tmp_path / "project"
+    root.mkdir()
+    monkeypatch.chdir(root)
+    monkeypatch.setenv("COLUMNS", "200")
+    for name in ("quickstart", "simworld", "delft", "diverse", "learning"):  # a file here comes before one that ships
+        (root / name).write_text(yaml.safe_dump(small_run(name)))
+    (root / "configs").mkdir()
+    shutil.copy(root / "learning", root / "configs/learning.yaml")
+    with TeacherServer(respond=answer) as teacher, served(root / "work/theirs/release/dataset") as (_, release):
+        yield Place(root, teacher.url, release)
+
+
+def in_order() -> list[tuple[str, str]]:
+    pages = [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
+    return [("README.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
+
+
+def test_what_cannot_run_here_is_in_the_documents():
+    lines = [" ".join(block.split()) for page in PAGES for block in blocks(page.read_text(encoding="utf-8"))]
+    texts = [*lines, *(text for _, text in ALL)]
+    assert [word for word in (*NOT_HERE, *BROUGHT) if not any(word in text for text in texts)] == [], "in no document"
+    assert [word for word in SMALL if not any(text.startswith(word) for _, text in ALL)] == [], "in no document"
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and keeps them."""
+    in_processes = runner._in_processes
+
+    def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, on_steps: Any) -> Any:
+        if "bench" in stage.path.parts:
+            return in_processes(stage, items, start, workers, watch, on_steps)
+        return runner._in_this_process(items, start, on_steps)
+
+    monkeypatch.setattr(runner, "_in_processes", work)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)  # 5 minutes on a machine that has nothing else to do
+def test_every_command_runs(place, in_this_process):
+    failed = []
+    for page, text in in_order():
+        if any(word in text for word in NOT_HERE):
+            continue
+        place.make(text)
+        place.clear(text)
+        start = time.monotonic()
+        result = CliRunner().invoke(app, place.words(text))
+        print(f"{time.monotonic() - start:6.1f} s, {result.exit_code}: {page}: cosfly {text}", flush=True)
+        if result.exit_code:
+            failed.append(f"{page}: cosfly {text}\n{result.output[-1500:]}\n{result.exception!r}")
+    assert not failed, "\n\n".join(failed)
