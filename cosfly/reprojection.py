@@ -18,6 +18,8 @@ FAR_M = np.float32(1000.0)  # of the sky
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
 LEAST_CONTRAST = 4.0  # grey levels: less is a wall or a fog
 LEAST_PAIRS = 4  # of frames, for one to be unusual among them
+LEAST_SHIFTED = 12  # points of a thing
+SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
 # Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
@@ -43,6 +45,7 @@ class Agreement:
     it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance. error: median of those on
     planes, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
     the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
+    shifted: points of one thing that is farther or nearer there, as most of it is; 0 where there is none.
     """
 
     seen: int
@@ -54,6 +57,7 @@ class Agreement:
     correlation: float
     tint: float
     shade: float
+    shifted: int
 
 
 def grid_rows(height_px: int) -> np.ndarray:
@@ -84,7 +88,7 @@ def compare_views(
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
     turn = other.rotation.T @ one.rotation
     shift = other.rotation.T @ (one.position_m - other.position_m)
-    counts, errors, brightness = _carry(
+    counts, errors, brightness, firm, moved = _carry(
         one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING
     )
     pairs: np.ndarray = np.empty((0, 2))
@@ -101,7 +105,18 @@ def compare_views(
         correlation = float(np.corrcoef(pairs.T)[0, 1])
     error = float(np.median(errors)) if len(errors) >= 30 else np.nan
     seen, agree, hidden, through, same = (int(n) for n in counts)
-    return Agreement(seen, agree, hidden, through, same, error, correlation, tint, shade)
+    return Agreement(seen, agree, hidden, through, same, error, correlation, tint, shade, _num_shifted(firm, moved))
+
+
+def _num_shifted(firm: np.ndarray, moved: np.ndarray) -> int:
+    """Give the points of the thing that moved most. firm, moved: ids at points well inside one thing, with its depth and without."""
+    if len(moved) < LEAST_SHIFTED:
+        return 0
+    counts = np.bincount(moved, minlength=SHARED_ID + 1)
+    counts[counts <= np.bincount(firm, minlength=len(counts))[: len(counts)]] = 0
+    counts[[0, SHARED_ID]] = 0  # ids of nothing and of many things
+    most = int(counts.max())
+    return most if most >= LEAST_SHIFTED else 0
 
 
 def usual_correlations(
@@ -191,7 +206,8 @@ def _num_far(depth):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving):  # type: ignore[no-untyped-def]
-    """Counts (5,), errors (k,), matches (k, 4): column, row of the grid, column and row in the other picture."""
+    """Counts (5,), errors (k,), matches (k, 4): column, row of the grid, column and row in the other picture; of points among nothing but
+    their own thing its id, of those with its depth and of the others."""
     height, width = depth_a.shape
     fx, fy, cx, cy = intrinsics
     other_fx, other_fy, other_cx, other_cy = others
@@ -199,6 +215,8 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
     counts = np.zeros(5, np.int64)
     errors, num_errors = np.empty(COLUMNS * ROWS), 0
     matches, num_matches = np.empty((COLUMNS * ROWS, 4), np.int64), 0
+    firm, num_firm = np.empty(COLUMNS * ROWS, np.int64), 0
+    moved, num_moved = np.empty(COLUMNS * ROWS, np.int64), 0
     for j in range(ROWS):
         v = int((j + 0.5) * height / ROWS)
         for i in range(COLUMNS):
@@ -216,7 +234,7 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
             if not (s > 1.5 and t > 1.5 and s < width - 2.5 and t < height - 2.5):
                 continue
             column, row = int(s), int(t)
-            best, is_through, is_same, is_free = 1e9, True, not has_ids, True
+            best, is_through, is_same, is_free, is_whole = 1e9, True, not has_ids, True, has_ids
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
                     off = float(depth_b[row + dy, column + dx]) - z
@@ -226,15 +244,26 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
                     if has_ids:
                         y1, x1 = row + dy, column + dx
                         is_free &= not moving[inst_b[y1, x1, 0]]
-                        is_same |= (
+                        is_own = (
                             inst_b[y1, x1, 0] == inst_a[v, u, 0]
                             and inst_b[y1, x1, 1] == inst_a[v, u, 1]
                             and inst_b[y1, x1, 2] == inst_a[v, u, 2]
                         )
+                        is_same |= is_own
+                        is_whole &= is_own
             if not is_free:
                 continue
             counts[0] += 1
-            if best <= TOLERANCE_SHARE * z + TOLERANCE_M:
+            is_there = best <= TOLERANCE_SHARE * z + TOLERANCE_M
+            if is_whole:
+                own = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8
+                if is_there:
+                    firm[num_firm] = own
+                    num_firm += 1
+                else:
+                    moved[num_moved] = own
+                    num_moved += 1
+            if is_there:
                 counts[1] += 1
                 counts[4] += is_same
                 matches[num_matches] = (u, j, column, row)
@@ -256,4 +285,4 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
                 counts[3] += 1
             else:
                 counts[2] += 1
-    return counts, errors[:num_errors], matches[:num_matches]
+    return counts, errors[:num_errors], matches[:num_matches], firm[:num_firm], moved[:num_moved]

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from release_tampering import depth_of, pixels_of, png, set_depth
 
+from cosfly.products.kinds import KINDS
+
 Row = dict[str, Any]
 Lie = Callable[[list[Row]], None]
 
@@ -705,6 +707,66 @@ def ids_of_things_exchanged(rows):
     row["instance"]["bytes"] = png(pixels)
 
 
+# --- of an outsider's list ---------------------------------------------------------------------------------------------
+
+
+def names_of_pictures_exchanged(rows):
+    swap(clean(rows)[2]["image"], clean(rows)[3]["image"], "path")
+
+
+def question_that_looks_ahead(rows):
+    for row in captioned(rows):
+        row["system_en"] += " The frames that follow are shown too."
+
+
+def flight_through_a_lossy_coding(rows):
+    import cv2
+
+    for row in clean(rows):
+        packed = cv2.imencode(".jpg", pixels_of(row, "image")[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
+        set_colours(row, cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def depth_in_centimetres_called_lossless(rows):
+    for row in clean(rows):
+        depth = depth_of(row)
+        set_depth(row, np.round(depth, 2).astype(np.float32))
+
+
+def red_and_blue_of_a_flight_exchanged(rows):
+    for row in perturbed(rows):
+        set_colours(row, pixels_of(row, "image")[..., ::-1])
+
+
+def ids_in(row: Row) -> tuple[np.ndarray, np.ndarray]:
+    """The mask of a row, and of each pixel the id."""
+    pixels = pixels_of(row, "instance")
+    return pixels, pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
+
+
+def thing_farther_in_one_frame(rows):
+    row = middle(rows)
+    _, ids = ids_in(row)
+    depth = depth_of(row)
+    sizes = {
+        own: (ids == own).sum()
+        for own in np.unique(ids)
+        if own not in (0, 65534, 65535) and depth[ids == own].max() < 900
+    }
+    thing = ids == max(sizes, key=lambda own: sizes[own] if sizes[own] < ids.size / 4 else 0)
+    depth[thing] *= np.float32(1.08)
+    set_depth(row, depth)
+
+
+def things_of_another_kind_in_a_trajectory(rows):
+    """Everything that is a building elsewhere."""
+    own = clean(rows)[0]["trajectory"]
+    for row in (row for row in rows if row["trajectory"] == own):
+        pixels = pixels_of(row, "instance")
+        pixels[pixels[..., 0] == KINDS["Buildings"], 0] = KINDS["Walls"]
+        row["instance"]["bytes"] = png(pixels)
+
+
 LIES: dict[str, tuple[Lie, bool]] = {
     lie.__name__: (lie, is_of_pixels)
     for is_of_pixels, lies in (
@@ -720,6 +782,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
             all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
             walk_of_nobody, clock_that_starts_late, weather_that_nobody_drew, night_that_nobody_drew, headings_lost, window_with_a_frame_twice,
+            names_of_pictures_exchanged, question_that_looks_ahead,
             time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
         )),
         (True, (
@@ -731,7 +794,8 @@ LIES: dict[str, tuple[Lie, bool]] = {
             colours_swapped_red_and_blue, one_picture_in_two_rows, other_visibility, grey_picture, blurred_picture,
             picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
             frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
-            second_person_far_away, ids_of_things_exchanged,
+            second_person_far_away, ids_of_things_exchanged, flight_through_a_lossy_coding, depth_in_centimetres_called_lossless, red_and_blue_of_a_flight_exchanged,
+            thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
         )),
     )
     for lie in lies

@@ -27,11 +27,16 @@ from cosfly.products.frames import instance_bytes
 from cosfly.products.playback import find_flights
 from cosfly.reading.documents import read_json
 from cosfly.settings import RunConfig
+from release.columns import POSE
 from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
+from release.record import read_record
 from release.splits import split_groups
+from release.verify.by_rule import check_inspected
 from release.verify.findings import EXAMPLES, Findings
+from release.verify.rows import FlightRows
+from release.verify.shards import check_shards
 from release.verify.verify import verify
 
 TINY = [
@@ -106,6 +111,47 @@ def test_a_lie_is_found(honest, tmp_path, name):
     lie, is_of_pixels = LIES[name]
     forged = forge(honest, tmp_path / "forged", lie)
     assert errors_in(forged, "pixels" if is_of_pixels else "rows"), name
+
+
+def test_statistics_that_a_filter_goes_by_are_the_rows(honest, dataset):
+    """A footer is bytes of the same length with another word for a split in it."""
+    record = read_record(dataset / "release.json")
+    found = Findings()
+    check_shards(dataset, record, found)
+    assert not found.kinds
+    shard = next(shard for shard in record.shards if shard.split == "train")
+    data = (dataset / shard.path).read_bytes()
+    begin = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    (dataset / shard.path).write_bytes(data[:begin] + data[begin:].replace(b"train", b"trail"))
+    check_shards(dataset, record, found)
+    assert {code for _, code in found.kinds} == {"statistics"}
+
+
+def test_the_shards_tell_which_library_wrote_them(honest):
+    record = read_record(honest / "release.json")
+    record.provenance.versions["pyarrow"] = "1.0.0"
+    found = Findings()
+    check_shards(honest, record, found)
+    assert [kind.severity for kind in found.kinds.values()] == ["warning"]
+
+
+@pytest.mark.parametrize(("most", "num_frames", "is_found"), [(5.0, 20, False), (0.5, 20, True), (0.5, 30, False)])
+def test_a_whole_clean_flight_keeps_the_bounds_of_its_inspection(most, num_frames, is_found):
+    """One that goes to and fro by a metre every second; of a flight in part nobody knows."""
+    rows = [
+        {
+            "frame_index": k,
+            "time_s": 0.5 * k,
+            "track": "clean",
+            "pose": dict.fromkeys(POSE, 0.0) | {"x_m": float(k // 2 % 2)},
+        }
+        for k in range(20)
+    ]
+    found = Findings()
+    check_inspected(
+        FlightRows("run/Town/trajectory/ORI", rows, num_frames=num_frames), {"accel_rms_max_mps2": most}, found
+    )
+    assert [code for _, code in found.kinds] == ["settings"] * is_found
 
 
 RECORD_LIES = {

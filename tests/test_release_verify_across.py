@@ -18,7 +18,7 @@ def flight(number: int, num_rows: int, **told) -> Summary:
     values = {
         "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train", "walk": str(number), "pair": None,
         "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [], "frames_digest": "",
-        "way_digest": "",
+        "way_digest": "", "kinds": [], "hue": [], "sky": "[]",
     }  # fmt: skip
     return Summary(**(values | told))
 
@@ -89,3 +89,31 @@ def test_the_same_way_in_two_splits_is_a_leak(tmp_path):
     other.split = "test"
     check_across([one, other], rows, by_town=False, both=False, findings=findings)
     assert {code for _, code in findings.kinds} == {"leak"}
+
+
+def told_of(flights: list[Summary], tmp_path) -> list[str]:
+    findings = Findings()
+    rows = RowFiles(tmp_path)
+    for one in flights:
+        rows.write(one.rows_file, np.zeros(one.num_rows, COMPARED))
+    check_across(flights, rows, by_town=False, both=False, findings=findings)
+    return sorted(code for _, code in findings.kinds)
+
+
+def test_a_thing_is_of_one_kind_in_all_flights_of_a_runs_town(tmp_path):
+    building, wall = 7 << 8 | 3, 7 << 8 | 4
+    assert told_of([flight(1, 1, kinds=[building]), flight(2, 1, kinds=[building])], tmp_path) == []
+    assert told_of([flight(1, 1, kinds=[building]), flight(2, 1, kinds=[wall])], tmp_path) == ["instance_kind"]
+    elsewhere = flight(2, 1, kinds=[wall], town="Town02")
+    assert told_of([flight(1, 1, kinds=[building]), elsewhere], tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("told", "is_found"),
+    [({}, True), ({"hue": [1.5, -11.0]}, False), ({"sky": '["night"]'}, False), ({"frames_digest": "of others"}, False), ({"is_foreign": True}, False)],
+)  # fmt: skip
+def test_twins_have_the_same_colours_under_one_sky(tmp_path, told, is_found):
+    one, other = flight(1, 1, hue=[1.8, -12.3]), flight(1, 1, rows_file="2.rows", track="perturbed")
+    one.pair, other.name = "run/Town01/trajectory_1/aug_001", "run/Town01/trajectory_1/aug_001"
+    other = Summary(**(vars(other) | {"pair": one.name, "hue": [-12.3, 1.8]} | told))
+    assert told_of([one, other], tmp_path) == ["scene_colour"] * is_found

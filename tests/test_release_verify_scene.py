@@ -35,7 +35,16 @@ def test_colours_may_differ_more_from_frame_to_frame_where_it_rains(rain, worst,
         given_id="trajectory_ORI",
     )
     whole = Agreement(
-        seen=2000, agree=2000, hidden=0, through=0, same=2000, error=0.0, correlation=0.97, tint=0.0, shade=0.0
+        seen=2000,
+        agree=2000,
+        hidden=0,
+        through=0,
+        same=2000,
+        error=0.0,
+        correlation=0.97,
+        tint=0.0,
+        shade=0.0,
+        shifted=0,
     )
     found = [whole] * 20
     found[12] = replace(whole, correlation=worst)

@@ -14,7 +14,7 @@ import numpy as np
 
 from caption.label_motion import LabelMotion, label_motion
 from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
-from caption.teachers.prompts import mission_lines, user_prompts
+from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
 from caption.truth.actions import label_of, measure, verdict_of
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
@@ -84,6 +84,13 @@ def _prompt_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
             where = f"{caption.sample_id}: prompt_{language}"
             lies.append(
                 Lie("prompt", where, _difference(text, expected[language]), "the flight data of the window's rows")
+            )
+    for language, text in caption.systems.items():
+        wanted = system_prompt(language)
+        if text != wanted:
+            where = f"{caption.sample_id}: system_{language}"
+            lies.append(
+                Lie("prompt", where, _difference(text, wanted), "what stands before every question of these prompts")
             )
     return lies
 

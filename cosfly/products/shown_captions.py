@@ -19,8 +19,8 @@ from cosfly.products.playback import Flight
 class ShownCaption:
     """One caption of a flight. frame_index: its current frame; window: indices of what its prompt shows, as it says.
 
-    prompts: user prompts by language, empty where none is shown. picture_px: (width, height). contradicted: by language, how many of its
-    sentences its record says the flight contradicts; empty where it does not say.
+    prompts, systems: user prompts by language and what stood before each, empty where none is shown. picture_px: (width, height).
+    contradicted: by language, how many of its sentences its record says the flight contradicts; empty where it does not say.
     """
 
     sample_id: str
@@ -29,6 +29,7 @@ class ShownCaption:
     picture_px: tuple[int, int]
     answers: dict[Language, Coc]
     prompts: dict[Language, str]
+    systems: dict[Language, str]
     decision: str
     label: str | None
     label_from: str

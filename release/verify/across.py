@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from cosfly.store import write_bytes
 from release.verify.findings import Findings
 from release.verify.motion import clean_positions
 from release.verify.rows import FlightRows
+from release.verify.scene import Shown
 
 CELL_M = 0.35  # people in one cell are nearer than the 0.5 m within which flights are built into one walk
 LEAST_SECONDS, WALK_SHARE = (
@@ -31,6 +33,8 @@ LEAST_SECONDS, WALK_SHARE = (
     0.7,
 )  # of the seconds that two flights know, in one cell: they follow one walk; half is enough to build
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
+HUE_MOST = 6.0  # grey levels between twins; honest 0.2 at 1280x720
+SKY = ("weather", "time_of_day", "weather_params", "look")
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
 ROWS_AT_ONCE = 40_000
 NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
@@ -42,7 +46,8 @@ FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 @dataclass
 class Summary:
     """What is kept of a flight to compare it with others. rows_file: of its rows. frames_digest: of the indices of its frames, the first three
-    of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none."""
+    of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none. kinds, hue: as Shown has
+    them; sky: what its first row says of weather and light."""
 
     name: str
     rows_file: str
@@ -56,17 +61,16 @@ class Summary:
     first_frames: list[int]
     frames_digest: str
     way_digest: str
+    kinds: list[int]
+    hue: list[float]
+    sky: str
 
     def dumped(self) -> dict[str, Any]:
         return dict(vars(self))
 
 
-def summary_of(flight: FlightRows, keys: list[tuple[int, int]], rows: RowFiles, rows_file: str) -> Summary:
-    """Summarize a flight, and write what is compared of its rows.
-
-    Args:
-        keys: of each row a number that tells its colour picture from others, and one for its depth; none, or one pair a row.
-    """
+def summary_of(flight: FlightRows, shown: Shown, rows: RowFiles, rows_file: str) -> Summary:
+    """Summarize a flight, and write what is compared of its rows. shown: of its pictures, nothing where they were not read."""
     first = flight.rows[0]
     _, target, _ = clean_positions(flight)
     whole = np.abs(flight.time_s - np.round(flight.time_s)) < 1e-3
@@ -77,8 +81,8 @@ def summary_of(flight: FlightRows, keys: list[tuple[int, int]], rows: RowFiles, 
     found["cell"] = NO_SECOND
     found["cell"][known] = np.column_stack([np.round(flight.time_s[known]), np.floor(target[known, :2] / CELL_M)])
     found["pose"] = pose
-    if keys:
-        found["image"][: len(keys)], found["depth"][: len(keys)] = np.array(keys, np.uint64).T
+    if shown.keys:
+        found["image"][: len(shown.keys)], found["depth"][: len(shown.keys)] = np.array(shown.keys, np.uint64).T
     rows.write(rows_file, found)
     way = np.round(pose, 4) + 0.0
     return Summary(
@@ -86,6 +90,7 @@ def summary_of(flight: FlightRows, keys: list[tuple[int, int]], rows: RowFiles, 
         track=first.get("track"), town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight),
         first_frames=flight.index[:3].tolist(), frames_digest=frames_digest(flight.index),
         way_digest=hashlib.sha256(way.tobytes()).hexdigest() if (way != way[0]).any() else "",
+        kinds=shown.kinds, hue=shown.hue, sky=json.dumps([flight.rows[0].get(name) for name in SKY]),
     )  # fmt: skip
 
 
@@ -148,6 +153,8 @@ def check_across(flights: list[Summary], rows: RowFiles, *, by_town: bool, both:
     _check_splits(flights, rows, by_town, findings)
     _check_pairs({flight.name: flight for flight in flights}, both, findings)
     _check_copies(flights, findings)
+    _check_kinds(flights, findings)
+    _check_hues({flight.name: flight for flight in flights}, findings)
     for column in ("image", "depth"):
         _check_pictures(flights, rows, column, findings)
 
@@ -247,6 +254,29 @@ def _check_copies(flights: list[Summary], findings: Findings) -> None:
         is_of_run = other.name.split("/")[0] == flight.name.split("/")[0]
         got = f"the poses of {other.name}, all of them"
         findings.add("error" if is_of_run else "warning", "copy", flight.name, got, "a flight of its own")
+
+
+def _check_kinds(flights: list[Summary], findings: Findings) -> None:
+    """A thing of a run's town is of one kind in all flights."""
+    first: dict[tuple[str, str, int], tuple[int, str]] = {}
+    for flight in flights:
+        for code in flight.kinds:
+            own, kind = code >> 8, code & 255
+            known, other = first.setdefault((flight.name.split("/")[0], flight.town, own), (kind, flight.name))
+            if kind != known:
+                findings.error("instance_kind", flight.name, f"instance {own} of kind {kind}", f"kind {known}, as in {other}")  # fmt: skip
+
+
+def _check_hues(flights: Mapping[str, Summary], findings: Findings) -> None:
+    """Twins see one place under one sky, in about the same colours."""
+    for flight in flights.values():
+        twin = flights.get(flight.pair or "")
+        if twin is None or flight.track == "clean" or not (flight.hue and twin.hue) or (flight.sky, flight.frames_digest) != (twin.sky, twin.frames_digest):  # fmt: skip
+            continue
+        off = float(np.abs(np.subtract(flight.hue, twin.hue)).max())
+        if off > HUE_MOST and not flight.is_foreign:
+            got = f"red and blue {off:.1f} grey levels off, on the mean of all frames"
+            findings.error("scene_colour", f"{flight.name} and {twin.name}", got, f"at most {HUE_MOST:g} between twins")
 
 
 def _check_pictures(flights: list[Summary], rows: RowFiles, column: str, findings: Findings) -> None:

@@ -7,6 +7,9 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from cosfly.flight_metrics import accel_rms, jerk_rms
 from cosfly.products.places import folder_name, town_folder
 from cosfly.provenance import CONVERSION, CONVERTED
 from cosfly.reading.tables import row_groups
@@ -20,6 +23,9 @@ from release.verify.rows import FlightRows
 WITHOUT_TWIN = "its twin is not released"  # of flights that were left out after walks had their names
 TIME_S = 1e-3  # times are written with three digits at least
 FOV_DEG = 0.01
+LEAST_POINTS = 10
+# Files keep tenths of millimetres, which three differences over half a second make a hundredth of a m/s^3.
+RMS_SHARE, RMS_ROUNDING = 0.02, 0.01
 REVIEWED = "rejected: review"  # by people: docs/files.md, "Decisions"
 RULES = "rules"  # the kind of teacher that asks nobody
 
@@ -168,6 +174,21 @@ def check_drawn(flight: FlightRows, settings: dict[str, Any], findings: Findings
     look = settings.get("look")
     if look and row.get("look") and row["look"] != look:
         findings.error("settings", flight.where(0, "look"), row["look"], f"{look}, as render was told")
+
+
+def check_inspected(flight: FlightRows, settings: dict[str, Any], findings: Findings) -> None:
+    """A whole clean flight keeps the bounds of motion that its inspection was told; of others the plan is not released.
+
+    Args:
+        settings: of the stage `inspect`; empty where nobody tells.
+    """
+    if not settings or len(flight) < LEAST_POINTS or flight.num_frames != len(flight) or flight.rows[0].get("track") != "clean":  # fmt: skip
+        return
+    dt_s = float(np.median(np.diff(flight.time_s)))
+    for name, rms in (("accel_rms_max_mps2", accel_rms), ("jerk_rms_max_mps3", jerk_rms)):
+        most, found = settings.get(name), rms(flight.pose[:, :3], dt_s)
+        if isinstance(most, int | float) and found > most * (1.0 + RMS_SHARE) + RMS_ROUNDING:
+            findings.error("settings", flight.name, f"{found:.2f} of motion", f"at most {most:g}, as inspect was told of {name}")  # fmt: skip
 
 
 def check_clock(folder: Path, record: ReleaseRecord, findings: Findings) -> None:

@@ -12,14 +12,14 @@ from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
 from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
-from release.verify.by_rule import check_drawn
+from release.verify.by_rule import check_drawn, check_inspected
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
 from release.verify.identity import check_identity
 from release.verify.motion import check_motion
 from release.verify.rows import FlightRows
 from release.verify.said import check_captions
-from release.verify.scene import check_pictures
+from release.verify.scene import NOTHING_SHOWN, check_pictures
 from release.verify.sources import Entry, FlightSource, flight_rows
 
 Level = Literal["structure", "rows", "pixels"]
@@ -36,7 +36,7 @@ LOSSLESS = DepthCoding(
 class Told:
     """What the record says that the checks of flights need. settings: of stages, by run and stage. by_town: splits share no town
     either. both: every flight's twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as.
-    prompts: by run."""
+    prompts: by run. is_reviewed: people may have accepted what the inspection did not."""
 
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
@@ -45,6 +45,7 @@ class Told:
     both: bool = False
     rounded_as: DepthCodingName = "float32"
     prompts: dict[str, dict[str, str]] = field(default_factory=dict)
+    is_reviewed: bool = False
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
         return _of_run({run: values for (run, name), values in self.settings.items() if name == stage}, flight)
@@ -103,15 +104,16 @@ def check_flight(
         lambda: check_motion(flight, twin, told.of(flight, "render").get("perturbation", {}), findings),
         lambda: check_captions(flight, told.window_frames, findings),
         lambda: check_drawn(flight, told.of(flight, "render"), findings),
+        lambda: check_inspected(flight, {} if told.is_reviewed else told.of(flight, "inspect"), findings),
     ]
     if reader is not None:
         checks.append(lambda: _read_captions(flight, twin, told, reader, findings))
     tried = [_tried(check, name, findings) for check in checks]  # all of them, whatever the first gives
     is_sane = all(tried)
-    keys: list[tuple[int, int]] = []
+    shown = NOTHING_SHOWN
     if level == "pixels":
         try:
-            keys = check_pictures(flight, source.pictures(job.entry), told.depth, told.rounded_as, findings)
+            shown = check_pictures(flight, source.pictures(job.entry), told.depth, told.rounded_as, findings)
         except InputError as error:
             findings.error("unreadable", name, f"{error.what}: {error.got}", "pictures that can be read")
         except SENSELESS as error:
@@ -119,7 +121,7 @@ def check_flight(
                 raise
             findings.error("not_checked", name, f"pictures: {type(error).__name__}: {error}", "rows of sense")
     try:
-        return summary_of(flight, keys, rows, job.rows_file).dumped()
+        return summary_of(flight, shown, rows, job.rows_file).dumped()
     except SENSELESS as error:
         findings.error("not_checked", name, f"{type(error).__name__}: {error}", "rows of sense")
         return None

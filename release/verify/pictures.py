@@ -25,9 +25,11 @@ SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
 BLANK_STD = 2.0  # grey levels: a picture of one colour has 0, fog over a street more than 5
+BLOCK_PX = 8  # of JPEG, WebP and videos
 LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 MOST_RAYS = 900  # through the box of a person: the score is a share of them
 SCORE = 0.12  # of the visibility: three deviations of a share of so many rays, and pixels on an edge
+STEP_PIXELS = 20_000  # of a frame
 MOST_KIND = max(KINDS.values())
 NOTHING = np.empty((0, 0), np.float32)
 NOTHING.flags.writeable = False
@@ -201,8 +203,11 @@ def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: n
         findings.error("visibility", flight.where(i, "visibility"), f"{score:.2f}", f"{share:.2f}, of the depth image")
 
 
-def look_of(colours: np.ndarray) -> tuple[float, float]:
-    """Tell how colourful and how sharp a picture is, grey levels: how far channels lie from their mean, and pixels from the next.
+def look_of(colours: np.ndarray) -> np.ndarray:
+    """Tell how a picture looks, (6,) grey levels.
+
+    How colourful and how sharp it is: how far channels lie from their mean, and pixels from the next. How far pixels lie from the next over
+    edges of blocks of 8 px, which lossy codings pack apart, and elsewhere. Red and blue less green.
 
     Args:
         colours: (k, w, 3 or 4) uint8, some of its rows.
@@ -210,7 +215,21 @@ def look_of(colours: np.ndarray) -> tuple[float, float]:
     few = colours[::LOOK_EVERY, :, :3].astype(np.int16)
     grey = few.sum(axis=2, dtype=np.int16)  # three times the brightness
     hue = np.abs(3 * few[:, ::LOOK_EVERY] - grey[:, ::LOOK_EVERY, None]).mean() / 3.0
-    return float(hue), float(np.abs(np.diff(grey, axis=1)).mean()) / 3.0
+    steps = np.abs(np.diff(grey, axis=1)).mean(axis=0) / 3.0
+    edges = steps[BLOCK_PX - 1 :: BLOCK_PX]
+    inside = (steps.sum() - edges.sum()) / max(len(steps) - len(edges), 1)
+    red, green, blue = few.mean(axis=(0, 1))
+    return np.array([hue, steps.mean(), edges.mean() if len(edges) else np.nan, inside, red - green, blue - green])
+
+
+def least_step(depth: np.ndarray) -> float:
+    """Give the least difference between two depths of some pixels, m; NaN where too few of them see anything."""
+    seen = depth.reshape(-1)[:: max(1, depth.size // STEP_PIXELS)]
+    seen = seen[seen < SKY_DEPTH_M]
+    if len(seen) < STEP_PIXELS // 10:
+        return np.nan
+    gaps = np.diff(np.sort(seen))
+    return float(gaps[gaps > 0.0].min(initial=np.inf))
 
 
 def grid_kinds(instance: np.ndarray) -> np.ndarray:

@@ -196,6 +196,7 @@ def shown_caption(row: Row) -> ShownCaption:
             language: Coc(**{name: row[f"caption_{language}_{name}"] for name in FIELDS}) for language in LANGUAGES
         },
         prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
+        systems={language: row[f"system_{language}"] for language in LANGUAGES if row.get(f"system_{language}")},
         decision=row["decision"],
         label=row["label"],
         label_from=row["label_from"],

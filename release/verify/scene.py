@@ -17,7 +17,17 @@ from cosfly.items import advance
 from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
-from release.verify.pictures import NOBODY, SHARED_ID, check_picture, decode, grid_kinds, look_of, view_of
+from release.verify.pictures import (
+    BLOCK_PX,
+    NOBODY,
+    SHARED_ID,
+    check_picture,
+    decode,
+    grid_kinds,
+    least_step,
+    look_of,
+    view_of,
+)
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -43,6 +53,10 @@ TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
 BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.03, 0.04
 # Of the lesser of both neighbours, in hue and in detail: honest 0.6 and 0.9 of ours; and what these must have for that to mean something.
 LOOKS_LEAST, LOOK_LEAST = (0.2, 0.6), 2.0
+# Steps over edges of blocks to those elsewhere: honest 0.998 to 1.004 over a flight; JPEG of quality 40 1.85. So many edges, for that to mean something.
+BLOCKS_MOST, LEAST_EDGES = 1.1, 300
+# Between the two nearest depths of a frame's sample: honest 4e-6 m; of so many frames of a flight the least counts.
+STEP_MOST_M, STEPS_LOOKED_AT = 2e-4, 8
 # Flights of others: depth may be rough, but it is equally rough in all frames.
 ROUGH_ERROR, TIMES_ROUGH = 1e-3, 20.0
 
@@ -57,23 +71,36 @@ class _Pairs:
     elsewhere: list[float] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What is kept of a flight's pictures to compare it with others. keys: of each row a number that tells its colour picture from others,
+    and one for its depth; 0 where it has none. kinds: id * 256 + kind of what is seen. hue: red and blue less green, grey levels, or nothing.
+    """
+
+    keys: list[tuple[int, int]]
+    kinds: list[int]
+    hue: list[float]
+
+
+NOTHING_SHOWN = Shown([], [], [])
+
+
 def check_pictures(
     flight: FlightRows,
     pictures: Iterator[Pictures],
     coding: DepthCoding,
     rounded_as: DepthCodingName,
     findings: Findings,
-) -> list[tuple[int, int]]:
+) -> Shown:
     """Check all pictures of a flight, one after the other; memory holds three frames.
 
     Args:
         coding: of the depth. rounded_as: the coding whose errors it has.
-    Returns:
-        of each row a number that tells its colour picture from others, and one for its depth; 0 where it has none.
     """
     keys: list[tuple[int, int]] = []
     pairs, kinds = _Pairs(), dict[int, int]()
-    looks = np.full((len(flight), 2), np.nan)
+    looks = np.full((len(flight), 6), np.nan)
+    steps: list[float] = []  # of some frames' depth
     before: list[tuple[int, View]] = []  # the two frames before
     for i, files in enumerate(pictures):
         advance()
@@ -86,14 +113,25 @@ def check_pictures(
             _check_kinds(flight, i, decoded[1], kinds, findings)
         if decoded[2] is not None:
             looks[i] = look_of(decoded[2])
+        if rounded_as == "float32" and i % max(1, len(flight) // STEPS_LOOKED_AT) == 0:
+            steps.append(least_step(decoded[0]))
         view = view_of(flight, i, decoded)
         if decoded[0].size:
             _compare(flight, i, view, before, pairs)
         before = [*before[-1:], (i, view)]
     _judge(flight, pairs, rounded_as, findings)
     if not flight.is_foreign:
-        _judge_looks(flight, looks, findings)
-    return keys
+        _judge_looks(flight, looks[:, :2], findings)
+        _judge_blocks(flight, looks[:, 2:4], findings)
+        least = min((step for step in steps if np.isfinite(step)), default=0.0)
+        if least > STEP_MOST_M:
+            findings.error("depth_coding", flight.name, f"depths that are {least:.4f} m apart or equal", "float32 as it was drawn, as the record says: depths that differ by millionths")  # fmt: skip
+    known = looks[np.isfinite(looks[:, 4])]
+    return Shown(
+        keys,
+        sorted(own << 8 | kind for own, kind in kinds.items()),
+        known[:, 4:].mean(axis=0).tolist() if len(known) else [],
+    )
 
 
 def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
@@ -153,6 +191,20 @@ def _judge_looks(flight: FlightRows, looks: np.ndarray, findings: Findings) -> N
                 findings.error("scene_colour", flight.where(k, "image"), got, f"a picture about as {name} as these")
 
 
+def _judge_blocks(flight: FlightRows, steps: np.ndarray, findings: Findings) -> None:
+    """Pictures that were drawn and packed without loss have no blocks.
+
+    Args:
+        steps: (n, 2) grey levels, from pixel to pixel over edges of blocks and elsewhere; NaN where nobody knows.
+    """
+    known = steps[np.isfinite(steps).all(axis=1)]
+    if len(known) * flight.size_px[0, 0] < LEAST_EDGES * BLOCK_PX:
+        return
+    over, inside = known.mean(axis=0)
+    if inside > 0.0 and over > BLOCKS_MOST * inside:
+        findings.error("scene_colour", flight.name, f"pixels that differ {over / inside:.2f} times as much over every {BLOCK_PX}th edge as elsewhere", f"at most {BLOCKS_MOST:g}: pictures that no lossy coding cut into blocks")  # fmt: skip
+
+
 def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
     """Find the pairs of frames that do not show one world."""
     if not pairs.found:
@@ -188,6 +240,9 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             got = f"{share:.0%} of the points where the frame before has them, {through:.1%} before what is drawn{off}"
             expected = f"at least {least:.0%}, at most {THROUGH_MOST:.1%} and planes {limit:.2%} off: depth, pose and camera that agree with the frame before"  # fmt: skip
             findings.error("scene_depth", where, got, expected)
+            continue
+        if gap <= NEAR_FRAMES and pair.shifted and not flight.is_foreign:
+            findings.error("scene_depth", where, f"a thing of {pair.shifted} points at another distance than in the frame before", "what stands still at its place")  # fmt: skip
             continue
         if pair.agree < LEAST_AGREE:
             continue

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -115,11 +117,12 @@ class Shards:
                     break
 
     def _groups(self, entry: Entry) -> Iterator[tuple[Path, Any, int, int, int]]:
-        """Yield where a flight's rows are: file, the same opened, row group, first row, row behind the last."""
-        for shard, group, begin, end in entry.parts:
+        """Yield where a flight's rows are: file, the same opened once, row group, first row, row behind the last."""
+        for shard, parts in groupby(entry.parts, key=itemgetter(0)):
             path = self.folder / shard
             with open_table(path, tree=self.folder) as table:
-                yield path, table, group, begin, end
+                for _, group, begin, end in parts:
+                    yield path, table, group, begin, end
 
 
 def rows_of_table(table: Any, path: Path) -> list[Row]:

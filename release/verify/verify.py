@@ -36,6 +36,7 @@ from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
 from release.verify.made_again import check_made_again
+from release.verify.shards import check_shards
 from release.verify.sources import Entry, FlightSource, Shards, Tree
 from release.verify.tars import found_tars
 
@@ -149,6 +150,7 @@ def _verify_rows(folder: Path, record: ReleaseRecord, is_readable: bool, how: _H
     try:
         records.check_numbers(folder, record, findings)
         by_rule.check_clock(folder, record, findings)
+        check_shards(folder, record, findings)
     except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
         findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
 
@@ -173,6 +175,7 @@ def _told(record: ReleaseRecord) -> Told:
     return Told(
         asked.window_frames, coded, settings, by_town=record.splits.by == "town", rounded_as=coded.coding,
         both=asked.pairs == "both" and len(asked.tracks) == 2, prompts=record.prompts,
+        is_reviewed=any(source.review_sha256 for source in record.provenance.sources),
     )  # fmt: skip
 
 
