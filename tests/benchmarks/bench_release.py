@@ -1,4 +1,4 @@
-"""How fast `release build` stores pictures, beside a plain copy of the same bytes, and how much memory it takes.
+"""How fast `release build` stores pictures, beside a copy of the same bytes, plain and with the digests that a release needs, and how much memory it takes.
 
     python tests/benchmarks/bench_release.py speed 4000             # 1280x720, two processes for either
     python tests/benchmarks/bench_release.py memory 10000 100000    # small pictures
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import os
 import resource
 import shutil
@@ -46,6 +47,10 @@ FRAMES_RELEASED = 400
 STORED: tuple[FrameFile, ...] = ("rgb", "instance")  # as they are; depth is compressed
 SIZES = {"speed": (1280, 720), "memory": (32, 18)}
 MB = 1e6
+COPIES = {
+    "plain copy": 0,
+    "copy, 2 digests": 2,
+}  # of each byte: its file's, held against its record, and that of what is written
 
 
 def make_tree(root: Path, num_released: int, size_px: tuple[int, int]) -> Path:
@@ -98,38 +103,54 @@ def build(root: Path, out: Path, files: tuple[FrameFile, ...], workers: int) -> 
     return time.perf_counter() - start_s
 
 
-def copy_flight(folder: Path, target: Path) -> int:
-    """Copy the first FRAMES_RELEASED frames of a flight into one file; gives its bytes."""
+def copy_flight(folder: Path, target: Path, num_digests: int) -> int:
+    """Copy the first FRAMES_RELEASED frames of a flight into one file; gives its bytes.
+
+    Args:
+        num_digests: 0; 1: a sha256 of each file; 2: and one of what is written.
+    """
+    whole = hashlib.sha256()
     with open(target, "wb") as out:
         for i in range(FRAMES_RELEASED):
             for file in STORED:
                 with open(folder / frame_name(i) / FILE_NAMES[file], "rb") as picture:
-                    shutil.copyfileobj(picture, out, 1 << 20)
+                    if not num_digests:
+                        shutil.copyfileobj(picture, out, 1 << 20)
+                        continue
+                    data = picture.read()
+                hashlib.sha256(data).digest()
+                if num_digests > 1:
+                    whole.update(data)
+                out.write(data)
         out.flush()
         os.fsync(out.fileno())
     return target.stat().st_size
 
 
-def plain_copy(tree: Path, out: Path, workers: int) -> tuple[float, int]:
+def copy(tree: Path, out: Path, workers: int, num_digests: int) -> tuple[float, int]:
     """Copy the pictures; gives seconds and bytes."""
     out.mkdir()
     flights = find_flights(tree)
     start_s = time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
-        sizes = list(pool.map(copy_flight, flights, [out / str(k) for k in range(len(flights))]))
+        sizes = list(
+            pool.map(copy_flight, flights, [out / str(k) for k in range(len(flights))], [num_digests] * len(flights))
+        )
     return time.perf_counter() - start_s, sum(sizes)
 
 
 def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
     tree = make_tree(folder, num_frames, SIZES["speed"])
     print(f"{'':24}{'seconds':>9}{'CPU s':>9}{'MB':>9}{'MB/s':>9}{'frames/s':>10}")
-    shares: list[tuple[float, float]] = []  # of the copy's rate: on the clock, by CPU
+    shares: dict[str, list[tuple[float, float]]] = {
+        name: [] for name in COPIES
+    }  # of the copy's rate: on the clock, by CPU
     for number in range(rounds):
         rows = []
-        for name in ("copy", "build") if number % 2 else ("build", "copy"):  # neither always has the quieter disk
+        for name in list(reversed((*COPIES, "build")))[:: -1 if number % 2 else 1]:  # none always has the quieter disk
             out, cpu_s = folder / "out", cpu_seconds()
-            if name == "copy":
-                seconds, stored = plain_copy(tree, out, NUM_WORKERS)
+            if name in COPIES:
+                seconds, stored = copy(tree, out, NUM_WORKERS, COPIES[name])
             else:
                 seconds = build(folder, out, STORED, NUM_WORKERS)
                 stored = sum(p.stat().st_size for p in (out / "dataset/data").iterdir())
@@ -141,10 +162,12 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
                 f"{name:24}{seconds:9.2f}{used_s:9.2f}{stored:9.0f}{stored / seconds:9.0f}{num_frames / seconds:10.0f}"
             )
         rates = {name: (stored / seconds, stored / used_s) for name, seconds, stored, used_s in rows}
-        shares.append((rates["build"][0] / rates["copy"][0], rates["build"][1] / rates["copy"][1]))
-    for what, column in (("on the clock", 0), ("by CPU", 1)):
-        told = ", ".join(f"{100 * share[column]:.0f} %" for share in shares)
-        print(f"stored as they are: {told} of a plain copy {what}")
+        for name, own in shares.items():
+            own.append((rates["build"][0] / rates[name][0], rates["build"][1] / rates[name][1]))
+    for name, own in shares.items():
+        for what, column in (("on the clock", 0), ("by CPU", 1)):
+            told = ", ".join(f"{100 * share[column]:.0f} %" for share in own)
+            print(f"stored as they are: {told} of a {name} {what}")
     few = min(num_frames, 2 * FRAMES_RELEASED)
     for path in find_flights(tree)[few // FRAMES_RELEASED :]:
         shutil.rmtree(path.parent, ignore_errors=True)
