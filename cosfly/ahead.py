@@ -37,8 +37,7 @@ def compiled_ahead(planner: str, todo: Collection[str]) -> Iterator[Callable[[st
     Args:
         todo: the stages that are still to be done.
     """
-    folder = cache_folder()
-    missing = [] if folder is None else [s for s in STAGES if s in todo and not (folder / _mark(s, planner)).exists()]
+    folder, missing = cache_folder(), not_compiled(planner, todo)
     if folder is None or not missing:
         yield lambda stage: None
         return
@@ -65,6 +64,12 @@ def compiled_ahead(planner: str, todo: Collection[str]) -> Iterator[Callable[[st
     finally:
         process.kill()
         process.communicate()
+
+
+def not_compiled(planner: str, todo: Collection[str]) -> list[str]:
+    """Tell for which of the stages that are still to be done `compiled_ahead` would compile."""
+    folder = cache_folder()
+    return [] if folder is None else [s for s in STAGES if s in todo and not (folder / _mark(s, planner)).exists()]
 
 
 def _mark(stage: str, planner: str) -> str:

@@ -206,14 +206,16 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
 
 
 def _do(stage: Stage, out: Path, place: str, left: _TimeLeft) -> StageResult:
-    """Do a stage that is not complete; one that is refuses other settings."""
-    was_complete = (out / stage.name / "manifest.json").exists()
-    if not was_complete:
-        log.info("%s", left.told(place, out / stage.name))
+    """Do a stage that is not complete; one that is refuses other settings, or goes on where more is to be done."""
+    folder = out / stage.name
+    before = read_manifest(folder) if (folder / "manifest.json").exists() else None
+    if before is None:
+        log.info("%s", left.told(place, folder))
     stage.work()
-    if was_complete:
+    after = read_manifest(folder)
+    if before == after:
         log.info("[%s] %s: already complete", place, stage.name)
-    return StageResult(stage, read_manifest(out / stage.name), was_complete)
+    return StageResult(stage, after, before == after)
 
 
 def _save_run(cfg: RunConfig, out: Path) -> None:

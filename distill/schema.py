@@ -271,7 +271,9 @@ class SplitFiles:
         if split not in self._writers:
             path = split_path(self._out, split)
             file = self._stack.enter_context(atomic_file(path))
-            self._writers[split] = self._stack.enter_context(pq.ParquetWriter(file, self._columns, compression="zstd"))
+            # Least and greatest values help nobody here, and those of whole prompts make a footer of 8 kB a row group.
+            writer = pq.ParquetWriter(file, self._columns, compression="zstd", write_statistics=False)
+            self._writers[split] = self._stack.enter_context(writer)
             self.paths.append(path)
         self._writers[split].write_table(pa.Table.from_pylist(self._rows[split], schema=self._columns))
         self._rows[split] = []

@@ -181,6 +181,15 @@ def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_pat
     assert not beside.exists()
 
 
+def test_a_dry_run_tells_of_compiling_where_it_was_not_done(base, tmp_path, monkeypatch):
+    told = {}
+    for name, folder in (("new", tmp_path), ("none", None)):
+        monkeypatch.setattr("cosfly.ahead.cache_folder", lambda folder=folder: folder)
+        shown = CliRunner().invoke(app, ["run", str(base), "--out", str(tmp_path / "run"), "--dry-run"])
+        told[name] = "of compiling, once on this machine" in shown.output
+    assert told == {"new": True, "none": False}
+
+
 def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base, tmp_path):
     assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), base, rates_near(base)))
     half = begin(base, tmp_path / "run", "inspect")
@@ -636,6 +645,7 @@ def test_more_walks_are_added_to_a_finished_run_and_leave_the_others_as_they_wer
     captions = list(read_captions(run / "caption/captions.jsonl"))
     more = tiny(**{"pedestrians.num_paths": 3})
     results = pipeline.run(more, run)
+    assert [r.stage.name for r in results if r.was_complete] == ["maps", "simplify"], "the others went on"
     assert [walk.as_json() for walk in read_walks(run / "pedestrians/path.json")][:2] == paths
     assert {path: (run / path).read_bytes() for path in frames} == frames
     assert len(find_flights(run / "render")) == 6

@@ -18,7 +18,7 @@ from cosfly.products.captions import Coc, Prompt, read_captions, write_captions
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import find_flights, read_flight
 from release.export import stage
-from release.export.captions import FORMULA, cell, export
+from release.export.captions import FORMULA, cell, export, read_lines
 from release.export.contract import ExportConfig
 from specimens import make_playback_tree
 
@@ -151,6 +151,14 @@ def test_the_command_tells_what_it_wrote(run, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert f"{len(accepted(run))} written; left out: dropped_hard_conflict 4" in done.output
+
+
+def test_the_folder_of_a_captions_file_is_as_good_as_the_file(run, tmp_path):
+    found = {
+        name: [line.sample_id for line in read_lines(run / "caption" / name, Counter())]
+        for name in ("", "captions.jsonl")
+    }
+    assert found[""] == found["captions.jsonl"] != []
 
 
 def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):

@@ -17,7 +17,7 @@ def _group() -> None:
 
 @app.command("captions")
 def export_captions(
-    source: Annotated[Path, typer.Argument(help="Run folder, captions.jsonl, or release.")],
+    source: Annotated[Path, typer.Argument(help="Run folder, captions.jsonl or its folder, or release.")],
     out: Annotated[Path, typer.Option(help="File to write.")],
     format: Annotated[
         Literal["csv", "jsonl", "sharegpt", "llava"],

@@ -65,6 +65,7 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
 
     from caption.run.progress import duration
     from cosfly import estimate
+    from cosfly.ahead import not_compiled
     from cosfly.console import answer_console
 
     rows = estimate.estimate(cfg, out, estimate.rates_near(out))
@@ -90,6 +91,8 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     answer_console.print(
         f"in all about {estimate.time_left(rows)}; {_size(needed)} of disk, {_size(free)} are free", soft_wrap=True
     )
+    if not_compiled(cfg.plan.planner, {row.name.rpartition("/")[2] for row in rows if not row.is_done}):
+        answer_console.print("and half a minute or more of compiling, once on this machine", soft_wrap=True)
     if any(row.tokens is None for row in rows):
         answer_console.print(f"tokens are {estimate.UNKNOWN_TOKENS}", soft_wrap=True)
     if more := estimate.more_walks(cfg, out):

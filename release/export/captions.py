@@ -72,7 +72,7 @@ class CaptionLine:
 
 
 def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
-    """Yield the accepted captions of a run folder, a captions.jsonl or a release, in their order.
+    """Yield the accepted captions of a run folder, a captions.jsonl (or the folder it stands in) or a release, in their order.
 
     Args:
         left_out: counts the others by reason.
@@ -87,8 +87,10 @@ def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
         captions = source / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
         return _of_captions(captions, source / "render", left_out)
+    if (source / "captions.jsonl").is_file():
+        return _of_captions(source / "captions.jsonl", None, left_out)
     raise InputError(
-        "no captions here", where=source, expected="a run folder, a captions.jsonl, or a release",
+        "no captions here", where=source, expected="a run folder, a captions.jsonl or its folder, or a release",
         fix="run cosfly caption first, or name its captions.jsonl",
     )  # fmt: skip
 
