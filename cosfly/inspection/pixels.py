@@ -142,29 +142,35 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
     # Of the run of a column that goes on, and of the two before it: id and first row.
     ids, firsts = np.full((3, width), -1, np.int32), np.zeros((3, width), np.int32)
+    # Each pixel of a row as one number, kind lowest and red lowest. Unsigned places: of others numba looks whether they count from the end.
+    codes, shades = np.full(width + 1, -1, np.int32), np.empty(width, np.uint32)
+    one, size, byte = np.uint64(1), np.uint64(width), np.uint32(255)
     for y in range(height):
-        begin = np.int64(0)
+        row, tones = instance[y], colours[y]
+        for x in range(size):
+            codes[x] = np.int32(row[x, 0]) | np.int32(row[x, 1]) << 8 | np.int32(row[x, 2]) << 16
+            shades[x] = np.uint32(tones[x, 0]) | np.uint32(tones[x, 1]) << 8 | np.uint32(tones[x, 2]) << 16
+        first = np.uint64(0)
         id1, id2, id3 = np.int64(-1), np.int64(-1), np.int64(-1)  # of the three runs before this one
         first1, first2 = np.int64(0), np.int64(0)
-        while begin < width:
-            kind, low, high = instance[y, begin, 0], instance[y, begin, 1], instance[y, begin, 2]
-            end = begin + 1
-            while end < width and instance[y, end, 0] == kind and instance[y, end, 1] == low and instance[y, end, 2] == high:  # fmt: skip
-                end += 1
-            number = np.int64(low) | np.int64(high) << 8
-            code = number << 8 | np.int64(kind)
+        while first < size:
+            code, end = np.int64(codes[first]), first + one
+            while codes[end] == code:  # -1 stands behind the row
+                end += one
+            begin, kind, number = np.int64(first), code & 255, code >> 8
             if kind == PERSON and not left_out[number]:
                 box[0], box[1] = min(box[0], begin), min(box[1], y)
-                box[2], box[3] = max(box[2], end), max(box[3], y + 1)
+                box[2], box[3] = max(box[2], np.int64(end)), max(box[3], y + 1)
             if kind not in (NOTHING, SKY):
                 kinds[number] = kind
-                same, light, pink = np.int64(0), np.int64(0), np.int64(0)
-                for x in range(begin, end - 1):
-                    red, green, blue = colours[y, x, 0], colours[y, x, 1], colours[y, x, 2]
-                    same += (red == colours[y, x + 1, 0]) & (green == colours[y, x + 1, 1]) & (blue == colours[y, x + 1, 2])  # fmt: skip
+                same, light, pink = np.uint32(0), np.uint32(0), np.uint32(0)
+                for x in range(first, end - one):
+                    shade = shades[x]
+                    red, green, blue = shade & byte, shade >> np.uint32(8) & byte, shade >> np.uint32(16)
+                    same += np.uint32(shade == shades[x + one])
                     light += green
-                    pink += (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
-                pairs[number] += end - 1 - begin
+                    pink += np.uint32((red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST))
+                pairs[number] += np.int64(end) - 1 - begin
                 equal[number] += same
                 bright[number] += light
                 counts[0] += pink
@@ -176,14 +182,16 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                     counts[1] += begin - first1
                 id3, id2, id1 = id2, id1, code
                 first2, first1 = first1, begin
-                for x in range(begin, end):
-                    if ids[0, x] != code:
-                        a, b = firsts[1, x], firsts[0, x]
-                        if (code == ids[1, x] and ids[0, x] == ids[2, x] and ids[2, x] >= 0 and y - b <= SHORTEST_RUN_PX and b - a <= SHORTEST_RUN_PX
-                                and number != SHARED_ID and ids[0, x] >> 8 != SHARED_ID and _is_plane(depth, a - 1, x, y, x)
-                                and _differs(colours, instance, b - 1, x, b, x) and _differs(colours, instance, y - 1, x, y, x)):  # fmt: skip
-                            counts[1] += y - b
-                        ids[2, x], ids[1, x], ids[0, x] = ids[1, x], ids[0, x], code
-                        firsts[2, x], firsts[1, x], firsts[0, x] = firsts[1, x], firsts[0, x], y
-            begin = end
+            first = end
+        if has_depth:
+            for column in range(size):
+                if ids[0, column] != codes[column]:
+                    x, code = np.int64(column), np.int64(codes[column])  # type: ignore[assignment]
+                    a, b = firsts[1, x], firsts[0, x]
+                    if (code == ids[1, x] and ids[0, x] == ids[2, x] and ids[2, x] >= 0 and y - b <= SHORTEST_RUN_PX and b - a <= SHORTEST_RUN_PX
+                            and code >> 8 != SHARED_ID and ids[0, x] >> 8 != SHARED_ID and _is_plane(depth, a - 1, x, y, x)
+                            and _differs(colours, instance, b - 1, x, b, x) and _differs(colours, instance, y - 1, x, y, x)):  # fmt: skip
+                        counts[1] += y - b
+                    ids[2, x], ids[1, x], ids[0, x] = ids[1, x], ids[0, x], code
+                    firsts[2, x], firsts[1, x], firsts[0, x] = firsts[1, x], firsts[0, x], y
     return pairs, equal, bright, kinds, counts, box

@@ -13,7 +13,7 @@ import numpy as np
 from cosfly.compiled import int64, njit, words_of
 from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY
 
-LOOK_BITS = 12
+LOOK_BITS = 11
 LOOK = np.uint64((1 << LOOK_BITS) - 1)
 LOOKS = 56 // LOOK_BITS  # in the bits that one fetch has at least
 MOST_AT_ONCE = 3  # literals of a look
@@ -26,11 +26,13 @@ BROKEN = np.int64(-1)
 
 class Code(NamedTuple):
     """A Huffman code. table (2 ** LOOK_BITS,) uint16: symbol * 16 + length by the next bits, 0 for what is longer, which is found by
-    symbols, in the order of their codes, and counts, of each length."""
+    symbols, in the order of their codes, and by length: ends, the first code that is longer, from the left in 16 bits; firsts, what a
+    code of that length is less than its place in symbols."""
 
     table: np.ndarray
     symbols: np.ndarray
-    counts: np.ndarray
+    ends: np.ndarray
+    firsts: np.ndarray
 
 
 def inflate(packed: bytes, start: int, size: int) -> tuple[np.ndarray, int]:
@@ -94,14 +96,15 @@ def _fetch(source, words, position, hold, held):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _new_code():  # type: ignore[no-untyped-def]
-    return Code(np.zeros(1 << LOOK_BITS, np.uint16), np.zeros(MOST_LITERALS + MOST_WAYS, np.int64), np.zeros(16, np.int64))  # fmt: skip
+    table, symbols = np.zeros(1 << LOOK_BITS, np.uint16), np.zeros(MOST_LITERALS + MOST_WAYS, np.int64)
+    return Code(table, symbols, np.zeros(16, np.int64), np.zeros(16, np.int64))
 
 
 @njit(cache=True, nogil=True)
 def _fill(code, lengths):  # type: ignore[no-untyped-def]
     """Fill the tables of a code of these lengths; False where they are none."""
-    table, symbols, counts = code
-    counts.fill(0)
+    table, symbols, ends, firsts = code
+    counts = np.zeros(16, np.int64)
     for length in lengths:
         counts[length] += length > 0
     starts, codes = np.zeros(17, np.int64), np.zeros(17, np.int64)
@@ -113,6 +116,8 @@ def _fill(code, lengths):  # type: ignore[no-untyped-def]
         starts[n + 1] = starts[n] + counts[n]
         word = word + counts[n - 1] << 1
         codes[n] = word
+        ends[n] = word + counts[n] << 16 - n
+        firsts[n] = starts[n] - word
     table.fill(0)
     for s in range(len(lengths)):
         n = lengths[s]
@@ -150,21 +155,20 @@ def _find_runs(table, runs):  # type: ignore[no-untyped-def]
 def _next(hold, code):  # type: ignore[no-untyped-def]
     """The next symbol * 16 + its length, -1 where the bits are no code."""
     entry = np.int64(code.table[np.int64(hold & LOOK)])
-    return entry if entry != 0 else _next_long(hold, code.symbols, code.counts)
+    return entry if entry != 0 else _next_long(hold, code)
 
 
 @njit(cache=True, nogil=True)
-def _next_long(hold, symbols, counts):  # type: ignore[no-untyped-def]
-    """As `_next`, bit by bit."""
-    code, first, index = np.int64(0), np.int64(0), np.int64(0)
-    for n in range(1, 16):
-        code |= np.int64(hold & np.uint64(1))
-        hold >>= np.uint64(1)
-        if code - counts[n] < first:
-            return symbols[index + code - first] * 16 + n
-        index += counts[n]
-        first = first + counts[n] << 1
-        code <<= 1
+def _next_long(hold, code):  # type: ignore[no-untyped-def]
+    """As `_next`, of codes that are longer than a look: those of each length follow each other, read from the left."""
+    word = np.int64(hold & np.uint64(0xFFFF))
+    word = (word & 0x5555) << 1 | word >> 1 & 0x5555
+    word = (word & 0x3333) << 2 | word >> 2 & 0x3333
+    word = (word & 0x0F0F) << 4 | word >> 4 & 0x0F0F
+    word = (word & 0x00FF) << 8 | word >> 8
+    for n in range(LOOK_BITS + 1, 16):
+        if word < code.ends[n]:
+            return code.symbols[code.firsts[n] + (word >> 16 - n)] * 16 + n
     return BROKEN
 
 

@@ -157,25 +157,39 @@ def _undone_alone(lines, first, wanted, channels):  # type: ignore[no-untyped-de
 @njit(cache=True, nogil=True)
 def _undo_colours(row, above):  # type: ignore[no-untyped-def]
     """Undo a row of three channels that leans on its left: they are computed beside each other, as each has to wait for its own left."""
-    red, green, blue = np.int64(0), np.int64(0), np.int64(0)
+    # Unsigned throughout: of a signed index numba looks whether it counts from the end, which takes as long as all the rest.
+    red, green, blue = np.uint32(0), np.uint32(0), np.uint32(0)
+    x, one, two, three, size, byte = (
+        np.uint64(1),
+        np.uint64(1),
+        np.uint64(2),
+        np.uint64(3),
+        np.uint64(len(row)),
+        np.uint32(255),
+    )
     if row[0] == 1:
-        for x in range(1, len(row), 3):
-            red = (row[x] + red) & 255
-            green = (row[x + 1] + green) & 255
-            blue = (row[x + 2] + blue) & 255
-            row[x], row[x + 1], row[x + 2] = red, green, blue
+        while x < size:
+            red = (row[x] + red) & byte
+            green = (row[x + one] + green) & byte
+            blue = (row[x + two] + blue) & byte
+            row[x], row[x + one], row[x + two] = red, green, blue
+            x += three
     elif row[0] == 3:
-        for x in range(1, len(row), 3):
-            red = (row[x] + ((red + above[x]) >> 1)) & 255
-            green = (row[x + 1] + ((green + above[x + 1]) >> 1)) & 255
-            blue = (row[x + 2] + ((blue + above[x + 2]) >> 1)) & 255
-            row[x], row[x + 1], row[x + 2] = red, green, blue
+        while x < size:
+            red = (row[x] + ((red + above[x]) >> one)) & byte
+            green = (row[x + one] + ((green + above[x + one]) >> one)) & byte
+            blue = (row[x + two] + ((blue + above[x + two]) >> one)) & byte
+            row[x], row[x + one], row[x + two] = red, green, blue
+            x += three
     else:
         corners = np.int64(0), np.int64(0), np.int64(0)
-        for x in range(1, len(row), 3):
-            ups = np.int64(above[x]), np.int64(above[x + 1]), np.int64(above[x + 2])
-            red = (row[x] + _nearest(red, ups[0], corners[0])) & 255
-            green = (row[x + 1] + _nearest(green, ups[1], corners[1])) & 255
-            blue = (row[x + 2] + _nearest(blue, ups[2], corners[2])) & 255
-            row[x], row[x + 1], row[x + 2] = red, green, blue
+        lefts = np.int64(0), np.int64(0), np.int64(0)
+        for k in range(1, len(row), 3):
+            ups = np.int64(above[k]), np.int64(above[k + 1]), np.int64(above[k + 2])
+            lefts = (
+                (row[k] + _nearest(lefts[0], ups[0], corners[0])) & 255,
+                (row[k + 1] + _nearest(lefts[1], ups[1], corners[1])) & 255,
+                (row[k + 2] + _nearest(lefts[2], ups[2], corners[2])) & 255,
+            )
+            row[k], row[k + 1], row[k + 2] = lefts
             corners = ups

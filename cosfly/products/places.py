@@ -21,7 +21,7 @@ from pydantic import Field
 
 from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.reading.files import is_below
+from cosfly.reading.files import is_below, real_path
 from cosfly.store import inside
 
 TOWN = "Town"  # what the name of a town's folder begins with
@@ -83,7 +83,7 @@ def tree_of_flight(folder: Path) -> Path:
     """
     parents = folder.absolute().parents
     tree = parents[min(2, len(parents) - 1)]
-    real, root = os.path.realpath(folder), os.path.realpath(tree)
+    real, root = real_path(folder), real_path(tree)
     is_beside = not is_below(real, root) and is_below(real, os.path.dirname(root))
     return Path(real) if is_beside else tree
 

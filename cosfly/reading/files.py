@@ -231,7 +231,7 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
     if limits().follow_links:
         return
     try:
-        real, root = os.path.realpath(path), os.path.realpath(tree)
+        real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
         raise InputError("not a name of a file", where=tree, got=str(error)) from None
     if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *_blobs(Path(root)))):
@@ -239,6 +239,20 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
             "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
             fix="if you trust it, --set reading.follow_links=true",
         )  # fmt: skip
+
+
+def real_path(path: Path) -> str:
+    """As `os.path.realpath`, which looks at every folder on the way, by asking the system, where there is such a file and it can be asked."""
+    try:
+        number = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except (OSError, AttributeError):  # not there, or another system
+        return os.path.realpath(path)
+    try:
+        return os.readlink(f"/proc/self/fd/{number}")
+    except OSError:  # no /proc
+        return os.path.realpath(path)
+    finally:
+        os.close(number)
 
 
 def is_below(path: str, root: str) -> bool:
