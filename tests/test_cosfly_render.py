@@ -80,7 +80,9 @@ def test_what_is_drawn_is_what_the_slow_way_finds():
     half, ids = rng.uniform(0.05, 20.0, (count, 3)), np.ones(count, np.uint16)
     builder = PartBuilder()
     for layer, (low_px, high_px) in enumerate([(0.0, 14.0), (14.0, 1e9)]):
-        boxes = Boxes(centers, half, np.broadcast_to(np.eye(3), (count, 3, 3)), ids, np.zeros(count), 1)
+        boxes = Boxes(
+            centers, half, np.broadcast_to(np.eye(3), (count, 3, 3)), ids, np.zeros(count), 1, np.zeros(count)
+        )
         builder.add(boxes, 0, half, 0, (1.0, 1.0, 1.0), min_px=low_px, max_px=high_px, layer=layer)
     parts = builder.finish()
     pose = world_from_camera(np.array([10.0, -20.0, 40.0]), np.array([5.0, -25.0, 130.0]))

@@ -47,6 +47,7 @@ from cosfly.render.contract import (
     other_id,
     plane_z_m,
 )
+from cosfly.render.layers import layers_of
 from cosfly.render.person import choose_clothes
 from cosfly.render.stage import RENDERERS, RenderConfig, open_renderer, run
 
@@ -213,6 +214,28 @@ def test_of_coplanar_surfaces_the_higher_layer_is_seen(renderer_name):
     steps = row[row > 0]
     np.testing.assert_array_equal(steps, np.sort(steps))
     assert set(steps.tolist()) == {1, 2, 3, 4, 5}
+
+
+def test_of_coplanar_surfaces_of_one_kind_always_the_same_one_is_seen(renderer_name):
+    """Where roads cross at one height, a depth buffer alone lets rounding decide: stripes of both (Z-fighting)."""
+    roads = [KINDS["Roads"]] * 3  # the third, which one of them meets elsewhere, needs no third tier
+    centers, halves = (
+        [(0, 0, -0.15), (-5, 0, -0.15), (-5, 40, -0.15)],
+        [(90, 4.5, 0.15), (60, 4, 0.15), (90, 4.5, 0.15)],
+    )
+    box_map = make_box_map(centers, halves, [(0, 0, 0), (0, 90, 0), (0, 3, 0)], roads)
+    assert layers_of(box_map).tolist() == [3.0, 3.5, 3.0]
+    renderer, seen = opened(renderer_name, box_map), []
+    crossing = np.array([[-8.9, -4.4, 0], [-1.1, -4.4, 0], [-1.1, 4.4, 0], [-8.9, 4.4, 0]])
+    for eye in [(-5.0, -19.0, 9.0), (-9.0, -24.0, 14.0), (21.0, -9.0, 7.0), (40.0, 30.0, 60.0)]:
+        pose, intrinsic = pose_towards(eye, (-5.0, 0.0, 0.0)), intrinsic_matrix(*SIZE, 70.0)
+        corners, _ = project(crossing, pose, intrinsic)
+        inside = cv2.fillConvexPoly(np.zeros(SIZE[::-1], np.uint8), np.round(corners).astype(np.int32), 1) > 0
+        inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        assert inside.sum() > 200
+        seen.append(np.unique(renderer.render(pose, intrinsic, None).ids[inside]).tolist())
+    renderer.close()
+    assert seen == [[2]] * 4
 
 
 def test_depth_is_exact_far_from_the_world_origin(renderer_name):

@@ -7,7 +7,7 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain under everything (`ground_plane`), or, where the ground slopes, its triangles and the surfaces on it
   (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M;
-- of coplanar surfaces the one of the higher layer (`layers_of`).
+- of coplanar surfaces the one of the higher layer, and of one layer always the same one (layers.py).
 """
 
 from __future__ import annotations
@@ -190,14 +190,6 @@ def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
     x, y, _ = scene_origin(box_map)
     center = np.array([x, y, plane_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
     return center, np.array([GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5])
-
-
-def layers_of(box_map: BoxMap) -> np.ndarray:
-    """The layer of each box, (n,)."""
-    table = np.full(256, STANDING_LAYER)
-    table[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
-    is_lawn = (box_map.kinds == KINDS["Vegetation"]) & (box_map.half_extents[:, 2] < LAWN_HALF_M)
-    return np.where(is_lawn, LAYERS["RoadLines"], table[box_map.kinds])
 
 
 def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

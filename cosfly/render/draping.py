@@ -1,7 +1,7 @@
 """Surfaces laid on ground that slopes: what both renderers draw in place of the flat ground plane and the flat slabs on it.
 
 The ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground everywhere; which of
-several surfaces in one place is seen is the layers' matter (contract.py). Nothing here is used for flat maps.
+several surfaces in one place is seen is the layers' matter (layers.py). Nothing here is used for flat maps.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ from cosfly.products.weather import WeatherParams
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped
+from cosfly.render.layers import layers_of
 from cosfly.render.solids import are_solids, solids_of
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
@@ -181,7 +182,7 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
     ids = np.append(contract.instance_ids(box_map, num_others), np.uint16(NO_INSTANCE))
-    tags = _tags(kinds, ids, np.append(contract.layers_of(box_map), 0))
+    tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
     is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])
     forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))

@@ -46,7 +46,7 @@ def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: View) -> tup
     builder, turn = PartBuilder(), rotation_matrix(0.0, car.heading_rad, 0.0)
     half, ids = np.array(car.half_extents_m), np.array([instance_id], np.uint16)
     BUILDERS[KINDS["Car"]](
-        builder, Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"])
+        builder, Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
     )
     parts = builder.finish()
     rows = view.rows(parts)

@@ -64,7 +64,10 @@ class Parts:
 
 @dataclass(frozen=True)
 class Boxes:
-    """The boxes of one kind: centers, half (n, 3); turns (n, 3, 3) world_from_box; ids (n,); seeds (n,) in [0, 1)."""
+    """The boxes of one kind: centers, half (n, 3); turns (n, 3, 3) world_from_box; ids (n,); seeds (n,) in [0, 1).
+
+    tiers: (n,) in [0, 1), of surfaces in their layer.
+    """
 
     centers: np.ndarray
     half: np.ndarray
@@ -72,12 +75,13 @@ class Boxes:
     ids: np.ndarray
     seeds: np.ndarray
     kind: int
+    tiers: np.ndarray
 
     def __len__(self) -> int:
         return len(self.centers)
 
     def select(self, keep: np.ndarray) -> Boxes:
-        columns = ("centers", "half", "turns", "ids", "seeds")
+        columns = ("centers", "half", "turns", "ids", "seeds", "tiers")
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
     def lengthwise(self) -> Boxes:
@@ -126,7 +130,7 @@ class PartBuilder:
         records["color"][:, :3] = color
         records["color"][:, 3] = boxes.seeds
         records["tag"] = tags(boxes.kind, material, boxes.ids)
-        records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer)
+        records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + boxes.tiers)
         self._parts.append(
             Parts(
                 records, np.full(n, mesh, np.uint8), centers, boxes.centers.astype(np.float32),

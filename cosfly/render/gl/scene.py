@@ -18,6 +18,7 @@ from cosfly.render.gl.loose import Loose
 from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, plain
 from cosfly.render.gl.solids import loose_solids
+from cosfly.render.layers import layers_of
 from cosfly.render.solids import are_solids, solids_of
 
 HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the shader draws none on it
@@ -47,6 +48,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     centers = box_map.centers - origin
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map), PART)
+    tiers = layers_of(box_map) % 1.0
     has_paint = bool((box_map.kinds == KINDS["RoadLines"]).any())
     for kind in np.unique(box_map.kinds[~are_meshes]):
         rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
@@ -57,6 +59,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
             all_ids[rows],
             seeds_of(box_map.ids[rows]),
             int(kind),
+            tiers[rows],
         )
         if kind == KINDS["Roads"] and has_paint:
             boxes = replace(boxes, seeds=np.full(len(boxes), HAS_PAINT))
@@ -72,7 +75,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     plane = PartBuilder()
     center, half = ground_plane(box_map)
     ids, seeds = np.full(1, NO_INSTANCE, np.uint16), np.zeros(1)
-    ground = Boxes((center - origin)[None], half[None], np.eye(3)[None], ids, seeds, KINDS["Terrain"])
+    ground = Boxes((center - origin)[None], half[None], np.eye(3)[None], ids, seeds, KINDS["Terrain"], np.zeros(1))
     plane.add(ground, meshes.BOX, half[None], GRASS, np.array([0.105, 0.14, 0.045]), layer=0)
     bare = plane.finish()
     builder.add_parts(bare)
