@@ -140,6 +140,10 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
         (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),
         (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
         (PLAIN.replace("12,8,8,30", "1200,800,800,30"), {}, r"are these centimetres\?"),
+        (PLAIN.replace("12,8,8,30", "12,8,800,30"), {}, r"too high: are these centimetres\?.*usually 800 m.*divide the heights alone"),
+        (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]}, r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
+        (PLAIN.replace(",", ";"), {}, r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
+        (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),
         ("", {}, "holds no boxes"),
         (PLAIN + "\"a", {}, "not a table"),
     ],
@@ -147,6 +151,27 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
 def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, settings, words):
     with pytest.raises(InputError, match=words):
         loaded(tmp_path, text, **settings)
+
+
+@pytest.mark.parametrize("columns", [(3, 4), (3, 4, 5)], ids=["length and width", "heights too"])
+def test_sizes_alone_in_centimetres_are_asked_about(tmp_path, columns):
+    """In a town of 140 m houses of 900 m: a factor for all would put the houses, 9 m wide then, within 2 m."""
+    houses = [["Buildings", 30 * k - 60, 12 * (k % 2), 9 + k, 8, 7] for k in range(5)]
+    told = [[value * 100 if k in columns else value for k, value in enumerate(house)] for house in houses]
+    head = "type,x,y,length,width,height"
+    text = lambda rows: "\n".join([head, *(",".join(map(str, row)) for row in rows), "Roads,0,30,200,8,0.3", ""])  # noqa: E731
+    assert len(loaded(tmp_path, text(houses))) == 6
+    with pytest.raises(
+        InputError, match=r"lie in each other: are these centimetres\?.*divide the columns of sizes"
+    ) as caught:
+        loaded(tmp_path, text(told))
+    assert "--set" not in str(caught.value)
+    every = [[house[0], *(100 * value for value in house[1:])] for house in houses]
+    assert len(loaded(tmp_path, text(every), metres_per_unit=0.01)) == 6
+    tower = [
+        ["Buildings", 0, 0, 60 - 9 * k, 50 - 8 * k, 60 + 30 * k] for k in range(4)
+    ]  # storeys set back, over each other
+    assert len(loaded(tmp_path, text(tower))) == 5
 
 
 @pytest.mark.parametrize(

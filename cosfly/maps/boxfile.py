@@ -26,6 +26,7 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
+from cosfly.maps.units import check_units
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import GROUND_KINDS, KINDS
@@ -55,9 +56,7 @@ NAMES: dict[str, tuple[str, ...]] = {
 }
 FIELDS = {name: field for field, names in NAMES.items() for name in names}
 SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
-WIDEST_M = 20_000.0  # no map is wider
 FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
-TALL_M = 400.0  # the usual building is lower
 DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
@@ -181,14 +180,8 @@ def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
 
 def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
     """Give the map with what the settings say of it, near the origin, if its size can be."""
+    check_units(box_map, path)
     low, high = box_map.bounds()
-    tall = box_map.half_extents[box_map.kinds == KINDS["Buildings"], 2] * 2
-    if (high - low)[:2].max() > WIDEST_M or (len(tall) and float(np.median(tall)) > TALL_M):
-        raise InputError(
-            "the map is too wide, or its buildings too high: are these centimetres?", where=path,
-            got=" x ".join(f"{size:.6g}" for size in high - low) + " m", expected="at most 20 km, buildings of usually less than 400 m",
-            fix="--set maps.boxes.metres_per_unit=0.01; or mend the stray box",
-        )  # fmt: skip
     given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=cfg.tool or box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**given, "source": source})
@@ -214,9 +207,18 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
             if not names:
                 names = line
                 fields, problems = _fields(names, cfg)
+                if len(names) == 1 and (mark := next((mark for mark in ";\t|" if mark in names[0]), "")):
+                    raise InputError(
+                        "the columns are not parted by commas", where=f"{path}: line {lines.line_num}", got=repr(names[0][:80]),
+                        expected=f"commas, where {'tabs' if mark == chr(9) else mark} stand, and a point in decimal numbers",
+                        fix="export the table as CSV with commas",
+                    )  # fmt: skip
                 problems += [
                     f"no column for {f} ({', '.join(NAMES[f])})" for f in ("x", "y", "type") if f not in fields
                 ]
+                for f in ("length", "width"):  # a box needs both; a height some kinds do without
+                    if not {f, f"half_{f}"} & set(fields):
+                        problems.append(f"no column for {f} ({', '.join(NAMES[f] + NAMES[f'half_{f}'])})")
                 if problems:
                     raise InputError.of_all(problems, where=path, expected=_hint(problems))
                 continue
