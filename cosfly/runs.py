@@ -11,6 +11,7 @@ from typing import Literal
 from cosfly.config import load
 from cosfly.errors import CosflyError, InputError
 from cosfly.folder_lock import is_held
+from cosfly.products.review import undecided
 from cosfly.settings import RunConfig
 from cosfly.settings_guide import Setting, changed
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest
@@ -60,6 +61,20 @@ class RunLook:
     @property
     def size_bytes(self) -> int:
         return sum(stage.size_bytes for stage in self.stages)
+
+    def waiting(self) -> dict[Path, int]:
+        """Give the folders of finished inspections that left flights to a person, and how many are still undecided.
+
+        Raises:
+            InputError: an inspection, or what was decided on it, cannot be read.
+        """
+        done = [
+            self.path / stage.name
+            for stage in self.stages
+            if stage.name.split("/")[-1] == "inspect" and stage.state == "complete"
+        ]
+        counts = {folder: len(undecided(folder / "inspect.json")) for folder in done}
+        return {folder: count for folder, count in counts.items() if count}
 
 
 def look(run: Path) -> RunLook:

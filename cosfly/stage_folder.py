@@ -296,16 +296,22 @@ class StageFolder:
         if lost:
             log.info("%s: %d steps of lost workers were done again, or left out with their item", self.stage, lost)
 
-    def nothing_kept(self, tally: Tally, *, expected: str | None = None) -> NothingKept:
-        """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure."""
+    def nothing_kept(
+        self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None
+    ) -> NothingKept:
+        """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure.
+
+        Args:
+            where: what stands on disk and says why; else the stage's folder. fix: what to do, where more is known of it.
+        """
         path = self.path / "failures.jsonl"
         failures = read_failures(path) if path.exists() else []
         return NothingKept(
             f"{self.stage} kept nothing, so there is nothing to go on with",
-            where=self.path,
+            where=where or self.path,
             got=f"{tally}; the first failure: {failures[0].message}" if failures else str(tally),
             expected=expected,
-            fix="mend what the records in that folder name, or change the settings and choose another --out",
+            fix=fix or "mend what the records in that folder name, or change the settings and choose another --out",
         )
 
 

@@ -21,7 +21,7 @@ from cosfly.inspection.stage import run
 from cosfly.inspection.view import PLOTS, draw_plan
 from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import find_flights, read_flight
-from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
+from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled, undecided
 from cosfly.products.traces import write_traces
 from cosfly.reading.files import sha256_file
 from release.package.sources import Source, gather
@@ -141,6 +141,50 @@ def test_the_command_decides_and_says_what_is_open(product):
     assert "3 accepted" in ask("--decisions", str(filled)).output
     filled.write_text(json.dumps(about | {"inspection": "0" * 64, "choices": []}))
     assert isinstance(ask("--decisions", str(filled)).exception, InputError)
+
+
+def test_a_trajectory_stands_for_its_flights(product):
+    """Accepted: those in review alone, for the rule's rejected one stays so; rejected: the accepted one too."""
+    clean, perturbed, other, *_ = folders_of(product)
+    trajectory = clean.rpartition("/")[0]
+    assert perturbed.startswith(trajectory)
+    assert not other.startswith(trajectory)
+    decide(product, "accepted", f"{trajectory}/")
+    assert {f: d.verdict for f, d in read_decisions(product).items()} == dict.fromkeys((clean, perturbed), "accepted")
+    product.with_name(REVIEW).unlink()
+    value = json.loads(product.read_text())
+    value["flights"][0]["result"] = "rejected"
+    product.write_text(json.dumps(value))
+    decide(product, "accepted", trajectory)
+    assert list(read_decisions(product)) == [perturbed]
+    product.with_name(REVIEW).unlink()
+    value["flights"][0]["result"] = "accepted"
+    product.write_text(json.dumps(value))
+    decide(product, "rejected", trajectory)
+    assert {f: d.verdict for f, d in read_decisions(product).items()} == dict.fromkeys((clean, perturbed), "rejected")
+    with pytest.raises(InputError, match="of a flight or of its trajectory"):
+        decide(product, "accepted", trajectory.rpartition("/")[0])
+
+
+def test_flights_that_wait_are_told_with_the_way_out(inspected, product, caplog):
+    tree = inspected.parent.parent / "tree"
+    files = (inspected.parent.parent / "map.json", inspected.parent.parent / "drone_trace.json", tree)
+    with caplog.at_level("WARNING"):
+        run(QUEUE, *files, product.parent / "again")
+    assert (
+        f"4 of 4 flights wait for a person (smoothness 4): cosfly inspect review --inspect {product.parent / 'again'}"
+        in caplog.text
+    )
+    assert undecided(product) == folders_of(product)
+    decide(product, "accepted", folders_of(product)[1])
+    assert len(undecided(product)) == 3
+    (product.parent.parent / "run.yaml").write_text("{}\n")
+    shown = CliRunner().invoke(app, ["show", str(product.parent.parent)])
+    assert re.search(r"3 flights wait for a person: cosfly inspect review --inspect \S+/inspect ", shown.output), (
+        shown.output
+    )
+    decide(product, "accepted", *folders_of(product))
+    assert "wait for" not in CliRunner().invoke(app, ["show", str(product.parent.parent)]).output
 
 
 @pytest.mark.slow

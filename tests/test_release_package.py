@@ -34,6 +34,7 @@ from cosfly.products.inspection import (
     write_inspection,
 )
 from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.review import Choice, add_decisions
 from cosfly.products.town import write_town_map
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
@@ -594,6 +595,24 @@ def test_no_accepted_flight_is_one_clear_error(inputs, tmp_path):
     with pytest.raises(NothingKept, match="release kept nothing") as caught:
         run(CFG, [replace(source_of(inputs), inspect=tmp_path / "inspect.json")], tmp_path / "r")
     assert "jerk 6" in str(caught.value)
+    assert caught.value.where == tmp_path
+    assert str(tmp_path / "report.html") in str(caught.value)
+
+
+def test_flights_left_for_review_are_told_with_the_way_out(inputs, tmp_path):
+    names = [folder.relative_to(inputs / "tree").as_posix() for folder in find_flights(inputs / "tree")]
+    (tmp_path / "inspect").mkdir()
+    product = tmp_path / "inspect/inspect.json"
+    write_inspection(product, make_inspection(inputs / "tree", dict.fromkeys(names, ("review", "z_fighting"))))
+    source = replace(source_of(inputs), inspect=product)
+    with pytest.raises(
+        NothingKept,
+        match=r"review: z_fighting 6.*--inspect \S+/inspect .*--accept FLIGHT --by NAME.*include_review=true",
+    ) as caught:
+        run(CFG, [source], tmp_path / "r")
+    assert caught.value.where == product.parent
+    add_decisions(product, [Choice(folder=name, verdict="accepted", reason="seen") for name in names], "Ann")
+    assert run(CFG, [source], tmp_path / "r").is_dir(), "the same command again"
 
 
 # --- verify -----------------------------------------------------------------------------------------------------------

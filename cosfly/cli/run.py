@@ -140,6 +140,7 @@ def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder."
     from rich.table import Table
 
     from cosfly.console import answer_console
+    from cosfly.products.review import how_to_decide
     from cosfly.runs import look
     from cosfly.store import dump_json
 
@@ -162,6 +163,11 @@ def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder."
         answer_console.print(f"  {setting.name} = {dump_json(setting.value)}", soft_wrap=True)
     for path in seen.to_look_at:
         answer_console.print(f"look at  {os.path.relpath(path)}", soft_wrap=True)
+    for folder, count in seen.waiting().items():
+        answer_console.print(
+            f"review   {count} flights wait for a person: {how_to_decide(Path(os.path.relpath(folder)))}",
+            soft_wrap=True,
+        )
     if seen.num_complete < len(seen.stages) and not seen.is_at_work:
         answer_console.print(f"continue  cosfly run {os.path.relpath(run)}", soft_wrap=True)
 

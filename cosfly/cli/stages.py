@@ -381,8 +381,13 @@ def inspect(
 @inspect_app.command("review")
 def inspect_review(
     folder: Annotated[Path, typer.Option("--inspect", help="Folder of the inspection, or its inspect.json.")],
-    accept: Annotated[list[str] | None, typer.Option(metavar="FLIGHT", help="Accept a flight; repeat it.")] = None,
-    reject: Annotated[list[str] | None, typer.Option(metavar="FLIGHT", help="Reject a flight; repeat it.")] = None,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FLIGHT", help="Accept a flight, or the flights in review of a trajectory; repeat it."),
+    ] = None,
+    reject: Annotated[
+        list[str] | None, typer.Option(metavar="FLIGHT", help="Reject a flight, or those of a trajectory; repeat it.")
+    ] = None,
     by: Annotated[str | None, typer.Option(help="Who decides.")] = None,
     reason: Annotated[str | None, typer.Option(help="Why.")] = None,
     decisions: Annotated[

@@ -14,7 +14,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
 from cosfly.journal import Journal
 from cosfly.products.inspection import FlightInspection, read_inspection
-from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions
+from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions, undecided
 from cosfly.reading.documents import read_model
 from cosfly.reading.files import read_text, sha256_file
 from cosfly.stage_folder import Failed, read_item, result_of
@@ -69,11 +69,11 @@ def summary(inspected: Path) -> str:
     queue = [flight.folder for flight in read_inspection(inspected).flights if flight.result == "review"]
     decisions = read_decisions(inspected)
     verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
-    undecided = [folder for folder in queue if folder not in decisions]
+    waiting = undecided(inspected)
     others = len(decisions.keys() - set(queue))
-    text = f"{len(queue)} flights in review: {verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(undecided)} open"
+    text = f"{len(queue)} flights in review: {verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
     text += f"; {others} others rejected" if others else ""
-    return text + (f" ({', '.join(undecided[:3])}{', ...' if len(undecided) > 3 else ''})" if undecided else "")
+    return text + (f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else "")
 
 
 def write_page(inspected: Path) -> Path:

@@ -6,6 +6,7 @@ in the tree. The folder is not called `inspect`: a file of that name would hide 
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from pathlib import Path
 
@@ -28,10 +29,13 @@ from cosfly.products.inspection import (
     write_inspection,
 )
 from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.provenance import recorded_digests
 from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Failed, Resume, StageFolder, result_of
+
+log = logging.getLogger(__name__)
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
@@ -88,7 +92,23 @@ def run(
     write_inspection(product, inspection)
     write_report(out / "report.html", inspection, views, cfg.page_mb)
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
+    _tell_review(inspection.funnel.flights, out)
     return product
+
+
+def _tell_review(flights: FlightFunnel, out: Path) -> None:
+    """Say which flights wait for a person: loudly where no other is left, so that a release would be empty."""
+    if flights.review:
+        level = logging.INFO if flights.accepted else logging.WARNING
+        reasons = ", ".join(f"{code} {count}" for code, count in flights.reasons.items())
+        log.log(
+            level,
+            "inspect: %d of %d flights wait for a person (%s): %s",
+            flights.review,
+            flights.inspected,
+            reasons,
+            how_to_decide(out),
+        )
 
 
 def _num_frames(folder: Path) -> int:

@@ -25,7 +25,7 @@ Verdict = Literal["accepted", "rejected"]
 
 
 class Choice(BaseModel):
-    """What somebody says of one flight, by its folder in the playback tree."""
+    """What somebody says of one flight by its folder in the playback tree, or of a whole trajectory by that above its flights."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -69,32 +69,62 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     return found
 
 
+def undecided(inspected: Path) -> list[str]:
+    """Name the flights, by folder, that wait for a person: those in review that nobody has decided.
+
+    Raises:
+        InputError: as `read_inspection` and `read_decisions`.
+    """
+    decisions = read_decisions(inspected)
+    flights = read_inspection(inspected).flights
+    return [flight.folder for flight in flights if flight.result == "review" and flight.folder not in decisions]
+
+
+def how_to_decide(folder: Path) -> str:
+    """Say how a person decides the flights that an inspection, in `folder`, left in review."""
+    return f"cosfly inspect review --inspect {folder} makes a page to look at them; with --accept FLIGHT --by NAME --reason TEXT it accepts one"
+
+
 def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[Decision]:
     """Put choices on record; all of them, or none.
+
+    A trajectory's folder stands for its flights in review; rejected with it are those that were accepted.
 
     Raises:
         InputError: one names no flight of the inspection, or accepts what a rule rejected.
     """
     read_decisions(inspected)  # what stands there must be of this inspection
     digest, at = sha256_file(inspected), datetime.now(UTC).isoformat(timespec="seconds")
-    flights = {flight.folder: flight for flight in read_inspection(inspected).flights}
+    flights = read_inspection(inspected).flights
     decisions = []
     for choice in choices:
-        flight = flights.get(choice.folder)
-        if flight is None:
-            known = ", ".join([folder for folder, one in flights.items() if one.result == "review"][:3])
-            raise InputError("no such flight", where=inspected, got=choice.folder, expected=f"the folder of a flight, as {known}")  # fmt: skip
-        if flight.result == "rejected" and choice.verdict == "accepted":
-            raise InputError(
-                "a flight that breaks a rule cannot be accepted", where=choice.folder, got=flight.reason or "rejected",
-                expected="a flight in review", fix="mend the flight, or change the threshold and inspect again",
-            )  # fmt: skip
-        about = {"inspection": digest, "sha256": flight.sha256, "by": by, "at": at}
-        decisions.append(Decision(**choice.model_dump(), **about))
+        for flight in _chosen(choice, flights, inspected):
+            if flight.result == "rejected" and choice.verdict == "accepted":
+                raise InputError(
+                    "a flight that breaks a rule cannot be accepted", where=flight.folder, got=flight.reason or "rejected",
+                    expected="a flight in review", fix="mend the flight, or change the threshold and inspect again",
+                )  # fmt: skip
+            about = {"inspection": digest, "sha256": flight.sha256, "by": by, "at": at}
+            decisions.append(Decision(**choice.model_dump() | {"folder": flight.folder}, **about))
     with Journal(inspected.with_name(REVIEW)) as journal:
         for decision in decisions:
             journal.append(decision.model_dump())
     return decisions
+
+
+def _chosen(choice: Choice, flights: list[FlightInspection], inspected: Path) -> list[FlightInspection]:
+    """Give the flights that a choice means; those of a trajectory that need nobody stay as they are."""
+    name = choice.folder.strip("/")
+    named = [flight for flight in flights if flight.folder == name]
+    below = [flight for flight in flights if flight.folder.rpartition("/")[0] == name]
+    meant = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
+    found = named or [flight for flight in below if flight.result in meant] or below
+    if not found:
+        known = ", ".join([flight.folder for flight in flights if flight.result == "review"][:3])
+        raise InputError(
+            "no such flight", where=inspected, got=choice.folder, expected=f"the folder of a flight or of its trajectory, as {known}"
+        )  # fmt: skip
+    return found
 
 
 def read_settled(inspected: Path) -> Inspection:

@@ -8,15 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosfly.errors import InputError
+from cosfly.errors import InputError, NothingKept
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.products.places import FlightChoice
+from cosfly.products.review import how_to_decide
 from cosfly.stage_folder import StageFolder, Tally
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig
 from release.package.shards import FlightPart
-from release.package.sources import Material, Source, choose_licence, gather, maps_of
+from release.package.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
 from release.package.survey import Placing, Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
 from release.package.wrong import Findings
 from release.record import ReleasedMap
@@ -127,8 +128,7 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
     captions, account = _index(sources, material, flights, findings)
     findings.check()
     if not flights:
-        tally = Tally(input=len(material.candidates), dropped=left_out)
-        raise stage.nothing_kept(tally, expected="an inspected flight that passed: see report.html of the inspection")
+        raise _no_flight(sources, material, left_out, stage)
     sized = [
         (
             flight,
@@ -151,6 +151,24 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
         maps=maps,
         licence=choose_licence(cfg.licence, [(shown.town, shown.licence) for shown in maps]),
     )
+
+
+def _no_flight(sources: list[Source], material: Material, left_out: Counter[str], stage: StageFolder) -> NothingKept:
+    """Say that no flight is left, and what to do: most often a person has to decide."""
+    tally = Tally(input=len(material.candidates), dropped=left_out)
+    waiting = [one.source for one in material.candidates if (one.left_out or "").startswith(IN_REVIEW)]
+    inspected = next((sources[number].inspect for number in waiting), None) or next(
+        (s.inspect for s in sources if s.inspect), None
+    )
+    if inspected is None:
+        return stage.nothing_kept(
+            tally, expected="a flight", fix="choose others with release.tracks, release.pairs or release.flights"
+        )
+    folder = inspected.parent
+    fix = f"mend what {folder / 'report.html'} names and inspect again, or choose others with release.tracks, release.pairs or release.flights"
+    if waiting:
+        fix = f"{how_to_decide(folder)}; then the same command again. Or, with another --out, take them undecided: --set release.include_review=true"
+    return stage.nothing_kept(tally, expected="an inspected flight that passed", where=folder, fix=fix)
 
 
 def _index(

@@ -20,6 +20,7 @@ from cosfly.reading.files import check_stays_below, read_text
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
+IN_REVIEW = "review: "  # how it begins, why a flight is left out that waits for a person
 NOT_CHOSEN = "not chosen"  # why a flight is left out that `release.flights` does not name
 
 
@@ -98,7 +99,7 @@ def input_names(sources: list[Source]) -> list[dict[str, str]]:
 class Candidate:
     """A flight that a source has: where it stands and what it is called.
 
-    left_out: why the inspection leaves it out, None where it does not. sha256: of its files as they were inspected; None where no
+    left_out: why the inspection leaves it out, `result: reason`, None where it does not. sha256: of its files as they were inspected; None where no
     inspection says, or it saw the tree in its older form. five_ray_mean: as it was inspected.
     """
 
