@@ -22,6 +22,10 @@ LEAST_SHIFTED = 12  # points of a thing
 SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
+# Kinds of surfaces that people and cars stand on, and water. Maps lay them on each other in one plane (two roads at their crossing), where a
+# renderer's rounding decides pixel by pixel whose id shows: of these the kind alone tells what is seen.
+FLAT = np.zeros(256, np.bool_)
+FLAT[[1, 2, 10, 23, 24, 25, 27]] = True
 # Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
 TOLERANCE_SHARE, TOLERANCE_M = 0.02, 0.1
 
@@ -42,7 +46,7 @@ class View:
 @dataclass(frozen=True)
 class Agreement:
     """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there (agree), lie behind
-    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance. error: median of those on
+    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. error: median of those on
     planes, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
     the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
     shifted: points of one thing that is farther or nearer there, as most of it is; 0 where there is none.
@@ -89,7 +93,7 @@ def compare_views(
     turn = other.rotation.T @ one.rotation
     shift = other.rotation.T @ (one.position_m - other.position_m)
     counts, errors, brightness, firm, moved = _carry(
-        one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING
+        one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING, FLAT
     )
     pairs: np.ndarray = np.empty((0, 2))
     tint = shade = np.nan
@@ -205,7 +209,7 @@ def _num_far(depth):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving):  # type: ignore[no-untyped-def]
+def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore[no-untyped-def]
     """Counts (5,), errors (k,), matches (k, 4): column, row of the grid, column and row in the other picture; of points among nothing but
     their own thing its id, of those with its depth and of the others."""
     height, width = depth_a.shape
@@ -249,7 +253,7 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
                             and inst_b[y1, x1, 1] == inst_a[v, u, 1]
                             and inst_b[y1, x1, 2] == inst_a[v, u, 2]
                         )
-                        is_same |= is_own
+                        is_same |= is_own or (flat[inst_a[v, u, 0]] and inst_b[y1, x1, 0] == inst_a[v, u, 0])
                         is_whole &= is_own
             if not is_free:
                 continue
