@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
+from cosfly.journal import Journal
 from cosfly.reading.documents import read_json, read_model, read_object
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
@@ -192,6 +193,12 @@ def _record_of(path: Path) -> StageRecord | None:
     return read_stage_record(folder) if folder is not None and _has_record(folder, *RECORDS[1]) else None
 
 
+def _kept_nothing(folder: Path) -> str | None:
+    """Say what became of the items of a stage that came to its end and dropped all of them; None of another one."""
+    items = {str(record.get("id")): str(record.get("status")) for record in Journal(folder / "items.jsonl").read()}
+    return f"{len(items)} items, all dropped" if items and set(items.values()) == {"dropped"} else None
+
+
 def _check_finished(path: Path) -> None:
     """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
     folder = _stage_folder(path)
@@ -199,6 +206,12 @@ def _check_finished(path: Path) -> None:
         return
     for name, schema in RECORDS:
         if not _has_record(folder, name, schema):
+            if path.is_file() and (dropped := _kept_nothing(folder)):
+                raise VerifyError(
+                    "the stage that made this kept nothing, so there is nothing to go on with", where=path, got=dropped,
+                    expected="at least one item that was kept",
+                    fix=f"see in {folder} why, mend that or change the stage's settings, and choose another --out",
+                )  # fmt: skip
             raise VerifyError(
                 "the stage that makes this is not finished, or its records are gone", where=path,
                 got=f"no {name} in {folder}", expected=f"{name} of that stage",

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from cosfly.errors import InputError, NothingKept
 from cosfly.geometry import box_iou, mask_box
 from cosfly.inspection import frames
+from cosfly.inspection.files import check_recorded
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
 from cosfly.inspection.frames import choose_frames, pedestrian_region
 from cosfly.inspection.jumps import Jumps
@@ -125,6 +126,35 @@ def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     found = inspect(workplace)
     assert codes_of(found, lost)["missing_file"] == "error"
     assert codes_of(found, never) == {"not_in_this_tree": "note"}
+
+
+def test_what_nothing_lists_is_not_asked_for(workplace):
+    """A flight of cosfly's whose own files somebody took away, as one of somebody else has none: annotations, checksums, fields of ours."""
+    tree = workplace / "tree"
+    for path in [*tree.rglob("meta.json"), *tree.rglob(CHECKSUMS)]:
+        path.unlink()
+    for folder in find_flights(tree):
+        edit(folder, lambda t: [t.pop(name, None) for name in ("source", "coordinates", "augmentation")])
+    found = read_inspection(run(CFG, None, None, tree, workplace / "out"))
+    for flight in found.flights:
+        assert (flight.result, {issue.severity for issue in flight.issues}) == ("accepted", {"note"}), flight.issues
+    assert codes_of(found, first_flight(workplace)) == {"no_checksums": "note", "not_in_this_tree": "note"}
+    (first_flight(workplace) / frame_name(3) / "rgb.png").unlink()
+    again = read_inspection(run(CFG, None, None, tree, workplace / "again"))
+    assert codes_of(again, first_flight(workplace))["missing_file"] == "error"
+
+
+def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
+    flight = first_flight(workplace)
+    report = Report()
+    tree = workplace / "tree"
+    names = [f"{flight.relative_to(tree).as_posix()}/{name}" for name in ("trajectory.json", CHECKSUMS)]
+    recorded = {name: sha256_file(tree / name) for name in names}
+    check_recorded(read_flight(flight), tree, recorded, report)
+    assert report.issues == []
+    (flight / CHECKSUMS).unlink()
+    check_recorded(read_flight(flight), tree, recorded, report)
+    assert [(issue.code, issue.where) for issue in report.issues] == [("missing_file", CHECKSUMS)]
 
 
 def test_smoothness_numbers_are_those_of_a_circle():

@@ -9,10 +9,10 @@ import pytest
 
 from cosfly import provenance
 from cosfly.config import Config
-from cosfly.errors import InputError, VerifyError
+from cosfly.errors import InputError, NothingKept, VerifyError
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.stage_folder import StageFolder, Tally
+from cosfly.stage_folder import Dropped, StageFolder, Tally
 from cosfly.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
 
 
@@ -155,6 +155,21 @@ def test_a_stage_without_its_records_is_not_finished(run, name):
     alone.parent.mkdir()
     shutil.copy(run / "caption/captions.jsonl", alone)
     provenance.checked_inputs(inputs_of(run) | {"captions": alone})
+
+
+def test_a_stage_that_kept_nothing_is_told_from_one_that_is_not_finished(tmp_path):
+    stage = begin(tmp_path / "inspect", "inspect")
+    product = tmp_path / "inspect/inspect.json"
+    with stage.journal as journal:
+        for number in range(2):
+            journal.append(Dropped(id=f"flight{number}", reason="missing_file").model_dump())
+    with pytest.raises(VerifyError, match="not finished, or its records are gone"):  # it may go on
+        provenance.checked_inputs({"inspect": tmp_path / "inspect"})
+    write_json(product, {})
+    with pytest.raises(NothingKept):
+        stage.finish([product], Tally(input=2, dropped={"missing_file": 2}))
+    with pytest.raises(VerifyError, match=r"kept nothing.*got 2 items, all dropped.*another --out"):
+        provenance.checked_inputs({"inspect": product})
 
 
 def test_a_forged_record_of_a_conversion_of_nothing(run):

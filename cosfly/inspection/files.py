@@ -21,8 +21,8 @@ from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
 def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
 
-    A tree of somebody else may lack a kind of file altogether: `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone. One of cosfly's
-    lacks what was not drawn (`render.modalities`): its checksums list no such file.
+    A flight may lack a kind of file altogether that its checksums do not list, as one of somebody else does: `meta.json` is cosfly's own, and
+    public readers ask for `rgb.png` alone. One of cosfly's lacks what was not drawn (`render.modalities`).
 
     Returns:
         of each frame that is complete so far its annotation, None in a tree without.
@@ -31,7 +31,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     size = (flight.camera.width_px, flight.camera.height_px)
     complete: dict[int, FrameMeta | None] = {}
     absent = [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
-    absent = [] if absent and flight.is_ours and _lists(flight, absent) else absent
+    absent = [] if absent and _lists(flight, absent) else absent
     names = [name for name in FRAME_FILES if name not in absent]
     for name in absent:
         report.add(
@@ -59,6 +59,8 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
 def _lists(flight: Flight, names: Collection[str]) -> bool:
     """Tell whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
     assert flight.folder is not None
+    if not (flight.folder / CHECKSUMS).is_file():
+        return False
     try:
         return any(listed.rpartition("/")[2] in names for listed in read_checksums(flight.folder))
     except InputError:
@@ -146,5 +148,7 @@ def check_recorded(flight: Flight, root: Path, recorded: Mapping[str, str], repo
             report.error(
                 "not_of_this_tree", name, "no such entry in the tree's manifest", "a flight that was made with it"
             )
-        elif digest is not None and path.is_file() and sha256_file(path) != digest:
+        elif digest is not None and not path.is_file():
+            report.error("missing_file", name, "no such file", "a file, listed in the tree's manifest")
+        elif digest is not None and sha256_file(path) != digest:
             report.error("checksum", name, "other bytes", "the digest in the tree's manifest")
