@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import textwrap
 from collections import Counter
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from caption.own_files import own_files
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig, LabelConfig
 from caption.truth.actions import Motion, is_contradicted, label_of, measure, table_of
+from caption.truth.reach import never_labels
 from caption.truth.released import read_released
 from cosfly import in_place, pipeline
 from cosfly.cli import app
@@ -34,6 +36,7 @@ from cosfly.products.actions import (
     kin_of,
     one_set,
     read_actions,
+    shipped_actions,
 )
 from cosfly.products.captions import answer_schema, normalize_action, read_captions
 from cosfly.reading.documents import read_json
@@ -186,6 +189,48 @@ def test_a_value_that_nobody_knows_fulfils_no_condition(tmp_path):
         blind = measure(future(forward=4.0, target=(np.nan, np.nan)))
         assert np.isnan(blind.sweep_deg)
         assert dict(table_of(LabelConfig()).implied[3])[OWN](blind) == pytest.approx(4.0 / 2.5 / 0.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_action_that_ships_can_be_the_label(seed):
+    assert never_labels(shipped_actions(), LabelConfig(), np.random.default_rng(seed)) == []
+
+
+def test_the_example_of_the_page_is_a_label_and_behind_what_it_shares_its_motion_with_it_is_none(tmp_path):
+    page = (Path(__file__).parent.parent / "docs/captions.md").read_text(encoding="utf-8")
+    example = textwrap.dedent(page[page.index("    actions:\n      ...\n") : page.index("| word | meaning |")])
+    entry, _, lines = example.strip().removeprefix("actions:\n  ...\n").partition("precedence:\n  - ...\n")
+    own, straight = lines.splitlines()
+    text = ACTIONS_FILE.read_text(encoding="utf-8")
+    text = text.replace("\n# The first line in which", f"\n{entry}\n# The first line in which")
+    for name, order in (("pasted.yaml", (own, straight)), ("last.yaml", (straight, own))):
+        (tmp_path / name).write_text(text.replace(straight, "\n".join(order)), encoding="utf-8")
+    told = {
+        name: CliRunner().invoke(app, ["caption", "actions", "--check", str(tmp_path / name)])
+        for name in ("pasted.yaml", "last.yaml")
+    }
+    assert [result.exit_code for result in told.values()] == [0, 0]
+    assert told["pasted.yaml"].output.endswith("18 actions, nothing wrong\n")
+    assert "warning" not in told["pasted.yaml"].output
+    assert re.search(rf"warning: {OWN}: \d+ of 3,000 .* label of 0, since .*track_straight", told["last.yaml"].output)
+
+
+def test_an_action_that_nothing_implies_is_named(tmp_path):
+    path = with_own(
+        tmp_path / "mine.yaml",
+        ENTRY.replace("implied: {size: [mean_speed_mps / 0.5]", "implied: {size: [mean_speed_mps / 900]"),
+    )
+    (told,) = never_labels(read_actions(path), LabelConfig(), np.random.default_rng(0))
+    assert told.startswith(f"{OWN}: none of 3,000 made-up motions implies it")
+
+
+def test_a_run_tells_of_an_action_that_was_never_the_label(whole, mine, tmp_path, caplog):
+    path = with_own(tmp_path / "fast.yaml", ENTRY.replace("mean_speed_mps / 0.5", "mean_speed_mps / 900"))
+    caption_run(CaptionConfig(actions=path), whole / "render", tmp_path / "fast")
+    assert f"{OWN}, an action of yours, was the label of no window" in caplog.text
+    caplog.clear()
+    caption_run(CaptionConfig(actions=mine), whole / "render", tmp_path / "slow")
+    assert "an action of yours" not in caplog.text
 
 
 # --- the whole way ----------------------------------------------------------------------------------------------------

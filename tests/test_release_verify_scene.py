@@ -12,7 +12,6 @@ from release.verify import scene
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
-
 WHOLE = Agreement(
     seen=2000, agree=2000, hidden=0, through=0, same=2000, shifted=0, error=0.0, correlation=0.97, tint=0.0, shade=0.0
 )  # fmt: skip

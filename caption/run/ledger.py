@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from caption.run.chance import ChanceCounts, ChanceReport
 from cosfly.chat.contract import Usage
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import action_tokens, actions_in_use, shipped_actions
 from cosfly.products.captions import Caption, TeacherRecord
 from cosfly.stage_folder import Tally
 from cosfly.store import sha256_bytes
@@ -93,7 +93,13 @@ class CaptionReport(_Record):
             f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them again"
             for reason, words in self.refusals.items()
         ]
-        return refused + (self.chance.warnings if self.chance else [])
+        own = set(actions_in_use().tokens) - set(shipped_actions().tokens)
+        never = [
+            f"{token}, an action of yours, was the label of no window; `cosfly caption actions --check FILE` may tell why"
+            for token in sorted(own)
+            if self.labels and token not in self.labels
+        ]
+        return refused + never + (self.chance.warnings if self.chance else [])
 
     def as_json(self) -> dict:
         left_out = {"judge_tokens"} if self.judge_tokens is None else set()

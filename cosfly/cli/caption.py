@@ -156,12 +156,19 @@ def caption_actions(
     check: Annotated[Path | None, typer.Option(help="File with actions of yours: say what is wrong with it.")] = None,
 ) -> None:
     """Write the closed set of actions into a file, or check a file of yours; --set caption.actions=FILE captions with it."""
+    import numpy as np
+
+    from caption.schema import LabelConfig
+    from caption.truth.reach import never_labels
     from cosfly.products.actions import export_actions, read_actions
 
     if (export is None) == (check is None):
         raise typer.BadParameter("give --export FILE or --check FILE")
     if check is not None:
-        typer.echo(f"{check}: {len(read_actions(check).tokens)} actions, nothing wrong")
+        actions = read_actions(check)
+        found = never_labels(actions, LabelConfig(), np.random.default_rng(0))
+        typer.echo("".join(f"warning: {line}\n" for line in found), nl=False)
+        typer.echo(f"{check}: {len(actions.tokens)} actions, nothing wrong{' but this' if found else ''}")
     elif export is not None:
         export_actions(export)
         typer.echo(export)
