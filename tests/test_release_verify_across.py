@@ -32,7 +32,7 @@ def stored(folder, flights: list[np.ndarray]) -> tuple[RowFiles, list[Summary]]:
 
 def table(num_rows: int, rng: np.random.Generator, most: int) -> np.ndarray:
     found = np.zeros(num_rows, COMPARED)
-    for name in ("sample_id", "image", "depth"):
+    for name in ("sample_id", "image", "depth", "place"):
         found[name] = rng.integers(0, most, num_rows)
     found["cell"] = rng.integers(-2, 3, (num_rows, 3))
     found["cell"][rng.random(num_rows) < 0.3] = NO_SECOND
@@ -89,6 +89,31 @@ def test_the_same_way_in_two_splits_is_a_leak(tmp_path):
     other.split = "test"
     check_across([one, other], rows, by_town=False, both=False, findings=findings)
     assert {code for _, code in findings.kinds} == {"leak"}
+
+
+@pytest.mark.parametrize(
+    ("num_same", "split", "is_found"), [(20, "test", True), (20, "train", False), (13, "test", False)]
+)
+def test_the_same_way_at_another_time_is_a_leak_between_splits(tmp_path, num_same, split, is_found):
+    walk = np.zeros(20, COMPARED)
+    walk["cell"] = NO_SECOND
+    walk["place"] = np.arange(1, 21)
+    late = walk.copy()
+    late["place"][num_same:] += 100
+    rows, (one, other) = stored(tmp_path, [walk, late])
+    other.split = split
+    findings = Findings()
+    check_across([one, other], rows, by_town=False, both=False, findings=findings)
+    assert {code for _, code in findings.kinds} == ({"leak"} if is_found else set())
+
+
+def test_who_stands_still_is_no_copy_of_who_stands_there_too(tmp_path):
+    stands = np.zeros(40, COMPARED)
+    stands["cell"], stands["place"] = NO_SECOND, np.repeat(np.arange(1, 9), 5)
+    rows, (one, other) = stored(tmp_path, [stands, stands.copy()])
+    other.split, findings = "test", Findings()
+    check_across([one, other], rows, by_town=False, both=False, findings=findings)
+    assert not findings.kinds, "eight places are too few"
 
 
 def told_of(flights: list[Summary], tmp_path) -> list[str]:

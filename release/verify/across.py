@@ -1,6 +1,6 @@
 """Relations between flights: one row a frame, splits that share no walk, pairs, pictures that stand in one place alone.
 
-Of each row 64 bytes are compared with those of all other rows. They wait in files (`RowFiles`), and as many of them as memory has room for
+Of each row 80 bytes are compared with those of all other rows. They wait in files (`RowFiles`), and as many of them as memory has room for
 are looked at in one pass: those whose key leaves the same rest. So memory is the same for a thousand rows and for a million.
 """
 
@@ -28,18 +28,20 @@ from release.verify.rows import FlightRows
 from release.verify.scene import Shown
 
 CELL_M = 0.35  # people in one cell are nearer than the 0.5 m within which flights are built into one walk
-LEAST_SECONDS, WALK_SHARE = (
-    8,
-    0.7,
-)  # of the seconds that two flights know, in one cell: they follow one walk; half is enough to build
+# Of the seconds that two flights know, in one cell: they follow one walk; half is enough to build. Of the places of one, the other's too.
+LEAST_SECONDS, LEAST_PLACES, WALK_SHARE = 8, 16, 0.7
+PLACE_M = 0.01  # two people on one pavement step on the same centimetre by chance, not again and again
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
 HUE_MOST = 6.0  # grey levels between twins; honest 0.2 at 1280x720
 SKY = ("weather", "time_of_day", "weather_params", "look")
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
 ROWS_AT_ONCE = 40_000
 NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
-# What is kept of a row. sample_id, image, depth: digests, 0 where there is none; cell: second, x, y of the clean person; pose: as POSE.
-COMPARED = np.dtype([("sample_id", "u8"), ("image", "u8"), ("depth", "u8"), ("cell", "i8", 3), ("pose", "f4", 6)])
+# What is kept of a row. sample_id, image, depth: digests, 0 where there is none; place, cell: of the clean person x, y and second, x, y;
+# pose: as POSE.
+COMPARED = np.dtype(
+    [("sample_id", "u8"), ("image", "u8"), ("depth", "u8"), ("place", "u8"), ("cell", "i8", 3), ("pose", "f4", 6)]
+)
 FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 
 
@@ -74,12 +76,16 @@ def summary_of(flight: FlightRows, shown: Shown, rows: RowFiles, rows_file: str)
     first = flight.rows[0]
     _, target, _ = clean_positions(flight)
     whole = np.abs(flight.time_s - np.round(flight.time_s)) < 1e-3
-    known = whole & ~np.isnan(target).any(axis=1)
+    is_seen = ~np.isnan(target).any(axis=1)
+    known = whole & is_seen
     pose = np.nan_to_num(flight.pose)
     found = np.zeros(len(flight), COMPARED)
     found["sample_id"] = [_digest(str(row.get("sample_id")).encode()) for row in flight.rows]
     found["cell"] = NO_SECOND
     found["cell"][known] = np.column_stack([np.round(flight.time_s[known]), np.floor(target[known, :2] / CELL_M)])
+    found["place"][is_seen] = [
+        _digest(place.tobytes()) for place in np.round(target[is_seen, :2] / PLACE_M).astype(np.int64)
+    ]
     found["pose"] = pose
     if shown.keys:
         found["image"][: len(shown.keys)], found["depth"][: len(shown.keys)] = np.array(shown.keys, np.uint64).T
@@ -184,14 +190,20 @@ def _check_splits(flights: list[Summary], rows: RowFiles, by_town: bool, finding
         if len(splits) > 1:
             findings.error("leak", f"{kind} {name}", f"in {', '.join(sorted(splits))}", "each walk in one split")
     known = [flight for flight in flights if flight.split is not None]
+    told: set[tuple[str, str]] = set()
     for one, other, share in same_walks(known, rows):
         if one.split != other.split:
             got = f"{one.split} and {other.split}: the person at the same place in {share:.0%} of the seconds"
             findings.error("leak", f"{one.name} and {other.name}", got, "one walk in one split")
+            told.add((one.name, other.name))
         elif one.walk != other.walk and None not in (one.walk, other.walk):
             findings.error(
                 "walk", f"{one.name} and {other.name}", f"{one.walk} and {other.walk}", "one name for one walk"
             )
+    for one, other, share in same_places(known, rows):
+        if one.split != other.split and (one.name, other.name) not in told:
+            got = f"{one.split} and {other.split}: {share:.0%} of the places of the person are the other's, at other times"
+            findings.error("leak", f"{one.name} and {other.name}", got, "one walk in one split")
 
 
 def same_walks(flights: list[Summary], rows: RowFiles) -> Iterator[tuple[Summary, Summary, float]]:
@@ -210,6 +222,24 @@ def same_walks(flights: list[Summary], rows: RowFiles) -> Iterator[tuple[Summary
         common = len(_seconds(rows, flights[a]) & _seconds(rows, flights[b]))
         if common >= LEAST_SECONDS and count >= WALK_SHARE * common:
             yield flights[a], flights[b], count / common
+
+
+def same_places(flights: list[Summary], rows: RowFiles) -> Iterator[tuple[Summary, Summary, float]]:
+    """Yield flights of one town family whose person is at the same places, whenever, and which share of the places of one of them that is."""
+    families = [town_family(flight.town) for flight in flights]
+    together: Counter[tuple[int, int]] = Counter()
+    for _, places in rows.groups(flights, "place"):
+        own = np.unique(places["flight"]).tolist()
+        pairs = itertools.combinations(own[:MOST_SHARED], 2)
+        together.update(pair for pair in pairs if families[pair[0]] == families[pair[1]])
+    for (a, b), count in sorted(together.items()):
+        least = (
+            min(len(np.unique(rows.read(flights[k].rows_file)["place"])) for k in (a, b))
+            if count >= LEAST_PLACES
+            else 0
+        )
+        if least and count >= WALK_SHARE * least:
+            yield flights[a], flights[b], count / least
 
 
 def _seconds(rows: RowFiles, flight: Summary) -> set[int]:
