@@ -16,7 +16,7 @@ from cosfly.render.draping import is_draped
 
 SAME_HEIGHT_M = 0.005  # a layer moves the depth test by 3 mm at 30 m
 EDGE_M = 0.01  # surfaces that share no more than an edge do not fight
-MOST_TIERS = 4  # in a layer: a depth buffer of float32 tells a quarter of one from the next at 100 m
+MOST_TIERS = 8  # in a layer, as many as meet at a junction of SimWorld; float32 depth tells an eighth of one from the next at 50 m
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
