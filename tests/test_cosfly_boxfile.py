@@ -141,6 +141,7 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
         (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
         (PLAIN.replace("12,8,8,30", "1200,800,800,30"), {}, r"are these centimetres\?"),
         (PLAIN.replace("12,8,8,30", "12,8,800,30"), {}, r"too high: are these centimetres\?.*usually 800 m.*divide the heights alone"),
+        ("x,y,length,type\n1,2,3,Buildngs\n1,zz,3,Buildings\n", {}, r"no column for width .*; line 2: unknown type 'Buildngs'.*; line 3: y is not .*3 to mend"),
         (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]}, r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
         (PLAIN.replace(",", ";"), {}, r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
         (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),

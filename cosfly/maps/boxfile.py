@@ -148,7 +148,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         try:
             _add(boxes, row, cfg)
         except _Wrong as wrong:
-            problems.append(f"{row.where}: {wrong}")
+            problems.append(f"{row.where}: {wrong}" if row.where else str(wrong))
         ids.append(row.values.get("id"))
     if problems:
         raise InputError.of_all(problems, where=path, expected=_hint(problems))
@@ -219,15 +219,18 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 for f in ("length", "width"):  # a box needs both; a height some kinds do without
                     if not {f, f"half_{f}"} & set(fields):
                         problems.append(f"no column for {f} ({', '.join(NAMES[f] + NAMES[f'half_{f}'])})")
-                if problems:
-                    raise InputError.of_all(problems, where=path, expected=_hint(problems))
+                yield from (_Row("", {}, wrong=problem) for problem in problems)
+                lost = {} if "type" in fields else {"type": "Static"}
                 continue
             if len(line) != len(names):
                 wrong = f"{len(line)} cells, where the first line has {len(names)}"
                 yield _Row(f"line {lines.line_num}", {}, wrong=wrong)
                 continue
             cells = ((field, cell.strip()) for field, cell in zip(fields, line, strict=True) if field)
-            yield _Row(f"line {lines.line_num}", {field: cell for field, cell in cells if cell})
+            values = {field: cell for field, cell in cells if cell}
+            if problems and not (wrong := _wrong_in(lost | values, cfg)):
+                continue  # what a lost column leaves out is told once
+            yield _Row(f"line {lines.line_num}", values, wrong=wrong if problems else "")
     except csv.Error as error:
         raise InputError("not a table", where=f"{path}: line {lines.line_num}", got=str(error)) from None
 
@@ -324,6 +327,14 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
         raise _Wrong(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
     for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):
         boxes.add(kind, rectangle.center, rectangle.size, low_m, high_m, rectangle.yaw_deg)
+
+
+def _wrong_in(values: Mapping[str, Any], cfg: BoxesConfig) -> str:
+    try:
+        _read(values, cfg)
+    except _Wrong as error:
+        return str(error)
+    return ""
 
 
 def _read(values: Mapping[str, Any], cfg: BoxesConfig) -> tuple[str, dict[str, float]]:
