@@ -223,7 +223,7 @@ def test_of_more_walks_a_dry_run_counts_what_is_added(base):
 
 
 def test_a_run_that_is_refused_before_anything_is_done_leaves_nothing(tmp_path):
-    (tmp_path / "town.csv").write_text("type,x,y\nBuildings,1,1\n")
+    (tmp_path / "town.csv").write_text("type,x,y,length,width\nBuildings,1,1,4,4\n")
     cfg = tiny(**{"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"})
     with pytest.raises(InputError, match="neither height nor half_height"):
         pipeline.run(cfg, tmp_path / "runs/mine")
