@@ -11,6 +11,7 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -80,10 +81,12 @@ class _Track:
     seconds: np.ndarray
     places_m: np.ndarray
 
-    @property
-    def key(self) -> tuple[str, bytes, bytes]:
+    @cached_property
+    def key(self) -> tuple[str, bytes]:
         """What is the same for two flights of one walk and length, but for noise."""
-        return self.family, self.seconds.tobytes(), np.round(self.places_m / SAME_M).tobytes()
+        digest = hashlib.sha256(self.seconds.tobytes())
+        digest.update(np.round(self.places_m / SAME_M).tobytes())
+        return self.family, digest.digest()
 
 
 def walks_of(courses: Iterable[Course]) -> dict[str, str]:
@@ -95,7 +98,7 @@ def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     """
     tracks = sorted((_track(course) for course in courses), key=lambda track: (track.name, track.key))
     groups = _Groups(track.name for track in tracks)
-    once: dict[tuple[str, bytes, bytes], _Track] = {}
+    once: dict[tuple[str, bytes], _Track] = {}
     for track in tracks:
         if len(track.seconds):
             groups.unite(track.name, once.setdefault(track.key, track).name)

@@ -34,7 +34,9 @@ from cosfly.store import atomic_file, write_bytes, write_model
 RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
 PAGE = "README.md"
 OLDER = "{split}.jsonl"  # what a split was before 3.0
-ROWS_AT_ONCE = 200  # rows of a row group: what one look at a sample, in an order drawn by lot, decodes
+# Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and the writer hold
+# all, grows by the groups.
+ROWS_AT_ONCE = 1000
 PREPARE = "run cosfly distill prepare"
 
 

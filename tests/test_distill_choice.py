@@ -21,7 +21,7 @@ def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tu
     ranks = Ranks(seed)
     for i, (decision, name) in enumerate(windows):
         ranks.add(f"group_{i % 3}", decision, name)
-    cut = ranks.cut(ranks.found, ratio)
+    cut = ranks.cut(ranks.flights, ratio)
     return [(decision, name) for decision, name in windows if cut.keeps(decision, name)]
 
 

@@ -24,10 +24,6 @@ def _rank(sample_id: str, seed: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
 
 
-def _numbers(ranks: array[int]) -> np.ndarray:
-    return np.frombuffer(ranks, dtype=np.uint64)
-
-
 @dataclass(frozen=True)
 class Cut:
     """Which windows of the training split stay."""
@@ -43,15 +39,30 @@ class Cut:
 
 
 class Ranks:
-    """The 64-bit ranks of the windows by flight and decision, which is all that is held of them."""
+    """The 64-bit ranks of the windows by flight and decision, which is all that is held of them.
+
+    Twelve bytes a window in two long arrays, not a short one for each flight and decision: the system takes long ones back whole.
+    """
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.found: dict[str, dict[str, array[int]]] = {}
+        self._kinds: dict[tuple[str, str], int] = {}  # flight and decision -> their number
+        self._kind_of, self._ranks = array("I"), array("Q")  # of each window
+
+    @property
+    def flights(self) -> list[str]:
+        return list(dict.fromkeys(flight for flight, _ in self._kinds))
 
     def add(self, flight: str, decision: str, sample_id: str) -> None:
-        ranks = self.found.setdefault(flight, {}).setdefault(decision, array("Q"))
-        ranks.append(_rank(sample_id, self.seed))
+        self._kind_of.append(self._kinds.setdefault((flight, decision), len(self._kinds)))
+        self._ranks.append(_rank(sample_id, self.seed))
+
+    def by_kind(self) -> dict[tuple[str, str], np.ndarray]:
+        """Give the ranks of each flight and decision, in order; needs a window."""
+        kind_of, ranks = np.frombuffer(self._kind_of, np.uint32), np.frombuffer(self._ranks, np.uint64)
+        order = np.lexsort((ranks, kind_of))
+        parts = np.split(ranks[order], np.cumsum(np.bincount(kind_of))[:-1])
+        return dict(zip(self._kinds, parts, strict=True))
 
     def cut(self, flights: Iterable[str], ratio: float) -> Cut:
         """Find the cut that leaves of each decision at most `ratio` times an equal share, and one window at least.
@@ -63,16 +74,17 @@ class Ranks:
             flights: those of the training split, one at least.
             ratio: > 0.
         """
-        ranks: dict[str, array[int]] = defaultdict(lambda: array("Q"))
-        for flight in flights:
-            for decision, found in self.found[flight].items():
-                ranks[decision].extend(found)
-        windows = {decision: len(found) for decision, found in sorted(ranks.items())}
+        wanted = set(flights)
+        ranks: dict[str, list[np.ndarray]] = defaultdict(list)
+        for (flight, decision), found in self.by_kind().items():
+            if flight in wanted:
+                ranks[decision].append(found)
+        windows = {decision: sum(map(len, found)) for decision, found in sorted(ranks.items())}
         most = max(1, math.floor(ratio * sum(windows.values()) / len(windows)))
         last_rank = {
-            decision: int(np.partition(_numbers(found), most - 1)[most - 1])
+            decision: int(np.partition(np.concatenate(found), most - 1)[most - 1])
             for decision, found in ranks.items()
-            if len(found) > most
+            if windows[decision] > most
         }
         return Cut(self.seed, ratio, most, windows, last_rank)
 
@@ -101,11 +113,10 @@ def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> 
         cuts: flight -> what has been cut of it already.
     """
     left: dict[str, dict[str, np.ndarray]] = defaultdict(dict)  # decision -> flight -> ranks, in order
-    for flight, found in sorted(ranks.found.items()):
-        for decision, all_ranks in found.items():
-            cut, own = cuts[flight], np.sort(_numbers(all_ranks))
-            last = None if cut is None else cut.last_rank.get(decision)
-            left[decision][flight] = own if last is None else own[own <= np.uint64(last)]
+    for (flight, decision), own in ranks.by_kind().items():
+        cut = cuts[flight]
+        last = None if cut is None else cut.last_rank.get(decision)
+        left[decision][flight] = own if last is None else own[: np.searchsorted(own, np.uint64(last), side="right")]
     counts = {decision: sum(map(len, flights.values())) for decision, flights in left.items()}
     total = sum(counts.values())
     if num_windows >= total:

@@ -169,8 +169,9 @@ class Flights:
         return CaptionedFlight(source, town, trajectory, variant, flight_id, size_px, num_frames)
 
     def walks(self) -> dict[str, str]:
-        """Tell the walks of the flights that were read, by their keys."""
-        return walks_of(self._courses)
+        """Tell the walks of the flights that were read since this was last asked, by their keys; what tells them is let go."""
+        courses, self._courses = self._courses, []
+        return walks_of(courses)
 
 
 def _ids_of(sources: Sequence[Source]) -> dict[Place, str]:

@@ -141,10 +141,11 @@ def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int
     windows = _Windows(cfg, sources)
     # Two passes: the splits, and what is too much, must be known before the first sample is written.
     ranks, excluded = _survey(windows, seed)
-    if not ranks.found:
+    if not ranks.flights:
         tally = Tally(input=excluded.total(), dropped=excluded)
         raise stage.nothing_kept(tally, expected="accepted captions whose images stand below --data")
     chosen = _choose(cfg, windows, ranks, seed)
+    del ranks  # of a million windows they take as much as the writing
     with write_training_set(out) as writer:
         facts, left_out = _write(windows, chosen, writer)
     writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
@@ -178,7 +179,7 @@ def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _
     windows.walks = windows.flights.walks()
     chosen = _Chosen(cfg, windows.walks, {}, None, None)
     group_of = {}
-    for flight in ranks.found:
+    for flight in ranks.flights:
         key = flight.rpartition("/")[0]
         group_of[flight] = chosen.group(key.split("/")[1], key)
     split_of = assign_splits(
