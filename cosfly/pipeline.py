@@ -153,16 +153,33 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     return towns
 
 
-def check_files(cfg: RunConfig) -> None:
-    """Check that the files of all maps are there.
+def check_with_files(cfg: RunConfig) -> None:
+    """Check what the last stage would ask for, and that the files of all maps are there.
 
     Raises:
-        InputError: one is missing, or none is named.
+        CosflyError: of several the text names each.
     """
+    problems = list[CosflyError]()
+    try:
+        check(cfg)
+    except CosflyError as error:
+        problems.append(error)
     for one in [cfg.of_town(name) for name in cfg.towns] or [cfg]:
-        for name, path in getattr(one.maps, one.maps.source).inputs().items():
-            if not path.exists():
-                raise InputError("there is no such file", where=f"maps.{one.maps.source}: {name}", got=str(path))
+        where = f"maps.{one.maps.source}"
+        try:
+            files = getattr(one.maps, one.maps.source).inputs()
+        except CosflyError as error:
+            problems.append(error)
+            continue
+        problems += [
+            InputError("there is no such file", where=f"{where}: {name}", got=str(path))
+            for name, path in files.items()
+            if not path.exists()
+        ]
+    if len(problems) > 1:
+        raise ConfigError.of_all([str(problem) for problem in problems], where=cfg.name)
+    if problems:
+        raise problems[0]
 
 
 class _TimeLeft:

@@ -85,10 +85,19 @@ class RunConfig(Config):
 
     @model_validator(mode="after")
     def _towns_can_be(self) -> RunConfig:
+        problems = list[ConfigError]()
         for name in self.towns:
-            if not TOWN_NAME.fullmatch(name) or name == "release":
-                raise ValueError(f"a town cannot be called {name!r}: letters, digits, _ and -, and not 'release'")
-            self.of_town(name)
+            try:
+                if not TOWN_NAME.fullmatch(name) or name == "release":
+                    expected = "letters, digits, _ and -, and not 'release'"
+                    raise ConfigError(f"a town cannot be called {name!r}", where="towns", expected=expected)
+                self.of_town(name)
+            except ConfigError as error:
+                problems.append(error)
+        if len(problems) > 1:
+            raise ConfigError.of_all([str(problem) for problem in problems], where="towns")
+        if problems:
+            raise problems[0]
         return self
 
     def of_town(self, name: str) -> RunConfig:

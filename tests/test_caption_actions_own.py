@@ -147,6 +147,28 @@ def test_what_is_wrong_with_a_file_is_told(tmp_path, old, new, told):
         read_actions(path)
 
 
+def test_all_that_is_wrong_with_a_file_is_told_at_once(tmp_path):
+    path = with_own(tmp_path / "mine.yaml")
+    text = path.read_text(encoding="utf-8")
+    mistakes = (  # two in one condition, one in the next, one in a list beside it, and one across the whole file
+        ("|yaw_deg| < label.hard_turn_deg", "|yow_deg| < label.hard"),
+        ("forward_m > -label.forward_m", "forward_m = 1"),
+        ("[mean_speed_mps / 0.5]", "[mean_speed_mps, meen_speed / 1]"),
+        ("  - [cruise_along]", "  - [cruise]"),
+    )
+    for old, new in mistakes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        read_actions(path)
+    for words in (
+        "'yow_deg' is not measured", "no threshold 'label.hard'", "compares nothing", "has no threshold", "'meen_speed'", "precedence names 'cruise'",
+        "cruise_along is implied by something",
+    ):  # fmt: skip
+        assert words in str(caught.value), words
+
+
 def test_a_set_that_lacks_what_the_rule_teacher_decides_is_refused(tmp_path):
     text = ACTIONS_FILE.read_text(encoding="utf-8")
     hover = text[text.index("  hover:\n") : text.index("  break_off:\n")]

@@ -48,8 +48,7 @@ def run(
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
     if dry_run:
-        pipeline.check(cfg)
-        pipeline.check_files(cfg)
+        pipeline.check_with_files(cfg)
         return _tell_estimate(cfg, out)
     options.set_aside(out, repair)
     options.verify_first(
@@ -224,10 +223,10 @@ def config_check(
     config: Annotated[Path, typer.Argument(help="YAML file, or the name of one that ships.")],
     overrides: options.Overrides = None,
 ) -> None:
-    """Check a configuration without running it; reports all problems at once, and a map's file that is not there."""
+    """Check a configuration without running it; reports all problems at once, also a map's file that is not there and a licence that nobody names."""
     from cosfly import pipeline
 
-    pipeline.check_files(options.resolve(config, overrides))
+    pipeline.check_with_files(options.resolve(config, overrides))
     typer.echo(f"{config}: ok")
 
 

@@ -114,12 +114,15 @@ class PedestriansConfig(Config):
 
     @model_validator(mode="after")
     def _ranges_are_ordered(self) -> PedestriansConfig:
+        wrong = []
         if self.min_distance_m >= self.max_distance_m:
-            raise ValueError(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
+            wrong.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
         if self.min_speed_mps > self.max_speed_mps:
-            raise ValueError(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
+            wrong.append(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
         if 0 < self.max_detour < 1:
-            raise ValueError(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
+            wrong.append(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return self
 
 

@@ -215,10 +215,13 @@ class PlanConfig(Config):
 
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:
+        wrong = []
         if self.relaxed_safety_m > self.safety_distance_m:
-            raise ValueError("relaxed_safety_m may not exceed safety_distance_m")
+            wrong.append("relaxed_safety_m may not exceed safety_distance_m")
         if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
-            raise ValueError("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
+            wrong.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return self
 
 
