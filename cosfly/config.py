@@ -130,9 +130,7 @@ def _hidden(model: type[BaseModel], data: dict, details: Sequence[Any]) -> list[
     except ValidationError as error:
         known = {detail["loc"] for detail in details}
         across = [d for d in error.errors() if d["type"] == "value_error" and d["loc"] not in known | wrong]
-        return [
-            _problem(model, d) + (f" (without {unknown[d['loc']]})" if d["loc"] in unknown else "") for d in across
-        ]
+        return [_problem(model, d) + (f" (without {unknown[d['loc']]})" if d["loc"] in unknown else "") for d in across]
     except ConfigError as error:  # of a town
         return [f"{error.where}: {error.what}"]
     return []

@@ -17,7 +17,7 @@ from functools import partial
 from cosfly.console import progress_bar
 from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.items import Item, Outcome, Work, advance, attempt, counted_steps
-from cosfly.stage_events import EventLog
+from cosfly.stage_events import EventLog, HowFar
 from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
 from cosfly.store import remove_partials
 from cosfly.worker_pool import Watch, WorkerPool
@@ -74,7 +74,7 @@ def run_items(
         log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
     progress = _Progress(items, records.keys())
     if workers and todo:
-        outcomes = _in_processes(stage, todo, (make_worker, worker_args), workers, watch, progress.move)
+        outcomes = _in_processes(stage, todo, (make_worker, worker_args), workers, watch, progress)
     else:
         outcomes = _in_this_process(todo, (make_worker, worker_args), progress.move)
     # Closed at once, also while an error is on its way: no worker goes on behind it.
@@ -132,10 +132,10 @@ def _in_processes(
     start: _Start,
     workers: int,
     watch: Watch,
-    on_steps: Callable[[str, int], None],
+    progress: _Progress,
 ) -> Generator[ItemRecord, None, None]:
-    events = EventLog(stage.path)
-    pool = WorkerPool(*start, min(workers, len(items)), watch, events, on_steps)
+    events = EventLog(stage.path, progress.how_far)
+    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move)
     try:
         yield from pool.outcomes(items)
     except CosflyError:
@@ -161,6 +161,9 @@ class _Progress:
     def shown(self, label: str) -> Iterator[None]:
         with progress_bar(label, total=sum(self._sizes.values()), done=sum(self._at.values())) as self._advance:
             yield
+
+    def how_far(self) -> HowFar:
+        return HowFar(sum(self._at.values()), sum(self._sizes.values()), "steps" if self._in_steps else "items")
 
     def move(self, item_id: str, num_steps: int) -> None:
         """Note how many steps of an item are done; fewer than before where it is begun again."""

@@ -14,6 +14,7 @@ from cosfly.folder_lock import is_held
 from cosfly.products.review import undecided
 from cosfly.settings import RunConfig
 from cosfly.settings_guide import Setting, changed
+from cosfly.stage_events import HowFar, progress_of, read_events
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
@@ -34,6 +35,7 @@ class StageLook:
         name: of a town's stage: `town/stage`.
         state: whether it has ended, has begun, or has not.
         tally: what became of its items; of one that has begun, of those that are done.
+        far, left_s: of one that works now, how far it is and how long it will still take; None where nobody knows.
     """
 
     name: str
@@ -41,6 +43,8 @@ class StageLook:
     tally: Tally | None
     seconds: float | None
     size_bytes: int
+    far: HowFar | None = None
+    left_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,9 @@ def look(run: Path) -> RunLook:
     folders = [(f"{town}/{name}", run / town / name) for town in cfg.towns for name in STAGES[:-1]]
     folders = [*folders, ("release", run / "release")] if cfg.towns else [(name, run / name) for name in STAGES]
     found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
-    return RunLook(run, cfg, is_held(run), [_stage(name, folder) for name, folder in folders], changed(cfg), found)
+    is_at_work = is_held(run)
+    stages = [_stage(name, folder, is_at_work) for name, folder in folders]
+    return RunLook(run, cfg, is_at_work, stages, changed(cfg), found)
 
 
 def find(root: Path, *, depth: int = 2) -> Iterator[Path]:
@@ -114,7 +120,7 @@ def find(root: Path, *, depth: int = 2) -> Iterator[Path]:
                 yield from find(path, depth=depth - 1)
 
 
-def _stage(name: str, folder: Path) -> StageLook:
+def _stage(name: str, folder: Path, is_at_work: bool) -> StageLook:
     size = _size(folder)
     if (folder / "manifest.json").exists():
         manifest = read_manifest(folder)
@@ -131,7 +137,8 @@ def _stage(name: str, folder: Path) -> StageLook:
             tally.dropped[record.reason] += 1
         else:
             tally.kept += 1
-    return StageLook(name, "begun", tally, None, size)
+    far = progress_of(read_events(folder)) if is_at_work else None
+    return StageLook(name, "begun", tally, None, size, *(far or ()))
 
 
 def _size(folder: Path) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ PAGE_HEAD = """# Settings
 
 Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > docs/settings.md`.
 `--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them, and needs no more than
-`cosfly config show FILE --changed` does: what is not the default. `cosfly config schema`
+`cosfly config show FILE --changed` does: what is not the default. `cosfly config show --find altitude` finds settings by a word of theirs. `cosfly config schema`
 gives the JSON schema, with which an editor completes and checks such a file: `cosfly config schema > schema.json`, and in many
 editors `# yaml-language-server: $schema=schema.json` as the file's first line.
 """
@@ -67,6 +67,23 @@ def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     """Explain those settings that are not the defaults; raises as `explain`."""
     defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
     return [one for one in explain(cfg, section) if not one.is_group and one.value != defaults.get(one.name)]
+
+
+def with_words(settings: Sequence[Setting], words: Sequence[str]) -> list[Setting]:
+    """Give those settings, no groups, whose name, value, kind or meaning have all the words.
+
+    Raises:
+        ConfigError: there is none.
+    """
+
+    def has_all(one: Setting) -> bool:
+        text = " ".join((one.name, dump_json(one.value), one.kind, one.meaning)).casefold()
+        return all(word.casefold() in text for word in words)
+
+    if found := [one for one in settings if not one.is_group and has_all(one)]:
+        return found
+    fix = "try fewer words, or the start of one"
+    raise ConfigError("no setting has these words", where="--find", got=" and ".join(words), fix=fix)
 
 
 def _explain(

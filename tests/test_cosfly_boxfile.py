@@ -1,6 +1,8 @@
 """Maps of one's own: tables and GeoJSON of boxes in the forms that people write, and what is wrong with others, all at once."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from cosfly.maps.boxfile import BoxesConfig, load
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.kinds import KIND_NAMES
+from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES, KINDS
 
 # Three boxes, as a table would have them: a turned house, a tree, a road.
 PLAIN = """\
@@ -113,6 +115,24 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
     with pytest.raises(ConfigError, match=r"maps\.boxes: boxes_3d\.json has its own types.*got metres_per_unit"):
         load(BoxesConfig(path=tmp_path / "own.json", metres_per_unit=0.01))
+
+
+def test_ours_in_centimetres_is_asked_about_without_advice_that_it_refuses(tmp_path):
+    boxes = town()
+    write_boxes(
+        tmp_path / "own.json", replace(boxes, centers=boxes.centers * 100, half_extents=boxes.half_extents * 100)
+    )
+    with pytest.raises(InputError, match=r"are these centimetres\?.*write the file in metres") as caught:
+        load(BoxesConfig(path=tmp_path / "own.json"))
+    assert "metres_per_unit" not in str(caught.value)
+
+
+def test_the_documents_list_every_type():
+    page = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
+    listed = page[page.index("Types of surfaces") : page.index("A height without `z`")]
+    assert set(re.findall(r"`(\w+)`", listed)) == KINDS.keys() - {"NONE"}
+    surfaces = re.findall(r"`(\w+)`", listed.partition(".")[0])
+    assert {KINDS[name] for name in surfaces} == GROUND_KINDS
 
 
 def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):

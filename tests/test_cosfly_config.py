@@ -11,7 +11,7 @@ from cosfly.cli import app
 from cosfly.config import Config, apply_overrides, load, shipped
 from cosfly.errors import ConfigError
 from cosfly.settings import RunConfig
-from cosfly.settings_guide import as_page, explain, nested
+from cosfly.settings_guide import as_page, explain, nested, with_words
 
 
 class Inner(Config):
@@ -54,7 +54,8 @@ def test_what_is_wrong_across_settings_is_told_beside_what_is_wrong_with_one():
         load(RunConfig, None, over)
     text = str(caught.value)
     assert "pedestrians.num_pahts: unknown setting (did you mean 'num_paths'?)" in text
-    assert "min_distance_m 200.0 is not below max_distance_m 100.0" in text and "(without pedestrians.num_pahts)" in text
+    assert "min_distance_m 200.0 is not below max_distance_m 100.0" in text
+    assert "(without pedestrians.num_pahts)" in text
     assert "min_speed_mps 9.0 is above" in text
     with pytest.raises(ConfigError, match=r"towns\.a: sed: unknown.*towns\.b: sed: unknown"):
         load(RunConfig, None, over[-1:])
@@ -65,7 +66,8 @@ def test_what_is_wrong_across_settings_is_told_beside_what_is_wrong_with_one():
 def test_a_wrong_value_is_not_replaced_by_a_default_that_nobody_chose():
     with pytest.raises(ConfigError) as caught:  # with the default in place of `high` the order would be wrong
         load(RunConfig, None, ["plan.altitude_max_m=high", "plan.altitude_min_m=900", "seed=x"])
-    assert "ascending" not in str(caught.value) and "2 to mend" in str(caught.value)
+    assert "ascending" not in str(caught.value)
+    assert "2 to mend" in str(caught.value)
 
 
 @pytest.mark.parametrize("override", ["novalue", "=3", "seed=[", "seed.x=1"])
@@ -167,6 +169,16 @@ def test_what_a_setting_may_be_is_said_in_words(name, kind):
 def test_a_section_that_is_not_there_has_a_neighbour():
     with pytest.raises(ConfigError, match=r"did you mean 'plan\.muco'"):
         explain(RunConfig(), "plan.mucco")
+
+
+def test_settings_are_found_by_words_of_theirs():
+    shown = CliRunner().invoke(app, ["config", "show", "--find", "ALTITUDE", "--find", "preferred"])
+    assert shown.exit_code == 0
+    assert "plan.altitude_preferred_m = 20.0" in shown.output
+    assert "altitude_max_m = " not in shown.output
+    assert [one.name for one in with_words(explain(RunConfig()), ["num_paths"])] == ["pedestrians.num_paths"]
+    with pytest.raises(ConfigError, match="no setting has these words; got altitude and zebra"):
+        with_words(explain(RunConfig()), ["altitude", "zebra"])
 
 
 def test_the_page_of_the_settings_is_up_to_date():

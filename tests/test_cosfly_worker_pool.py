@@ -15,7 +15,7 @@ from toy_workers import make_broken_worker, make_counting_worker, make_talking_w
 from cosfly.errors import EnvironmentMissing
 from cosfly.journal import Journal
 from cosfly.runner import Item, Watch, run_items
-from cosfly.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, read_events
+from cosfly.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
 from cosfly.stage_folder import Failed
 from cosfly.worker_pool import WORDS, limit_s
 
@@ -185,10 +185,35 @@ def test_events_tell_what_happened_and_a_damaged_line_is_no_harm(tmp_path):
     assert probes
     assert all(event.disk_free_mib > 0 for event in probes)
     assert any(rss > 10 for event in probes for rss in event.rss_mib.values())
+    assert [(event.done, event.total, event.unit) for event in probes[:1]] == [(0, 2, "items")]
     with Journal(path) as journal:
         journal.append({"at_s": 1.0, "event": "of a later cosfly"})
     path.write_bytes(path.read_bytes() + b"cut sho")
     assert read_events(tmp_path / "s") == events
+
+
+def test_probes_tell_how_far_the_stage_is_and_their_pace_how_long_it_will_take(tmp_path):
+    at = [0]
+
+    def how_far() -> HowFar:
+        return HowFar(at[0], 428, "steps")
+
+    for first, last in ((0, 400), (100, 120)):  # the second time the stage goes on: its pace is its own
+        log = EventLog(tmp_path, how_far)
+        log.tell("began", workers=1)
+        assert progress_of(read_events(tmp_path)) is None  # what a run before told counts no more
+        at[0] = first
+        log.probe({})
+        assert progress_of(read_events(tmp_path)) == (how_far(), None)
+        at[0] = last
+        time.sleep(0.2)
+        log.probe({})
+        log.close()
+    events = read_events(tmp_path)
+    far, left_s = progress_of(events)
+    assert far == (120, 428, "steps")
+    assert left_s == pytest.approx((events[-1].at_s - events[-2].at_s) / 20 * 308)
+    assert progress_of([]) is None
 
 
 def test_a_week_of_probes_stays_small(tmp_path):

@@ -245,10 +245,10 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and keeps them."""
     in_processes = runner._in_processes
 
-    def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, on_steps: Any) -> Any:
+    def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, progress: Any) -> Any:
         if "bench" in stage.path.parts:
-            return in_processes(stage, items, start, workers, watch, on_steps)
-        return runner._in_this_process(items, start, on_steps)
+            return in_processes(stage, items, start, workers, watch, progress)
+        return runner._in_this_process(items, start, progress.move)
 
     monkeypatch.setattr(runner, "_in_processes", work)
 

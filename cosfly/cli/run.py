@@ -12,6 +12,7 @@ from cosfly.cli import options
 
 if TYPE_CHECKING:
     from cosfly.pipeline import StageResult
+    from cosfly.runs import StageLook
     from cosfly.settings import RunConfig
 
 app = typer.Typer()
@@ -154,7 +155,7 @@ def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder."
     for stage in seen.stages:
         seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
         size = _size(stage.size_bytes) if stage.size_bytes else ""
-        table.add_row(stage.name, stage.state, "" if stage.tally is None else str(stage.tally), seconds, size)
+        table.add_row(stage.name, stage.state, _items_of(stage), seconds, size)
     answer_console.print(table)
     if seen.differing:
         answer_console.print("settings that are not the defaults:")
@@ -169,6 +170,17 @@ def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder."
         )
     if seen.num_complete < len(seen.stages) and not seen.is_at_work:
         answer_console.print(f"continue  cosfly run {os.path.relpath(run)}", soft_wrap=True)
+
+
+def _items_of(stage: StageLook) -> str:
+    """Say what became of a stage's items; of one at work how far it is: `120 of 428 frames, about 3 min left`."""
+    from caption.run.progress import duration
+
+    if stage.far is None:
+        return "" if stage.tally is None else str(stage.tally)
+    what = "frames" if stage.far.unit == "steps" else "items"
+    left = "" if stage.left_s is None else f", about {duration(stage.left_s)} left"
+    return f"{stage.far.done:,} of {stage.far.total:,} {what}{left}"
 
 
 @app.command("list")
@@ -243,8 +255,14 @@ def config_show(
         bool, typer.Option("--markdown", help="With --describe: as the page docs/settings.md.")
     ] = False,
     changed: Annotated[bool, typer.Option("--changed", help="Only what is not the default.")] = False,
+    find: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--find", metavar="WORD", help="Only settings whose name, value or meaning has this word; may be repeated."
+        ),
+    ] = None,
 ) -> None:
-    """Print the resolved configuration: every setting with its value, and with --describe what it means."""
+    """Print the resolved configuration: every setting with its value, and with --describe or --find what it means."""
     import yaml
 
     from cosfly import settings_guide
@@ -254,9 +272,11 @@ def config_show(
         config, section = None, config
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
+    if find:
+        explained = settings_guide.with_words(explained, find)
     if markdown:
         typer.echo(settings_guide.as_page(explained), nl=False)
-    elif describe:
+    elif describe or find:
         for line in settings_guide.as_lines(explained):
             answer_console.print(line)
     else:
