@@ -15,7 +15,7 @@ from test_renderers_contract import HIP, circling, opened, pose_towards, street,
 from cosfly.config import build
 from cosfly.coverage_page import coverage_html
 from cosfly.errors import ConfigError, InputError, RenderError
-from cosfly.geometry import intrinsic_matrix
+from cosfly.geometry import intrinsic_matrix, rotation_matrices
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
@@ -25,6 +25,7 @@ from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherPara
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.atmosphere import fog_extinction, light_direction, lights_on
+from cosfly.render.gl.lamps import APART_M, HIGH_M, lamps_along_streets
 from cosfly.render.person import choose_clothes
 from cosfly.render.stage import RenderConfig, open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
@@ -263,6 +264,42 @@ def test_each_knob_is_seen(renderer):
     dusk = drawn(renderer, params(time="dusk"), pose_towards((20.0, -5.0, 8.0), (-20.0, 0.0, 5.0)))
     west = dusk.rgb[dusk.kinds == KINDS["Sky"]].astype(float).mean(axis=0)
     assert west[0] > west[2], "warm where the sun goes down"
+
+
+def test_a_map_without_lamps_is_lit_along_its_streets_and_only_when_it_is_dark(renderer, monkeypatch):
+    assert len(renderer.scene.lamps) == 0, "it has lamps of its own"
+    frames = {}
+    for name in ("lit", "dark"):
+        if name == "dark":
+            monkeypatch.setattr("cosfly.render.gl.scene.lamps_along_streets", lambda box_map: np.zeros((0, 3)))
+        plain = opened("gl", street())
+        frames[name] = {time: drawn(plain, params(time=time)) for time in ("noon", "night")}
+        plain.close()
+    lit, dark = frames["lit"], frames["dark"]
+    road = dark["night"].kinds == KINDS["Roads"]
+    assert brightness(lit["night"].rgb, road) > 2.0 * brightness(dark["night"].rgb, road)
+    assert len({labels(frame) for pair in (lit, dark) for frame in pair.values()}) == 1
+    np.testing.assert_array_equal(lit["noon"].rgb, dark["noon"].rgb)
+
+
+def test_lamps_stand_by_turns_along_streets_and_not_in_each_other():
+    yaw = 30.0
+    turn = rotation_matrices(np.radians([[0.0, yaw, 0.0]]))[0]
+    rows = [("Roads", (100.0, 5.0, -0.15), (40.0, 4.0, 0.15)), ("Roads", (100.0, 5.0, -0.15), (4.0, 39.0, 0.15)), ("Buildings", (0, 0, 5), (5, 5, 5))]  # fmt: skip
+    centers, halves = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
+    crossing = make_box_map(
+        centers, halves, np.array([[0.0, yaw, 0.0]] * 3), [KINDS[row[0]] for row in rows], [1, 2, 3], MapHeader(name="x", ground_z_m=0.0),
+    )  # fmt: skip
+    lamps = lamps_along_streets(crossing)
+    local = (lamps - centers[0]) @ turn
+    first = local[:5]  # of the larger road: every 16 m, by turns 0.5 m from either edge
+    np.testing.assert_allclose(first[:, 0], [-32, -16, 0, 16, 32], atol=1e-9)
+    np.testing.assert_allclose(first[:, 1], [-3.5, 3.5, -3.5, 3.5, -3.5], atol=1e-9)
+    np.testing.assert_allclose(lamps[:, 2], HIGH_M)
+    apart = np.linalg.norm(lamps[:, None, :2] - lamps[None, :, :2], axis=2) + 1e9 * np.eye(len(lamps))
+    assert apart.min() >= APART_M
+    assert 5 < len(lamps) < 10, "those of the other road, less that of the crossing"
+    assert lamps_along_streets(crossing.select(np.array([2]))).shape == (0, 3)
 
 
 def test_rain_falls_and_wets_the_road(renderer):

@@ -147,7 +147,7 @@ class VllmEngine:
             try:
                 if self._open and not self._is_closing:
                     self._step(llm)
-            except Exception as error:
+            except Exception as error:  # of this thread nobody else hears: who waits for an answer would wait for ever
                 self._break(error)
 
     def _take(self) -> list[tuple[Request, Future[Reply]]]:

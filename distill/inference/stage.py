@@ -242,7 +242,7 @@ def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
     """
     try:
         return asyncio.run(_write_answers(cfg, inputs, out))
-    except Exception as error:
+    except Exception as error:  # torch's class has no name here until torch is loaded; all others go on
         if not _is_memory_full(error):
             raise
         said = f"{cfg.batch_size}: {str(error)[:120]}"

@@ -192,7 +192,8 @@ class GlRenderer:
             for loose in self._loose:
                 loose.place(self.origin_m - self.scene.origin_m)
             if self._weather is not None and weather is not None:
-                self._weather.prepare(weather, parts, middle, half)
+                lamps = self.scene.lamps - (self.origin_m - self.scene.origin_m)
+                self._weather.prepare(weather, parts, lamps, middle, half)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
             centers, radii = self._solids.centers, self._solids.radii
             beside = (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)

@@ -1,9 +1,16 @@
-"""Street lamps of a map: where they hang, and the light that they throw on the ground, as a map seen from above."""
+"""Street lamps of a map: where they hang, and the light that they throw on the ground, as a map seen from above.
+
+A map without any is lit all the same, along its streets: by lamps that throw light and are not drawn, as no box stands for them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from cosfly.geometry import rotation_matrices
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KINDS
 from cosfly.render.gl.parts import LAMP, Parts
 
 MAP_PX = 384
@@ -11,6 +18,10 @@ REACH_M = 45.0  # farther off a lamp gives nothing
 CROWDED = 0.4  # several lamps in one place give less than their sum: where they crowd, each is a weaker one
 BRIGHT = 0.5  # red of a lamp's glass, which tells it from its housing
 FALL_M = 5.5  # height that the fall of the light is computed for, whatever the pole's
+# Of lamps that no pole stands for: along a street, by turns on its two sides.
+STREETS = ("Roads", "Sidewalks")
+ALONG_M, APART_M, HIGH_M = 16.0, 12.0, 6.5  # from one to the next; least distance of any two; over the street
+FROM_EDGE_M = 0.5
 MOST_NEAR = 16  # lamps whose mirror images a frame has, as many as the shader has room for
 
 
@@ -19,6 +30,29 @@ def lamps_of(parts: Parts) -> np.ndarray:
     records = parts.records
     is_lamp = (((records["tag"] >> 8) & 0xFF) == LAMP) & (records["color"][:, 0] > BRIGHT)
     return records["center"][is_lamp].astype(np.float64)
+
+
+def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
+    """Places of lamps along the streets of a map that has none of its own, (n, 3) m, world: the largest street's first."""
+    streets = box_map.select(box_map.is_any_of({KINDS[name] for name in STREETS}))
+    half = streets.half_extents
+    turns = rotation_matrices(np.radians(streets.rotations_deg))
+    found = [np.zeros((0, 3))]
+    for row in np.lexsort((streets.ids, -half[:, 0] * half[:, 1])):
+        along, across = (0, 1) if half[row, 0] >= half[row, 1] else (1, 0)
+        steps = np.arange(max(1, round(2.0 * half[row, along] / ALONG_M)))
+        own = np.zeros((len(steps), 3))
+        own[:, along] = half[row, along] * ((2.0 * steps + 1.0) / len(steps) - 1.0)
+        own[:, across] = np.where(steps % 2, 1.0, -1.0) * max(half[row, across] - FROM_EDGE_M, 0.0)
+        found.append(streets.centers[row] + own @ turns[row].T)
+    places = np.concatenate(found)
+    stays = np.ones(len(places), bool)
+    pairs = cKDTree(places[:, :2]).query_pairs(APART_M, output_type="ndarray") if len(places) else []
+    for first, second in sorted(map(tuple, pairs)):
+        stays[second] &= not stays[first]
+    places = places[stays]
+    places[:, 2] = np.maximum(places[:, 2], box_map.ground.height_at(places)) + HIGH_M
+    return places
 
 
 def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.ndarray, np.ndarray]:

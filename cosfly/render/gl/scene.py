@@ -14,6 +14,7 @@ from cosfly.products.kinds import KINDS
 from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin, seeds_of
 from cosfly.render.draping import Draped, drape, is_draped
 from cosfly.render.gl import meshes
+from cosfly.render.gl.lamps import lamps_along_streets, lamps_of
 from cosfly.render.gl.loose import Loose
 from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, plain
@@ -28,7 +29,8 @@ HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the sh
 class Scene:
     """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world.
 
-    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes.
+    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes. lamps: (n, 3) relative to
+    the parts' zero, lamps of a map that has none among its parts.
     """
 
     parts: Parts
@@ -37,6 +39,7 @@ class Scene:
     ground: Ground
     draped: Loose
     solids: Loose
+    lamps: np.ndarray
 
 
 def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
@@ -81,7 +84,9 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     builder.add_parts(bare)
     loose = {} if box_map.ground.is_flat else _loose(drape(box_map), origin, np.append(lying, bare.records))
     standing = loose_solids(box_map, solids, origin, all_ids)
-    return Scene(builder.finish(), origin, plane_z_m(box_map), box_map.ground, Loose.all_of(loose), standing)
+    parts = builder.finish()
+    lamps = np.zeros((0, 3)) if len(lamps_of(parts)) else lamps_along_streets(box_map) - origin
+    return Scene(parts, origin, plane_z_m(box_map), box_map.ground, Loose.all_of(loose), standing, lamps)
 
 
 def _loose(draped: Draped, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
