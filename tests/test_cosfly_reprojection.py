@@ -6,7 +6,18 @@ from numpy.testing import assert_allclose
 
 from cosfly.products.kinds import KINDS
 from cosfly.render.contract import LAYERS
-from cosfly.reprojection import FLAT, LEAST_PAIRS, View, compare_views, usual_correlations
+from cosfly.reprojection import (
+    COLUMNS,
+    FLAT,
+    LEAST_CONTRAST,
+    LEAST_PAIRS,
+    View,
+    compare_views,
+    correlate_colours,
+    grid_rows,
+    median_of,
+    usual_correlations,
+)
 
 
 def test_frames_are_judged_by_those_of_their_own_zoom():
@@ -53,3 +64,34 @@ def test_of_two_roads_in_one_plane_either_may_show(kinds, is_same):
     found = compare_views(*views, np.array([80.0, 80.0, 80.0, 45.0]))
     assert found.agree > 1000
     assert found.same == (found.agree if is_same else 0)
+
+
+@pytest.mark.parametrize("rain", [0.0, 60.0])
+def test_colours_of_points_agree_as_numpy_says(rain):
+    """A plane with a picture on it and a camera that moves 1 px to the side: by hand from the pictures' rows. Alone or with all else."""
+    rng = np.random.default_rng(0)
+    whole = rng.integers(0, 200, (90, 161, 3)).astype(np.uint8)
+    noisy = whole + rng.uniform(0.0, rain, whole.shape).astype(np.uint8)
+    rows, columns = grid_rows(90), ((np.arange(COLUMNS) + 0.5) * 160 / COLUMNS).astype(int)
+    depth, nothing = np.full((90, 160), 20.0, np.float32), np.empty((0, 0, 3), np.uint8)
+    one = View(depth, nothing, whole[rows, :160], np.eye(3), np.zeros(3))
+    other = View(depth, nothing, noisy[rows, 1:], np.eye(3), np.array([0.25, 0.0, 0.0]))
+    camera = np.array([80.0, 80.0, 80.0, 45.0])
+    found = compare_views(one, other, camera)
+    reached = columns[(columns >= 3) & (columns < 158)]
+    inside = (rows > 1) & (rows < 87)  # all that is compared lies a pixel and a half inside
+    here = whole[rows[inside]][:, reached].reshape(-1, 3).astype(float)
+    there = noisy[rows[inside]][:, reached].reshape(-1, 3).astype(float)
+    pairs = np.stack([here.mean(axis=1), there.mean(axis=1)])
+    assert_allclose(found.correlation, np.corrcoef(pairs)[0, 1], rtol=1e-12)
+    assert_allclose(found.shade, np.median(pairs[1] - pairs[0]), atol=1e-12)
+    hues = (there - pairs[1][:, None]) - (here - pairs[0][:, None])
+    assert_allclose(found.tint, np.median(np.abs(hues).max(axis=1)), atol=1e-12)
+    assert correlate_colours(one, other, camera, camera, least_contrast=LEAST_CONTRAST) == found.correlation
+    assert np.isnan(correlate_colours(one, other, camera, camera, least_contrast=200.0))
+
+
+@pytest.mark.parametrize("num", [1, 2, 5, 8])
+def test_median(num):
+    values = np.random.default_rng(num).normal(size=num).astype(np.float32)
+    assert median_of(values) == float(np.median(values))

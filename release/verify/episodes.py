@@ -29,7 +29,7 @@ from release.export.lerobot.features import ACTION, CAMERAS, FLAGS, STATE, TEXTS
 from release.export.lerobot.format import VERSIONS, task_of
 from release.verify.findings import Findings
 from release.verify.rows import Row
-from release.verify.sources import BATCH_ROWS, Entry, Pictures, picture_at, rows_of_table, with_ids
+from release.verify.sources import BATCH_ROWS, Entry, Pictures, pictures_of, rows_of_table, with_ids
 
 INFO = "meta/info.json"
 EPISODE: dict[str, type] = {
@@ -88,8 +88,7 @@ class Episodes:
             with open_table(path, tree=self.folder) as table:
                 row = 0
                 for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
-                    for i in range(max(begin - row, 0), min(end - row, len(batch))):
-                        found: Pictures = {file: picture_at(batch.column(column), i) for file, column in names.items()}
+                    for found in pictures_of(batch, names)[max(begin - row, 0) : max(end - row, 0)]:
                         if depth := found.get("depth"):
                             found["depth"] = _npy_of_tiff(depth, f"{name}: {entry.name}")
                         yield found

@@ -12,25 +12,23 @@ from cosfly.png.read import Png, parse_png
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reprojection import COLUMNS, View, grid_rows, survey
+from cosfly.reprojection import View, grid_rows, median_of
 from release.columns import PICTURES
 from release.depth import depth_of
 from release.record import DepthCoding
 from release.verify.findings import Findings
+from release.verify.pixels import Survey, depths_of_person, rays_to_person, survey
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
-PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
-SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
 BLANK_STD = 2.0  # grey levels: a picture of one colour has 0, fog over a street more than 5
-BLOCK_PX = 8  # of JPEG, WebP and videos
-LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
-MOST_RAYS = 900  # through the box of a person: the score is a share of them
+MOST_RAYS, LEAST_RAYS = 900, 30  # through the box of a person: the score is a share of them
 SCORE = 0.12  # of the visibility: three deviations of a share of so many rays, and pixels on an edge
 STEP_PIXELS = 20_000  # of a frame
-MOST_KIND = max(KINDS.values())
+PERSON, MOST_KIND = KINDS["Pedestrians"], max(KINDS.values())
+PERSON_HALF_M = np.array(PERSON_HALF_EXTENTS_M)
 NOTHING = np.empty((0, 0), np.float32)
 NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
@@ -90,15 +88,19 @@ def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
     return View(depth, instance, colours, np.ascontiguousarray(rotation), flight.pose[i, :3].copy())
 
 
-def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findings) -> bool:
-    """Check depth, mask and colours of a row with each other and with the row; False where the depth is no depth."""
-    depth, instance, colours = decoded
-    limits, counts, box, kinds = survey(depth, instance, KINDS["Sky"], PERSON_ID)
-    if colours is not None and float(colours[..., :3].std()) < BLANK_STD:
-        findings.error("blank", flight.where(i, "image"), f"standard deviation {colours.std():.2f}", "a picture")
-    good = not depth.size or _check_depth(flight, i, limits, findings)
+def check_picture(flight: FlightRows, i: int, decoded: Decoded, deviation: float, findings: Findings) -> bool:
+    """Check depth, mask and colours of a row with each other and with the row; False where the depth is no depth.
+
+    Args:
+        deviation: of the colours, grey levels; NaN where there are none.
+    """
+    depth, instance, _ = decoded
+    found = survey(depth, instance)
+    if deviation < BLANK_STD:
+        findings.error("blank", flight.where(i, "image"), f"standard deviation {deviation:.2f}", "a picture")
+    good = not depth.size or _check_depth(flight, i, found.low_m, found.high_m, findings)
     if instance.size:
-        _check_instance(flight, i, instance, counts, box, kinds, bool(depth.size), findings)
+        _check_instance(flight, i, instance, found, bool(depth.size), findings)
         if depth.size and good:
             _check_person_depth(flight, i, instance, depth, findings)
     if depth.size and instance.size and good and not flight.is_foreign:
@@ -106,8 +108,7 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
     return good
 
 
-def _check_depth(flight: FlightRows, i: int, limits: np.ndarray, findings: Findings) -> bool:
-    low, high = limits
+def _check_depth(flight: FlightRows, i: int, low: float, high: float, findings: Findings) -> bool:
     where = flight.where(i, "depth")
     if np.isnan(low):
         findings.error("depth_range", where, "pixels that are not finite", "metres in every pixel")
@@ -121,55 +122,50 @@ def _check_depth(flight: FlightRows, i: int, limits: np.ndarray, findings: Findi
 
 
 def _check_instance(
-    flight: FlightRows, i: int, instance: np.ndarray, counts: np.ndarray, box: np.ndarray, kinds: np.ndarray,
-    has_depth: bool, findings: Findings,
-) -> None:  # fmt: skip
+    flight: FlightRows, i: int, instance: np.ndarray, found: Survey, has_depth: bool, findings: Findings
+) -> None:
     """Check the mask: the person where the row has it, kinds that exist, sky where the depth is the sky's."""
     where = flight.where(i, "instance")
-    visible = bool(flight.rows[i].get("target_visible"))
     if flight.is_foreign:
         low, high = np.floor(flight.box[i, :2]), np.ceil(flight.box[i, 2:])
-        if visible and not np.isnan(low).any() and np.prod(high - low) >= LEAST_BOX_PX2 and not kinds[KINDS["Pedestrians"]]:  # fmt: skip
-            findings.error("mask", where, "no pedestrian", "pixels of the person, who is visible")
-        elif visible and not np.isnan(low).any() and np.prod(high - low) >= LEAST_BOX_PX2:
+        visible = bool(flight.rows[i].get("target_visible"))
+        if visible and not np.isnan(low).any() and np.prod(high - low) >= LEAST_BOX_PX2:
             (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int)
-            if not (instance[y0 : y1 + 1, x0 : x1 + 1, 0] == KINDS["Pedestrians"]).any():
-                findings.error("mask", where, "no pedestrian at target_bbox", "pixels of the person, who is visible")
+            if not (instance[y0 : y1 + 1, x0 : x1 + 1, 0] == PERSON).any():
+                got = "no pedestrian at target_bbox" if (instance[..., 0] == PERSON).any() else "no pedestrian"
+                findings.error("mask", where, got, "pixels of the person, who is visible")
         return
-    found = box.astype(np.float64) if counts[1] else np.full(4, np.nan)
-    if not np.array_equal(found, flight.mask_box[i], equal_nan=True):
-        got = "no pixel of the person" if not counts[1] else f"pixels in {found.tolist()}"
+    box = found.box.astype(np.float64) if found.num_person else np.full(4, np.nan)
+    if not np.array_equal(box, flight.mask_box[i], equal_nan=True):
+        got = "no pixel of the person" if not found.num_person else f"pixels in {box.tolist()}"
         recorded = flight.mask_box[i]
         expected = (
             "none: target_mask_bbox is null" if np.isnan(recorded).any() else f"{recorded.tolist()}, target_mask_bbox"
         )
         findings.error("mask", where, got, expected)
-    if counts[2]:
-        findings.error("mask", where, f"{counts[2]} pixels of the person of another kind", f"kind {KINDS['Pedestrians']}")  # fmt: skip
-    if kinds[MOST_KIND + 1 :].any():
-        findings.error("mask", where, f"kind {int(np.flatnonzero(kinds)[-1])}", f"kinds of 0 to {MOST_KIND}")
-    if has_depth and counts[0]:
-        findings.error("sky", where, f"{counts[0]:,} pixels are sky in one of instance and depth", "the same sky in both")  # fmt: skip
+    if found.num_odd_person:
+        findings.error("mask", where, f"{found.num_odd_person} pixels of the person of another kind", f"kind {PERSON}")
+    if found.most_kind > MOST_KIND:
+        findings.error("mask", where, f"kind {found.most_kind}", f"kinds of 0 to {MOST_KIND}")
+    if has_depth and found.num_odd_sky:
+        findings.error("sky", where, f"{found.num_odd_sky:,} pixels are sky in one of instance and depth", "the same sky in both")  # fmt: skip
 
 
 def _check_person_depth(
     flight: FlightRows, i: int, instance: np.ndarray, depth: np.ndarray, findings: Findings
 ) -> None:
     """The surface of the person is about as far as the row says its hip is."""
-    expected = flight.numbers("target_depth_m")[i] if "target_depth_m" in flight.rows[i] else np.nan
+    expected = flight.rows[i].get("target_depth_m")
     box = flight.box[i] if flight.is_foreign or np.isnan(flight.mask_box[i]).any() else flight.mask_box[i]
-    if np.isnan(box).any() or np.isnan(expected) or not flight.rows[i].get("target_visible"):
+    if expected is None or np.isnan(expected) or np.isnan(box).any() or not flight.rows[i].get("target_visible"):
         return
     height, width = depth.shape
     x0, y0 = np.clip(np.floor(box[:2]), 0, [width, height]).astype(int)
     x1, y1 = np.clip(np.ceil(box[2:]), 0, [width, height]).astype(int)
-    part = instance[y0:y1, x0:x1]
-    is_person = part[..., 0] == KINDS["Pedestrians"]
-    if not flight.is_foreign:
-        is_person &= (part[..., 1] == 255) & (part[..., 2] == 255)
-    surface = depth[y0:y1, x0:x1][is_person]
-    if len(surface) and abs(float(np.median(surface)) - expected) > SURFACE_M:
-        got, wanted = f"{float(np.median(surface)):.2f} m at the person", f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"  # fmt: skip
+    is_ours = not flight.is_foreign
+    surface = depths_of_person(depth, instance, np.array([x0, y0, x1, y1]), is_ours)
+    if len(surface) and abs((found := median_of(surface)) - expected) > SURFACE_M:
+        got, wanted = f"{found:.2f} m at the person", f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"  # fmt: skip
         findings.error("depth", flight.where(i, "depth"), got, wanted)
 
 
@@ -181,45 +177,15 @@ def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: n
         return
     (x0, y0), (x1, y1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_RAYS)))
-    pixels = np.meshgrid(np.floor(np.arange(x0, x1, stride)), np.floor(np.arange(y0, y1, stride)))
-    u, v = (axis.ravel() for axis in pixels)
-    fx, fy, cx, cy = flight.intrinsics[i]
-    rays = np.stack([(u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, np.ones(len(u))], axis=1)
-    rays = rays @ (flight.rotations[i] @ BODY_FROM_CAMERA).T
-    rays[np.abs(rays) < 1e-12] = 1e-12
-    half, away = np.array(PERSON_HALF_EXTENTS_M), flight.target_m[i] - flight.pose[i, :3]
-    low, high = (away - half) / rays, (away + half) / rays
-    enter, leave = np.maximum(np.minimum(low, high).max(axis=1), 0.3), np.maximum(low, high).min(axis=1)
-    hits = leave > enter
-    if hits.sum() < 30:
+    num_hits, num_seen = rays_to_person(
+        depth, instance, np.floor(np.arange(x0, x1, stride)), np.floor(np.arange(y0, y1, stride)), flight.intrinsics[i],
+        flight.rotations[i] @ BODY_FROM_CAMERA, flight.target_m[i] - flight.pose[i, :3], PERSON_HALF_M,
+    )  # fmt: skip
+    if num_hits < LEAST_RAYS:
         return
-    height, width = depth.shape
-    inside = hits & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    column, row = u[inside].astype(int), v[inside].astype(int)
-    seen = depth[row, column] > enter[inside] - 0.05
-    seen |= (instance[row, column, 1] == 255) & (instance[row, column, 2] == 255)
-    share = float(seen.sum() / hits.sum())
+    share = num_seen / num_hits
     if abs(share - score) > SCORE:
         findings.error("visibility", flight.where(i, "visibility"), f"{score:.2f}", f"{share:.2f}, of the depth image")
-
-
-def look_of(colours: np.ndarray) -> np.ndarray:
-    """Tell how a picture looks, (6,) grey levels.
-
-    How colourful and how sharp it is: how far channels lie from their mean, and pixels from the next. How far pixels lie from the next over
-    edges of blocks of 8 px, which lossy codings pack apart, and elsewhere. Red and blue less green.
-
-    Args:
-        colours: (k, w, 3 or 4) uint8, some of its rows.
-    """
-    few = colours[::LOOK_EVERY, :, :3].astype(np.int16)
-    grey = few.sum(axis=2, dtype=np.int16)  # three times the brightness
-    hue = np.abs(3 * few[:, ::LOOK_EVERY] - grey[:, ::LOOK_EVERY, None]).mean() / 3.0
-    steps = np.abs(np.diff(grey, axis=1)).mean(axis=0) / 3.0
-    edges = steps[BLOCK_PX - 1 :: BLOCK_PX]
-    inside = (steps.sum() - edges.sum()) / max(len(steps) - len(edges), 1)
-    red, green, blue = few.mean(axis=(0, 1))
-    return np.array([hue, steps.mean(), edges.mean() if len(edges) else np.nan, inside, red - green, blue - green])
 
 
 def least_step(depth: np.ndarray) -> float:
@@ -230,11 +196,3 @@ def least_step(depth: np.ndarray) -> float:
         return np.nan
     gaps = np.diff(np.sort(seen))
     return float(gaps[gaps > 0.0].min(initial=np.inf))
-
-
-def grid_kinds(instance: np.ndarray) -> np.ndarray:
-    """Give id * 256 + kind at the grid's points, each once."""
-    height, width = instance.shape[:2]
-    columns = ((np.arange(COLUMNS) + 0.5) * width / COLUMNS).astype(np.int64)
-    points = instance[grid_rows(height)][:, columns].reshape(-1, 3).astype(np.int64)
-    return np.unique((points[:, 1] | points[:, 2] << 8) << 8 | points[:, 0])

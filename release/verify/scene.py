@@ -14,20 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
+from cosfly.reprojection import Agreement, View, compare_views, correlate_colours, is_zoomed, usual_correlations
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
-from release.verify.pictures import (
-    BLOCK_PX,
-    NOBODY,
-    SHARED_ID,
-    check_picture,
-    decode,
-    grid_kinds,
-    least_step,
-    look_of,
-    view_of,
-)
+from release.verify.pictures import check_picture, decode, least_step, view_of
+from release.verify.pixels import BLOCK_PX, NUM_IDS, look_of, new_kinds
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -100,21 +91,21 @@ def check_pictures(
         coding: of the depth. rounded_as: the coding whose errors it has.
     """
     keys: list[tuple[int, int]] = []
-    pairs, kinds = _Pairs(), dict[int, int]()
-    looks = np.full((len(flight), 6), np.nan)
+    pairs, kinds = _Pairs(), np.full(NUM_IDS, -1, np.int16)
+    looks = np.full((len(flight), 7), np.nan)
     steps: list[float] = []  # of some frames' depth
     before: list[tuple[int, View]] = []  # the two frames before
     for i, files in enumerate(pictures):
         advance()
         decoded = decode(flight, i, files, coding, findings)
         keys.append(_keys(files, decoded))
-        if decoded is None or not check_picture(flight, i, decoded, findings):
+        look = look_of(decoded[2]) if decoded is not None and decoded[2] is not None else looks[i]
+        if decoded is None or not check_picture(flight, i, decoded, look[-1], findings):
             before = []
             continue
         if decoded[1].size and not flight.is_foreign:
             _check_kinds(flight, i, decoded[1], kinds, findings)
-        if decoded[2] is not None:
-            looks[i] = look_of(decoded[2])
+        looks[i] = look
         if rounded_as == "float32" and i % max(1, len(flight) // STEPS_LOOKED_AT) == 0:
             steps.append(least_step(decoded[0]))
         view = view_of(flight, i, decoded)
@@ -128,12 +119,9 @@ def check_pictures(
         least = min((step for step in steps if np.isfinite(step)), default=0.0)
         if least > STEP_MOST_M:
             findings.error("depth_coding", flight.name, f"depths that are {least:.4f} m apart or equal", "float32 as it was drawn, as the record says: depths that differ by millionths")  # fmt: skip
-    known = looks[np.isfinite(looks[:, 4])]
-    return Shown(
-        keys,
-        sorted(own << 8 | kind for own, kind in kinds.items()),
-        known[:, 4:].mean(axis=0).tolist() if len(known) else [],
-    )
+    hues = looks[np.isfinite(looks[:, 4]), 4:6]
+    ids = np.flatnonzero(kinds >= 0)
+    return Shown(keys, (ids << 8 | kinds[ids]).tolist(), hues.mean(axis=0).tolist() if len(hues) else [])
 
 
 def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
@@ -141,15 +129,17 @@ def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
     colour, depth = files.get("rgb") or b"", files.get("depth") or b""
     # The last bytes before the IEND chunk (12): the stream's own checksum and that of its chunk (4 each).
     told = int.from_bytes(colour[-20:-12], "big")
-    samples = bytes(depth[:: max(1, len(depth) // 8192)]) if decoded else b""
+    samples = np.frombuffer(depth, np.uint8)[:: max(1, len(depth) // 8192)].tobytes() if decoded else b""
     return told, int.from_bytes(hashlib.blake2b(samples, digest_size=8).digest(), "big") if samples else 0
 
 
-def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: dict[int, int], findings: Findings) -> None:
-    """An instance is of one kind in all frames."""
-    for code in grid_kinds(instance).tolist():
+def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.ndarray, findings: Findings) -> None:
+    """An instance is of one kind in all frames. kinds: (NUM_IDS,) as in the frames before, -1 of what was not seen; what is new is added."""
+    for code in new_kinds(instance, kinds):
         own, kind = code >> 8, code & 255
-        if own not in (NOBODY, SHARED_ID) and kinds.setdefault(own, kind) != kind:
+        if kinds[own] < 0:
+            kinds[own] = kind
+        elif kinds[own] != kind:
             findings.error("instance_kind", flight.where(i, "instance"), f"instance {own} of kind {kind}", f"kind {kinds[own]}, as before")  # fmt: skip
 
 
@@ -170,9 +160,9 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
         pairs.found[-1] = replace(pairs.found[-1], correlation=np.nan, tint=np.nan)
     if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
         moved = replace(view, colours=previous.colours)
-        pairs.elsewhere[-2] = compare_views(
+        pairs.elsewhere[-2] = correlate_colours(
             before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i], least_contrast=CONTRAST
-        ).correlation
+        )
 
 
 def _judge_looks(flight: FlightRows, looks: np.ndarray, findings: Findings) -> None:

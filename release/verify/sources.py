@@ -13,7 +13,9 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from cosfly.errors import InputError
 from cosfly.products.frames import FILE_NAMES, FrameFile
@@ -110,8 +112,7 @@ class Shards:
         for path, table, group, begin, end in self._groups(entry):
             row = 0
             for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
-                for i in range(max(begin - row, 0), min(end - row, len(batch))):
-                    yield {file: picture_at(batch.column(name), i) for file, name in names.items()}
+                yield from pictures_of(batch, names)[max(begin - row, 0) : max(end - row, 0)]
                 row += len(batch)
                 if row >= end:
                     break
@@ -137,12 +138,19 @@ def rows_of_table(table: Any, path: Path) -> list[Row]:
         raise InputError("not text", where=path, got=str(error)) from None
 
 
-def picture_at(column: Any, row: int) -> memoryview | None:
-    """Give a picture where it lies in the table's memory."""
-    value = column[row]
-    if value.is_valid and pa.types.is_struct(value.type):
-        value = value["bytes"]
-    return memoryview(value.as_buffer()).cast("B") if value.is_valid else None
+def pictures_of(batch: pa.RecordBatch, names: dict[FrameFile, str]) -> list[Pictures]:
+    """Give the pictures of a batch's rows where they lie in its memory, since a value that Arrow gives is a copy. names: of their columns."""
+    found: list[Pictures] = [{} for _ in range(len(batch))]
+    for file, name in names.items():
+        column = batch.column(name)
+        values = column.field("bytes") if pa.types.is_struct(column.type) else column
+        _, bounds, data = values.buffers()
+        begins = np.frombuffer(bounds, np.int32)[values.offset :]
+        known = pc.and_(column.is_valid(), values.is_valid()).to_pylist()
+        whole = memoryview(data or b"").cast("B")
+        for i, row in enumerate(found):
+            row[file] = whole[begins[i] : begins[i + 1]] if known[i] else None
+    return found
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
