@@ -128,6 +128,11 @@ THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand 
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 FIFTH_SET = Path(__file__).with_name("prose_fifth.jsonl")
 SIXTH_SET = Path(__file__).with_name("prose_sixth.jsonl")  # hard styles, whose wordings are kept from the reader
+# Two thirds in plain styles, a third in freer ones, three hands on flights of three maps that had seen nothing of the reader. The first two
+# were read while rules were written; the ninth was looked at by nobody, and its wordings are kept from the reader.
+SEVENTH_SET = Path(__file__).with_name("prose_seventh.jsonl")
+EIGHTH_SET = Path(__file__).with_name("prose_eighth.jsonl")
+NINTH_SET = Path(__file__).with_name("prose_ninth.jsonl")
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 
@@ -234,7 +239,7 @@ CASES = [
     Case("en", HOLD, H, "The person cannot be seen any more.", (), (("cannot be seen any more", "can be seen plainly"),)),
     Case("en", HOLD, H, "Not visible now; visible at t0, t1 and t2.", (), (("Not visible now", "Visible now"),)),
     # states, suppositions, plans
-    Case("en", HOLD, H, "The subject had been standing still.", (), (("standing still", "running"),)),
+    Case("en", HOLD, H, "The subject had been standing still.", (("standing still", "running"),)),
     Case("en", FOLLOW, R, "The walker keeps moving.", (("keeps moving", "stands still"),)),
     Case("en", FOLLOW, R, "If she turned left, we would swing left by 30 degrees.", ()),
     Case("en", FOLLOW, R, "The range will shrink to 15 m unless we slow down.", ()),
@@ -338,4 +343,15 @@ CASES = [
     Case("en", HOLD, "search_to_reacquire_target", "Plain at t0, in view at t1, gone at t3, gone now.", ()),
     Case("zh", FOLLOW, R, "人比中心高14像素。", (("14", "34"),)),
     Case("en", FOLLOW, R, "Speeds: ours rose from 2.0 to 3.4 m/s, theirs fell from 1.5 to 1.4.", (("3.4", "6.4"),)),
+    Case("zh", FOLLOW, R, "行人还在走，航向总共右转约 20 度。", (("20", "70"),)),
+    Case("en", FOLLOW, R, "The drone's speed climbs from 2.0 to 3.4 m/s.", (("2.0 to 3.4", "2.0 to 6.4"),)),
+    Case("zh", FOLLOW, R, "水平距离缩短，无人机却在抬高。", (("缩短", "拉大"),)),
+    Case("en", FOLLOW, R, "The person walks straight towards the camera at about 1.4 m/s.", (("1.4", "4.4"),)),
+    Case("en", FOLLOW, R, "Altitude is up two metres and forty centimetres over the window.", ()),
+    Case("zh", HOLD, "search_to_reacquire_target", "行人还站着。", (("还站着", "在狂奔"),)),
+    Case("zh", HOLD, "search_to_reacquire_target", "行人在前三帧清晰可见。", (("前三帧", "五帧里一直"),)),
+    Case("zh", FOLLOW, R, "末帧框为 23×58 像素，偏右 52 像素、偏上 14 像素。", (("23×58", "43×58"),)),
+    Case("zh", FOLLOW, R, "行人正走向机头右侧。", ()),
+    Case("en", FOLLOW, R, "The drone is 5.4 m further along.", ()),
+    Case("en", FOLLOW, R, "The gap is back to 19.7 m after 20.3 m at t3.", (("19.7", "39.7"),)),
 ]  # fmt: skip

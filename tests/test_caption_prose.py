@@ -15,7 +15,21 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from retold import misread
-from specimens_prose import CASES, FIFTH_SET, FOLLOW, FOURTH_SET, HOLD, SECOND_SET, SIXTH_SET, THIRD_SET, WINDOWS, Case
+from specimens_prose import (
+    CASES,
+    EIGHTH_SET,
+    FIFTH_SET,
+    FOLLOW,
+    FOURTH_SET,
+    HOLD,
+    NINTH_SET,
+    SECOND_SET,
+    SEVENTH_SET,
+    SIXTH_SET,
+    THIRD_SET,
+    WINDOWS,
+    Case,
+)
 from wordings import FOREIGN, OWN, SETS
 
 from caption.schema import EvidenceConfig
@@ -78,24 +92,31 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
 
 
 @pytest.mark.parametrize(
-    ("path", "of_all", "numbers", "sides"),
+    ("path", "flagged_at_most", "of_all", "numbers", "sides"),
     [
-        (GOLD_PROSE, 0.845, 0.95, 0.87),
-        (SECOND_SET, 0.815, 0.91, 0.8),
-        (THIRD_SET, 0.68, 0.75, 0.7),
-        (FOURTH_SET, 0.8, 0.795, 0.89),
-        (FIFTH_SET, 0.66, 0.66, 0.79),
-        (SIXTH_SET, 0.31, 0.42, 0.17),  # styles that were not met: little is contradicted, and nothing true
+        (GOLD_PROSE, 0, 0.845, 0.95, 0.87),
+        (SECOND_SET, 0, 0.815, 0.91, 0.8),
+        (THIRD_SET, 0, 0.67, 0.75, 0.66),
+        (FOURTH_SET, 0, 0.8, 0.795, 0.89),
+        (FIFTH_SET, 0, 0.66, 0.66, 0.79),
+        (SEVENTH_SET, 1, 0.65, 0.79, 0.79),
+        (EIGHTH_SET, 0, 0.73, 0.83, 0.63),
+        # Not met: hard styles and common ones. Wanted are 3 % flagged, too.
+        (SIXTH_SET, 2, 0.43, 0.54, 0.29),
+        (NINTH_SET, 2, 0.54, 0.67, 0.46),
     ],
-    ids=["gold", "second", "third", "fourth", "fifth", "sixth"],
+    ids=["gold", "second", "third", "fourth", "fifth", "seventh", "eighth", "sixth", "ninth"],
 )
-def test_captions_of_others_pass_and_their_errors_are_caught(path: Path, of_all: float, numbers: float, sides: float):
-    """Bounds of what is reached on sets that are read by now; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
+def test_captions_of_others_pass_and_their_errors_are_caught(
+    path: Path, flagged_at_most: int, of_all: float, numbers: float, sides: float
+):
+    """Bounds of what is reached on sets that are read by now, and on two that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
+    captions = list(read_gold_prose(path))
     flagged, caught = measure(
         (one.language, one.facts, one.coc, [(error.kind, error.in_text(one.coc)) for error in one.errors])
-        for one in read_gold_prose(path)
+        for one in captions
     )
-    assert flagged <= 0.03
+    assert round(flagged * len(captions)) <= flagged_at_most
     assert caught["all"] >= of_all
     assert caught["numbers"] >= numbers
     assert caught["sides"] >= sides
@@ -125,7 +146,7 @@ def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_nothing(langua
 
     assert state_of(known) == "contradicted"
     assert state_of(unmet) == "unread"
-    monkeypatch.setattr(judging, "is_met", lambda *_: True)
+    monkeypatch.setattr(judging, "is_met", lambda *_, **__: True)
     assert state_of(unmet) == "contradicted"  # it is for its wording alone that it is left unread
 
 

@@ -16,6 +16,7 @@ MORE_THAN = re.compile(
 ZH_MORE = re.compile(
     r"(?<![接将靠附最])(?:高|低|远|近|宽|窄|快|慢|多|少|大|小|长|短)(?:出|了)?(?:约|大约|近|将近)?\s*$"
 )
+MORE_BY = re.compile(r"[多少]出(?:了)?(?:约|大约|近|将近)?\s*$")  # "最后半秒就多出 3.2 米"
 _DOWN_WORDS = frozenset(
     ["less", "lower", "below", "closer", "nearer", "narrower", "shorter", "smaller", "slower", "down", "fewer"]
 )
@@ -49,6 +50,8 @@ class Changing:
             and not (numeral.unit == "px" and self.clause.has("quantity", "centre"))  # "比中心低 49 像素"
         ):
             return "change", -1 if more.group()[0] in "低近窄慢少小短" else 1
+        if self.language == "zh" and numeral.unit == "m" and (more := MORE_BY.search(self.text, 0, numeral.start)):
+            return "change", -1 if more.group()[0] == "少" else 1
         if self._is_done(numeral):
             return "either", sign if numeral.unit != "deg" else 0
         links = [t for t in before if t.kind == "link" and numeral.start - t.end <= 14]
@@ -58,7 +61,7 @@ class Changing:
             and not (self.language == "zh" and self._is_against_time())
         ):
             return "value", 0
-        if (trends and self.text[trends[-1].end - 1] in "到至") or (
+        if (trends and self.text[trends[-1].end - 1] in "到至回") or (
             trends and self.text[: trends[-1].end].endswith(" from")
         ):
             return "value", 0

@@ -157,7 +157,7 @@ def _may_be_slant(token: Token, text: str) -> Token:
 _PARTICLE = re.compile(
     r"\b(?!look|point|pitch|tilt|camera|angl|view|px|pixel|m\b|met|deg|straight|further|slow|pick|catch|caught|keep|end|set|show|upside|sum|line|well|nose|face|facing|bear|gaz|see|head|pan|turn|follow|close|clos|open|back|make|made|take|speed|sped|brought|bring|cover|hold|held|lock|give|gave|brow|slope|high|half|so|and|or|is|are|it|the|#)"
     r"[a-z]+ (up|down)\b(?! to t\d| with| front)"
-    r"|(?:^|[,;(:]|\b(?:is|are|was|now|currently|and)) ?(up|down) (?=(?:by |from |to )?(?:about |roughly |almost |nearly |some |an? )*[#\d])"
+    r"|(?:^|[,;(:]|\b(?:is|are|was|now|currently|and)) ?(up|down) (?=(?:by |from |to )?(?:about |roughly |almost |nearly |some |an? )*(?:[#\d]|(?:one|two|three|four|five|six|seven|eight|nine|ten|half)\b))"
 )
 
 
@@ -166,8 +166,9 @@ def _particles(text: str, tokens: list[Token]) -> list[Token]:
     taken = [(t.start, t.end) for t in tokens if t.kind in ("trend", "side", "modality", "action", "time", "link")]
     found = []
     for match in _PARTICLE.finditer(text):
-        if not any(start < match.end() and match.start(1) < end for start, end in taken):
-            found.append(Token("trend", match[1] or match[2], match.start(1 if match[1] else 2), match.end()))
+        at = match.start(1 if match[1] else 2)
+        if not any(start < match.end() and at < end for start, end in taken):
+            found.append(Token("trend", match[1] or match[2], at, match.end()))
     return found
 
 

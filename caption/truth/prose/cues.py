@@ -116,7 +116,7 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
             t.value,
         )
         for t in clause.of("who", "drone", "target")
-        if sentence.text[t.start : t.end] not in OBJECTS
+        if sentence.text[t.start : t.end] not in OBJECTS and not is_aimed_at(sentence, clause, t)
     )
     if not ranked and _ITS.search(sentence.text, clause.start, clause.end):
         return ""
@@ -131,6 +131,15 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
     if others and others[0] - best < (5 if sentence.language == "en" else 2):
         return ""
     return owner
+
+
+_TOWARDS = re.compile(r"\b(?:towards?|away from|after|past|behind|around|round) (?:the |our )?$|(?:朝着?|朝向|远离)$")
+
+
+def is_aimed_at(sentence: Sentence, clause: Clause, token: Token) -> bool:
+    """Tell whether somebody is only where another goes: "walks towards the camera at 1.2 m/s"."""
+    others = [t for t in clause.of("who", "drone", "target") if t.value != token.value and t.end <= token.start]
+    return bool(others) and _TOWARDS.search(sentence.text, clause.start, token.start) is not None
 
 
 _ITS = re.compile(r"\bits?\b|其")

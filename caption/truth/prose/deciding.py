@@ -51,6 +51,8 @@ def actions_of(sentence: Sentence, clause: Clause, *, is_plan: bool) -> list[Sai
     """Give the actions that a clause names and does not refuse."""
     found: list[Said] = []
     for token in clause.of("action"):
+        if token.value == "fast" and _SHEDS.search(sentence.text, 0, token.start):
+            continue  # "bleeds off yet more speed"
         if not _is_refused(sentence, clause, token) and not _IS_ATTRIBUTE.match(sentence.text, token.end):
             side = _side_of(sentence, clause, token) if token.value in _SIDED else 0
             force = _force(sentence, clause, token, is_plan=is_plan)
@@ -80,6 +82,7 @@ def _is_praised(text: str, clause: Clause, token: Token, language: str) -> bool:
     return _PRAISED["zh"].search(text, clause.start, token.start) is not None
 
 
+_SHEDS = re.compile(r"\b(?:bleed|shed|scrub|los|drop|dump|wash|tak)\w* (?:off )?(?:\w+ )?$")
 _IS_ATTRIBUTE = re.compile(
     r"\s*(?:offset|error|drift|deviation|component|angle|rate|偏移|误差|偏差|分量)"
 )  # "sideways offset"
@@ -103,7 +106,9 @@ _PRAISED = {
 }  # fmt: skip
 # "you have already let the nose go right": what was asked for once.
 _PERFECT = {
-    "en": re.compile(r"(?:'ve|\bhas|\bhave|\bhad) (?:already |just |now )?(?!to\b|got\b)\w+"),
+    "en": re.compile(
+        r"(?:'ve|\bhas|\bhave|\bhad|\bhaving) (?:already |just |now )?(?!to\b|got\b)\w+|\bhaving (?:already )?$"
+    ),
     "zh": re.compile(r"已经?(?:让|使|把|将)"),
 }
 

@@ -16,6 +16,8 @@ _EXTREME = re.compile(
     r"\b(?:low|high|peak|top|trough|maximum|minimum|mean|average) (?:of|at) (?:only |just )?$|\baverag(?:es|ed|ing) $|\b(?:bottomed out|bottomed|topped out|peaked|topped) at $|\bas (?:low|high|fast|slow) as (?:only |just )?$"
     r"|(?:最高|最低|最大|最小|最快|最慢|峰值|谷底|平均|均值|平均值)(?:为|是|曾|达|到|至|报|只有|仅|约)*\s*$"
 )
+_TURNS = ("yaw", "target_turn", "bearing")
+_OF_TURNS = frozenset([*_TURNS, "heading", "target_heading"])
 _WHOLE = 4  # numbers of a list that runs over the window
 _ROUGHLY = 0.04  # share of a hedged number by which it may lie from another value of the window
 
@@ -30,12 +32,22 @@ class NumberJudge(NumberComparison):
     def holds(self, s: Statement) -> bool | None:
         found = self.compare(s)
         if s.kind == "number" and not self._is_possible(s, is_meant=found is True):
-            return False
+            return None if self._is_others_turn(s) else False
         if s.kind == "course" and self._goes_otherwise(s):
             return False
         if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self.is_of_the_window(s):
             return None
-        return found
+        return None if found is False and self._is_others_turn(s) else found
+
+    def _is_others_turn(self, s: Statement) -> bool:
+        """Tell whether an angle is exactly the other's turn or where the other stands, now: whose it is is often told sentences before."""
+        if s.kind != "number" or not set(s.names) <= _OF_TURNS:
+            return False
+        _, value, step = self.read(s.numbers[0])
+        slack = step + _ROUGHLY * value * bool(s.hedge)
+        others = [self.measured.series(name) for name in _TURNS if name not in s.names]
+        now = [series[-1] for series in others if series and series[-1] is not None]
+        return any(abs(abs(v) - value) <= slack and s.side * v >= 0 for v in now)
 
     def _is_plain(self, s: Statement) -> bool:
         """Tell whether the words leave no doubt whose value a number is, and of which frame."""

@@ -23,6 +23,7 @@ OFF_CENTRE = re.compile(
     r"比(?:画面|图像|镜头)?的?(?:中心|正中|中央|中点|画心)[点线]?(?:要|还|略|稍|偏|靠)*[高低上下](?:约|出|了)*\s*$"
 )
 _WAY_MORE = re.compile(r"[多少](?:走|飞)(?:出|了)?(?:约|大约)?\s*$")
+_ON_ITS_WAY = re.compile(r"\s*(?:along|on|ahead|forward)\b")  # "3.6 m further along"
 _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "m": {
         "closer nearer farther further 近 远": ("distance", "slant"),
@@ -105,7 +106,7 @@ class Naming:
             return ()
         if self.language == "en":
             match = MORE_THAN.match(self.text, numeral.end)
-            word = match["word"] if match else ""
+            word = match["word"] if match and not _ON_ITS_WAY.match(self.text, match.end()) else ""
         else:
             match = ZH_MORE.search(self.text[self.clause.start : numeral.start])
             word = match.group()[0] if match else ""

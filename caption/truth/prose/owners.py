@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import OBJECTS, Context
+from caption.truth.prose.cues import OBJECTS, Context, is_aimed_at
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.numerals import Numeral
 
@@ -67,7 +67,11 @@ class Owners:
         for who in reversed(people):
             if any(_GENITIVE.fullmatch(self.text, who.end, t.start) for t in quantities if who.end <= t.start):
                 return who.value
-            is_subject = who.end <= numeral.start and self.text[who.start : who.end] not in OBJECTS
+            is_subject = (
+                who.end <= numeral.start
+                and self.text[who.start : who.end] not in OBJECTS
+                and not is_aimed_at(self.sentence, self.clause, who)
+            )
             if is_subject and _COMPARED.search(self.text, 0, who.start) and ":" in self.text[who.end : numeral.start]:
                 continue  # "faster than she was: 4.3 m/s"
             if is_subject and any(

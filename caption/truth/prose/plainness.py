@@ -36,6 +36,10 @@ _TURNS = re.compile(
 )
 
 
+_UNSEEN = re.compile(r"occlu|\bhidden|out of (?:view|sight|frame)|outside|遮挡|视野外|看不[见到]")  # whenever that was
+_ORDINALS = re.compile(  # several frames that are told one by one: "in the second and third frames"
+    r"\b(?:first|second|third|fourth|#) (?:and|to|through|or) (?:the )?(?:second|third|fourth|fifth|last|final|#)\b"
+)
 _BACK = {"en": re.compile(r"\bback (?:at|to|up|down|on)\b"), "zh": re.compile(r"回到|又回|复又")}
 
 
@@ -52,16 +56,20 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
     match found.kind:
         case "state":
             return (
-                found.word in ("walking", "standing")  # others are rarely met, or idioms: "running out"
+                found.word in ("walking", "standing", "running")  # others are rarely met
                 and not _STANDS_AT.match(text, token.start)
                 and not clause.has("who", "scene")
                 and _has_subject(token, clause, language, found)
             )
         case "visibility":
             return (
-                _is_of_frame(clause)
+                (
+                    _is_of_frame(clause)
+                    or (found.frames is None and _UNSEEN.search(text, token.start, token.end) is not None)
+                )
                 and found.word != "visible"  # "to keep him in the picture", "last seen": never of what is hidden now
                 and not any(sentence.numerals[i].unit in ("m", "percent", "px") for i in clause.numerals)
+                and not _ORDINALS.search(text, clause.start, clause.end)
             )
         case "trend":
             allowed = (
@@ -116,7 +124,9 @@ def _is_of_drone(before: str, clause: Clause) -> bool:
 def _has_subject(token: Token, clause: Clause, language: str, found: Statement) -> bool:
     whose = "drone" if found.word in ("hovering", "flying") else "target"
     people = [t for t in clause.of("who", "drone", "target") if (t.start, t.end) != (token.start, token.end)]
-    return bool(people) and all(t.value == whose for t in people) and people[0].start < token.start
+    if not people or any(t.value != whose for t in people):
+        return False
+    return people[0].start < token.start or 0 <= people[0].start - token.end <= 1  # "the motionless walker"
 
 
 def _is_of_frame(clause: Clause) -> bool:

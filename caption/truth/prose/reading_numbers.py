@@ -42,6 +42,7 @@ _IN_LAST_STEP = {
     "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
     "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
 }  # fmt: skip
+_AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
 _AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 
@@ -115,7 +116,10 @@ class NumberReader:
         if per_second or self.clause.is_blocked(first.start) or self._is_planned(first.start):
             self.left_out = True
         elif "x" in joins or (joins[:1] in (["*"], ["by"], ["乘"]) and first.unit == "px"):
-            self._pairs(members)
+            in_pairs = len(members) if "x" in joins[1:] else 2
+            self._pairs(members[:in_pairs])
+            for i in members[in_pairs:]:  # "21x44 px, 4 px left, 7 px up"
+                self._single([i], "number")
         elif first.unit == "percent":
             for i in members:
                 self._percent(i)
@@ -284,7 +288,7 @@ class NumberReader:
                 self.statements = [s for s in self.statements if s is not early and s is not late]
                 self._course(late.numbers[0], early.numbers[0])
                 return
-            if a.unit != b.unit or not self.timing.goes_to(b):
+            if a.unit != b.unit or not self.timing.goes_to(b) or _AFTERWARDS.search(self.text, a.end, b.start):
                 continue
             if self.timing.comes_from(a) or (
                 late.clause == early.clause

@@ -14,11 +14,16 @@ _UNSURE = {
     ),
     "zh": re.compile(r"后|短暂|曾|直到|自|起|一度|之前|此前|先|又"),
 }
-_RUNNING = re.compile(r"\b(?:run|running|jog|jogs|jogging|sprint|sprinting|sprints|rushing)\b|跑")
+_RUNNING = re.compile(r"\b(?:run|running|jog|jogs|jogging|sprint|sprinting|sprints|sprinted|rushing)\b|跑|奔")
 _IDIOM = re.compile(
     r"\s+(?:out of|out|low|late|short|high|hot|parallel|in parallel|smoothly)\b"
 )  # "running out of room"
 _STILL = ("standing still", "motionless", "stationary", "standstill", "immobile", "站着", "站立", "站定", "原地不动")
+_EVERY = tuple(range(32))  # frame of the longest window
+_ALWAYS = {
+    "en": re.compile(r"\b(?:throughout|always|all along|all the time|(?:in |for )?(?:all|each of the) five|(?:in )?every (?:single )?frame|the (?:whole|entire) (?:time|window))\b"),
+    "zh": re.compile(r"一直|始终|全程|五帧(?:里|中|内|都|均|全)|每一?帧都?"),
+}  # fmt: skip
 _WHILE = {
     "en": re.compile(r"\b(?:while|when|where|whilst|if) (?=visible|in view|in sight|seen|hidden)"),
     "zh": re.compile(r"(?:可见|看得见|看得到)(?:时|的时候|期间|之时)"),
@@ -105,7 +110,10 @@ class StateReader(ClauseWords):
         is_one = {t.value for t in self.clause.of("visibility")} == {"hidden", "partly"}  # "partly", "hidden"
         many = len({t.start for t in self.clause.of("visibility")}) > 1 and bool(times_of(self.clause)) and not is_one
         loose = many or (not spans and (counted or _UNSURE[self.language].search(part) is not None))
-        self._add(token, kind="visibility", word=word, negated=negated, frames=None if loose else self._frames(token))
+        frames = None if loose else self._frames(token)
+        if frames is None and not negated and _ALWAYS[self.language].search(part):
+            frames = _EVERY
+        self._add(token, kind="visibility", word=word, negated=negated, frames=frames)
 
     def _negation_before(self, token: Token) -> Token | None:
         """Give the negation that stands right before a word."""

@@ -26,6 +26,8 @@ _APART = {"dist_up": 1, "dist_down": -1}
 _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between a word of change and its number
 
 
+_BESIDE = re.compile(r"[侧方]")
+_GOES = re.compile(r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行")
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
 
 
@@ -121,7 +123,11 @@ class WordReader(ClauseWords):
                 len(same) > 1 or nearest in ("over", "pitch")
             ):
                 return ()
+            if nearest == "speed":
+                return self._speed_names(token)  # "the drone's speed climbs"
             return () if self._owner(token) == "target" else ("altitude",)
+        if len(same) > 1 and any(t.value in _VERTICAL for t in same) and self._is_of_flier():
+            return ()  # of nothing that its clause names: also a climb
         if value in _APART:
             if self.clause.has("quantity", "centre") or self.clause.has("who", "scene") or self._nears_something(token):
                 return ()
@@ -131,6 +137,10 @@ class WordReader(ClauseWords):
         if nearest == "height":
             return ("box_height",) if self._speaks_of_box() else ("altitude",)
         return TREND_SERIES.get(nearest, ())
+
+    def _is_of_flier(self) -> bool:
+        """Tell whether a clause names the drone and no quantity: "无人机却在抬高"."""
+        return self.clause.has("who", "drone") and not self.clause.has("quantity")
 
     def _is_of_size(self, token: Token) -> bool:
         """ "the walker gets smaller", "她越来越小": of a person whose clause names no quantity, the size in the picture."""
@@ -172,6 +182,8 @@ class WordReader(ClauseWords):
                 ranked.append((cost, -(cue.end - cue.start), cue.value))
         if ranked:
             return min(ranked)[2]
+        if any((t.start, t.end) != (token.start, token.end) for t in self.clause.of("quantity")):
+            return ""  # of what its own clause names, not of what was spoken of before
         word = self.text[token.start : token.end]
         if (
             self.language == "en"
@@ -184,7 +196,7 @@ class WordReader(ClauseWords):
             return ""
         if token.start - self.clause.start > (30 if self.language == "en" else 10):
             return ""
-        return self.context.cue
+        return self.context.told or self.context.cue
 
     def _trend_span(self) -> tuple[int, int] | None:
         if self.clause.has("time", "last_step"):
@@ -231,7 +243,7 @@ class WordReader(ClauseWords):
             "offset": ("offset_x",),
             "bearing": ("bearing",),
         }.get(topic)
-        if names is None:
+        if names is None or self._is_of_way(token, topic):
             self.left_out = True
             return
         frames = self._frames(token)
@@ -253,6 +265,12 @@ class WordReader(ClauseWords):
             span=span,
             word="likely" if is_hedged else "",
         )
+
+    def _is_of_way(self, token: Token, topic: str) -> bool:
+        """Tell whether a side of the nose is where somebody goes or stands: "走向机头右侧", "walks off to the left of our heading"."""
+        if topic == "yaw":
+            return self.clause.has("who", "target") or _BESIDE.search(self.text, token.start, token.end + 1) is not None
+        return topic == "bearing" and _GOES.search(self.text, self.clause.start, self.clause.end) is not None
 
     def _topic(self, token: Token, owner: str) -> str:
         ranked = []

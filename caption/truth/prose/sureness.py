@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from functools import cached_property
 
-from caption.truth.prose.changing import MORE_THAN, ZH_MORE
+from caption.truth.prose.changing import MORE_BY, MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import GOES_TO, Context, names_of, without_mean
 from caption.truth.prose.moments import Moments
@@ -277,7 +277,7 @@ class Sureness:
 
     def _follows_trend(self, numeral: Numeral) -> bool:
         trends = [t for t in self.clause.of("trend") if t.value not in ("steady", "mixed") and t.end <= numeral.start]
-        trends = [t for t in trends if not self.text[: t.end].endswith(("到", "至", "为", " to", " from"))]
+        trends = [t for t in trends if not self.text[: t.end].endswith(("到", "至", "回", "为", " to", " from"))]
         return any(_CHANGES_BY[self.language].fullmatch(self.text, t.end, numeral.start) for t in trends)
 
     def _is_changed(self, numeral: Numeral) -> bool:
@@ -295,6 +295,8 @@ class Sureness:
                 return True
         elif numeral.unit == "px" and self.clause.has("quantity", "centre"):
             return False  # "比中心低 49 像素"
+        elif MORE_BY.search(self.text, 0, numeral.start):
+            return True
         elif ZH_MORE.search(self.text[: numeral.start]):
             thans = self.clause.of("link", "than")
             return bool(thans) and not any(thans[0].start <= t.start for t in self.clause.of("who", "target", "drone"))
