@@ -82,12 +82,7 @@ def run_items(
         for record in outcomes:
             records[record.id] = record
             journal.append(record.model_dump())
-            if isinstance(record, Failed):
-                named = "" if record.id in record.message else f"{record.id}: "
-                log.error("%s: %s%s", stage.stage, named, record.message)
-            else:
-                reason = f" ({record.reason})" if isinstance(record, Dropped) else ""
-                log.debug("%s: %s: %s%s, %.2f s", stage.stage, record.id, record.status, reason, record.seconds)
+            _tell(stage.stage, record)
             progress.finish(record.id)
     ordered = [records[item_id] for item_id in ids]
     tally = _tally(stage, ordered)
@@ -100,6 +95,15 @@ def run_items(
             fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
         )
     return Finished(ordered, tally)
+
+
+def _tell(stage: str, record: ItemRecord) -> None:
+    if isinstance(record, Failed):
+        named = "" if record.id in record.message else f"{record.id}: "
+        log.error("%s: %s%s", stage, named, record.message)
+    else:
+        reason = f" ({record.reason})" if isinstance(record, Dropped) else ""
+        log.debug("%s: %s: %s%s, %.2f s", stage, record.id, record.status, reason, record.seconds)
 
 
 def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:

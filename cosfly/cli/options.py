@@ -120,6 +120,13 @@ def _config_path(config: Path | None) -> Path | None:
     return config
 
 
+def needed(name: str, value: Path | None) -> Path:
+    """An option that a stage needs but its subcommands do not: a usage error, exit 2, where it is missing."""
+    if value is None:
+        raise typer.BadParameter("it must be given", param_hint=f"'{name}'")
+    return value
+
+
 def manner(cfg: RunConfig, resume: Resume) -> dict[str, Any]:
     """How a stage works, whatever it makes: arguments that all stages with workers take."""
     from cosfly.settings import manner_of_work

@@ -245,13 +245,7 @@ def run(
     shared = finished.kept
     if not shared:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
-    flights = {
-        name: [
-            DroneTrace.from_json(result_of(r, _Compared).flights.get(name) or {}, f"{out}/items.jsonl: {r.id}: {name}")
-            for r in shared
-        ]
-        for name in cfg.planners
-    }
+    flights = {name: _flights_of(name, shared, out) for name in cfg.planners}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
     named = {name: PLANNERS[name] for name in flights}
     summary = {
@@ -284,6 +278,15 @@ class _Compared(BaseModel):
     flights: dict[str, dict[str, Any]]
     errors: dict[str, str]
     times_ms: dict[str, float]
+
+
+def _flights_of(planner: str, shared: list[Kept], out: Path) -> list[DroneTrace]:
+    return [
+        DroneTrace.from_json(
+            result_of(record, _Compared).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
+        )
+        for record in shared
+    ]
 
 
 def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:

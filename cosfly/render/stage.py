@@ -115,7 +115,9 @@ class RenderConfig(WeatherConfig):
         if self.backend != "gl":
             raise ValueError(f"backend {self.backend} draws no weather: take gl, or weather_mode off")
         if self.look != Look():
-            raise ValueError("look is for flights without weather: leave it out, or take weather_mode off")
+            raise ValueError(
+                "look is for flights without weather: leave it out (--set 'render.look={}'), or take weather_mode off"
+            )
         return self
 
     @field_validator("tracks", "modalities")
@@ -236,20 +238,13 @@ def run(
     check_ground(box_map, boxes)
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)
-    passed = [(number, trace) for number, trace in enumerate(all_traces) if trace.drop_reason is None]
-    if not passed:
-        tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
-        raise stage.nothing_kept(tally, expected="a flight that the planner kept")
+    passed = _passed(stage, all_traces)
     ids_record = _ids_record(box_map, num_others_of(_companies(others, all_traces)))
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
-    items = [
-        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
-        for number, trace in passed
-        for track in cfg.tracks
-    ]
+    items = [_item(number, trace, track) for number, trace in passed for track in cfg.tracks]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file = out / town / IDS_FILE
@@ -269,6 +264,23 @@ def run(
         **_weather_drawn(cfg, made),
     )
     return out
+
+
+def _item(number: int, trace: DroneTrace, track: str) -> Item:
+    return Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
+
+
+def _passed(stage: StageFolder, traces: list[DroneTrace]) -> list[tuple[int, DroneTrace]]:
+    """Give the flights that are drawn, each with its number among all.
+
+    Raises:
+        NothingKept: there is none.
+    """
+    passed = [(number, trace) for number, trace in enumerate(traces) if trace.drop_reason is None]
+    if not passed:
+        tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
+        raise stage.nothing_kept(tally, expected="a flight that the planner kept")
+    return passed
 
 
 def _weather_drawn(cfg: RenderConfig, made: list[_Rendered]) -> dict:
