@@ -61,10 +61,12 @@ class WeatherPass:
     def prepare(
         self, params: WeatherParams, parts: Parts, unseen_lamps: np.ndarray, middle: np.ndarray, half_m: float
     ) -> None:
-        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit, and others (n, 3)."""
-        self._lamps = np.concatenate([street_lamps.lamps_of(parts), unseen_lamps])
+        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit and mirrored in
+        puddles. unseen_lamps: (n, 3), of those that only throw light."""
+        self._lamps = street_lamps.lamps_of(parts)
+        lit = np.concatenate([self._lamps, unseen_lamps])
         self.values, self.sun_direction = uniforms(params), light_direction(params)
-        near = self._lamps[(np.abs(self._lamps[:, :2] - middle[:2]) < half_m + street_lamps.REACH_M).all(axis=1)]
+        near = lit[(np.abs(lit[:, :2] - middle[:2]) < half_m + street_lamps.REACH_M).all(axis=1)]
         light, self._lamp_area = street_lamps.lamp_map(near, middle, half_m)
         self._lamp_map.write(light.tobytes())
 
