@@ -117,6 +117,17 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
         load(BoxesConfig(path=tmp_path / "own.json", metres_per_unit=0.01))
 
 
+def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
+    rows = [f"house,{x},0,4,4,6" for x in range(0, 400, 10)] + ["road,5,5,90,7,wide"]
+    with pytest.raises(InputError) as caught:
+        loaded(tmp_path, "\n".join(["type,x,y,length,width,height", *rows]))
+    assert "line 2: unknown type 'house' (and 39 more)" in str(caught.value)
+    assert "line 42: unknown type 'road' (did you mean 'Roads'?), height is not a finite number: 'wide'" in str(
+        caught.value
+    )
+    assert "2 to mend" in str(caught.value)
+
+
 def test_ours_in_centimetres_is_asked_about_without_advice_that_it_refuses(tmp_path):
     boxes = town()
     write_boxes(

@@ -55,6 +55,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "name": ("name",),  # tells a person which one is meant
 }
 FIELDS = {name: field for field, names in NAMES.items() for name in names}
+TYPES = [kind for kind in KINDS if kind != "NONE"]
 SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
 FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
 DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
@@ -96,11 +97,13 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        for name, kind in types.items():
-            if kind not in KINDS:
-                raise ValueError(
-                    f"{name}: there is no type {kind!r}{nearest(kind, KINDS)}; there are {', '.join(KINDS)}"
-                )
+        wrong = [
+            f"{name}: there is no type {kind!r}{nearest(kind, TYPES)}"
+            for name, kind in types.items()
+            if kind not in TYPES
+        ]
+        if wrong:
+            raise ValueError(f"{'; '.join(wrong)}; there are {', '.join(TYPES)}")
         return types
 
     def inputs(self) -> dict[str, Path]:
@@ -143,14 +146,16 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     rows = list(readers[path.suffix.lower()](cfg, path))
     if not rows:
         raise InputError("the map holds no boxes", where=path)
-    boxes, ids, problems = BoxList(), list[Any](), list[str]()
+    boxes, ids, places = BoxList(), list[Any](), dict[str, list[str]]()
     for row in rows:
         try:
             _add(boxes, row, cfg)
         except _Wrong as wrong:
-            problems.append(f"{row.where}: {wrong}" if row.where else str(wrong))
+            places.setdefault(str(wrong), []).append(row.where)
         ids.append(row.values.get("id"))
-    if problems:
+    if places:
+        # What is wrong with many rows is told once, or it would hide what is wrong with a few.
+        problems = [_placed(where, wrong) for wrong, where in places.items()]
         raise InputError.of_all(problems, where=path, expected=_hint(problems))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
     box_map = boxes.box_map(header)
@@ -159,11 +164,16 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     return _told(box_map, cfg, path)
 
 
+def _placed(where: Sequence[str], wrong: str) -> str:
+    first = f"{where[0]}: {wrong}" if where[0] else wrong
+    return f"{first} (and {len(where) - 1} more)" if len(where) > 1 else first
+
+
 def _hint(problems: Sequence[str]) -> str | None:
     """Say what would have been right, where names are what is wrong."""
     hints = {
         "has no meaning": f"columns {', '.join(FIELDS)}; maps.boxes.ignore leaves others out",
-        "type": f"types are {', '.join(kind for kind in KINDS if kind != 'NONE')}; maps.boxes.types translates others",
+        "type": f"types are {', '.join(TYPES)}; maps.boxes.types={{house: Buildings}} translates others",
     }
     found = [hint for word, hint in hints.items() if any(word in problem for problem in problems)]
     return "; ".join(found) or None
@@ -358,7 +368,7 @@ def _read(values: Mapping[str, Any], cfg: BoxesConfig) -> tuple[str, dict[str, f
 def _kind(values: Mapping[str, Any], cfg: BoxesConfig) -> str:
     name = str(values.get("type", ""))
     kind = cfg.types.get(name, name)
-    if kind not in KINDS or kind == "NONE":
+    if kind not in TYPES:
         alike = {known.lower(): known for known in [*KINDS, *cfg.types]}
         close = get_close_matches(name.lower(), alike, n=1)
         raise _Wrong(
