@@ -22,6 +22,8 @@ from cosfly.reading.limits import MB, limits, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
 
+WORTH_THREADS_BYTES = 8 * MB  # of a row group: one thread takes less time for fewer, and each keeps memory of its own
+
 LEAST_ROW_BYTES = 1_000  # of a row in memory, as values of Python: packed, a million equal ones are a few kB
 
 
@@ -94,8 +96,9 @@ def read_row_group(path: Path | str, table: pq.ParquetFile, k: int, columns: lis
         InputError: it is damaged, or over the limit.
     """
     _check_size(path, table, k)
+    threads = table.metadata.row_group(k).total_byte_size > WORTH_THREADS_BYTES
     with arrow_errors(path):
-        return table.read_row_group(k, columns=columns)
+        return table.read_row_group(k, columns=columns, use_threads=threads)
 
 
 def row_batches(
