@@ -89,6 +89,8 @@ def test_what_cannot_hold_the_depths_is_named(tmp_path):
     np.save(tmp_path / "depth.npy", (ramp(np.float32) * 10).astype(np.float32))
     study = run(tmp_path / "depth.npy", tmp_path / "out")
     assert study.left_out == {"16-bit PNG of millimetres": "depths beyond 65.5 m"}
+    np.save(tmp_path / "depth.npy", (ramp(np.float32) * 1e6).astype(np.float32))
+    assert run(tmp_path / "depth.npy", tmp_path / "out").left_out["16-bit float"] == "depths beyond 65504 m"
 
 
 @pytest.mark.parametrize(

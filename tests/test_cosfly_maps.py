@@ -239,6 +239,7 @@ def broken_worlds() -> list:
         "nodes[0] (GEN_BP_Building_01_C): properties.orientation": lambda n: n["properties"]["orientation"].update(
             roll=9
         ),
+        "world.json: GEN_BP_Building_01_C": lambda n: n["properties"]["scale"].update(x=5e-324),
         "GEN_BP_Building_01_C.instance_name": lambda n: n.update(instance_name="BP_Spaceship_C"),
     }.items():
         bad = copy.deepcopy(good)
@@ -496,6 +497,8 @@ def change(model: dict, path: str, value) -> None:
         ("CityObjects/road/geometry/0/boundaries", [[[8, 9]]], "road.geometry[0].boundaries surface 0: not a ring"),
         ("vertices/8", [10**9, 0, 0], "vertices: the map is too wide"),
         ("vertices/8", [10**400, 0, 0], "vertices[8][0]: the city model holds a number"),
+        ("transform/translate", [0.0, 1e308, 0.0], "transform.translate: not a vector"),
+        ("vertices/8", [1e300, 0, 0], "vertices: not a list of vertices"),
         ("transform/scale/0", 10**400, "transform.scale[0]: the city model holds a number"),
     ],
 )  # fmt: skip

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -236,6 +238,17 @@ def test_scores_survive_the_disk(tmp_path, samples):
             getattr(again, name), getattr(scores, name), equal_nan=name in ("proved", "contradicted", "unread")
         ), name
         assert getattr(again, name).dtype == getattr(scores, name).dtype
+
+
+def test_scores_whose_text_is_no_text_are_damaged(tmp_path, samples):
+    path = tmp_path / "scores.parquet"
+    write_scores(path, scores_of(samples, texts=np.zeros((8, 3))))
+    table = pq.read_table(path)
+    place = table.column_names.index("key")
+    broken = pa.array([b"\xff\xfe"] * len(table), pa.binary()).cast(pa.string(), safe=False)
+    pq.write_table(table.set_column(place, "key", broken), path)
+    with pytest.raises(InputError, match=r"scores\.parquet: not a whole parquet file"):
+        read_scores(path)
 
 
 # --- floors -----------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from release.package.depth import MOST_PNG_M, depth_record, encoded
 from release.record import DepthCodingName
 
 SCHEMA, VERSION = "cosfly.depth_study", "1.0"
+MOST_HALF_M = float(np.finfo(np.float16).max)  # more is no number in 16 bits
 BITS = (8, 10, 12, 16)
 ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: exact values of a float are nearly all unlike
 CM, KB = 100.0, 1000.0
@@ -142,6 +143,9 @@ def _decoded(truth: np.ndarray, measured: np.ndarray, file: Path) -> tuple[dict[
         ("16-bit PNG of millimetres", "millimetre_png"),
     )
     for title, coding in codings:
+        if coding == "float16" and truth[measured].max() > MOST_HALF_M:
+            left_out[title] = f"depths beyond {MOST_HALF_M:g} m"
+            continue
         try:
             blob, errors = encoded(memoryview(npy), coding, file)
         except InputError:

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cosfly.errors import InputError
+from cosfly.products.columns import is_in_range
 from cosfly.reading.documents import MISSING, parse_document, parse_json
 from cosfly.reading.files import read_unpacked
 from cosfly.reading.limits import limits, over_limit
@@ -242,7 +243,7 @@ def _transform(model: dict, path: Path) -> np.ndarray:
             part = np.array(transform[name], dtype=np.float64)
         except (TypeError, ValueError):
             part = np.empty(0)
-        if part.shape != (3,) or not np.isfinite(part).all():
+        if part.shape != (3,) or not is_in_range(part):
             raise InputError("not a vector", where=f"{path}: transform.{name}", expected="three finite numbers")
         parts.append(part)
     return np.array(parts)
@@ -254,7 +255,7 @@ def _vectors(values: Any, where: str) -> np.ndarray:
         vectors = np.empty((0, 3)) if values == [] else np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         vectors = np.empty(0)
-    if vectors.ndim != 2 or vectors.shape[1] != 3 or not np.isfinite(vectors).all():
+    if vectors.ndim != 2 or vectors.shape[1] != 3 or not is_in_range(vectors):
         raise InputError("not a list of vertices", where=where, expected="lists of three finite numbers")
     return vectors
 

@@ -22,11 +22,13 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
+from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.documents import read_json, validation_errors
 
 log = logging.getLogger(__name__)
 
+LEAST_M = 1e-3  # no object is smaller
 M_PER_CM = 0.01
 PLACEHOLDER_CM = 256.0  # the size table gives this cube to every asset that was never measured
 PAVEMENT_TOP_M, ROAD_TOP_M, PAINT_TOP_M, BASE_TOP_M, SLAB_M = 0.0, -0.06, -0.03, -0.12, 0.3
@@ -263,6 +265,11 @@ def _add_node(boxes: BoxList, cfg: SimWorldConfig, node: _Node, asset: Asset, si
     is_placeholder = asset.default_size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
     size = np.array(asset.default_size_m) if is_placeholder else size_cm * M_PER_CM
     size = size * [scale.x, scale.y, scale.z]
+    if not LEAST_M <= size.min() <= size.max() <= LARGEST:
+        raise InputError(
+            "the size of an object cannot be", where=f"{cfg.world}: {node.id}", got=f"{size.tolist()} m, of size and scale",
+            expected=f"{LEAST_M:g} m or more", fix="mend its scale, or its asset's size in the table",
+        )  # fmt: skip
     foot = location.z * M_PER_CM
     low = 0.0 if 0 < foot <= cfg.stand_m else foot
     xy = (location.x * M_PER_CM, -location.y * M_PER_CM)  # Unreal's y points right

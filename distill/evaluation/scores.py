@@ -20,7 +20,7 @@ from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
-from cosfly.reading.tables import row_groups
+from cosfly.reading.tables import arrow_errors, row_groups
 from cosfly.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
 
@@ -190,7 +190,8 @@ def read_scores(path: Path) -> Scores:
             fix = "run cosfly distill evaluate anew"
             raise InputError("not the scores of an evaluation", where=path, got=got, expected="one", fix=fix)
         for name in _NAMES:
-            columns[name] += group.column(name).to_pylist()
+            with arrow_errors(path):  # text that is no UTF-8 shows here
+                columns[name] += group.column(name).to_pylist()
     try:
         return Scores(**{name: _values(name, values) for name, values in columns.items()})
     except (TypeError, ValueError, KeyError) as error:
