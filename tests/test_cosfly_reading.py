@@ -364,6 +364,16 @@ def test_a_picture_is_measured_before_it_is_decoded(limited, monkeypatch):
         arrays.parse_picture(_png(1200, 1000), "x")
 
 
+def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
+    picture = bytearray(rgb_bytes(np.zeros((40, 60, 3), np.uint8)))
+    assert arrays.parse_picture(bytes(picture) + b"what stands behind", "x").shape == (40, 60, 3)
+    place = picture.index(b"IDAT") - 4
+    picture[place : place + 4] = struct.pack(">I", 2**31 - 1)
+    monkeypatch.setattr(cv2, "imdecode", None)  # a decoder would make room for it
+    with pytest.raises(InputError, match="not an image"):
+        arrays.parse_picture(bytes(picture), "x")
+
+
 @pytest.mark.parametrize(
     "data",
     [b"", _png(0, 3), b"BM" + b"\0" * 90, cv2.imencode(".jpg", np.zeros((9, 9, 3), np.uint8))[1].tobytes()],
@@ -444,6 +454,7 @@ def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, lim
     (tree / "Town01/far").symlink_to(tmp_path / "far")
     (tree / "Town01/round").symlink_to(tree)  # and round again
     (tree / "Town01/gone").symlink_to(tmp_path / "nowhere")
+    (tree / "Town01/itself").symlink_to(tree / "Town01/itself")
 
     def found() -> list[str]:
         return [path.parent.relative_to(tree).as_posix() for path in files.files_named(tree, "trajectory.json")]

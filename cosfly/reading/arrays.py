@@ -167,13 +167,24 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
     """
     size = png_size(data)
     image = None
-    if size is not None:
+    if size is not None and _holds_its_chunks(data):
         check_pixels(size[0] * size[1], where, "{} x {} px".format(*size))
         with decoder_errors(where):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError("not an image", where=where, got=f"{len(data)} bytes", expected="a PNG")
     return image
+
+
+def _holds_its_chunks(data: bytes) -> bool:
+    """Tell whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk says, up to gigabytes."""
+    place = len(PNG_SIGNATURE)
+    while place + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, place)
+        place += length + 12
+        if kind == b"IEND":
+            break
+    return place <= len(data)
 
 
 @contextlib.contextmanager

@@ -205,7 +205,7 @@ def files_named(tree: Path, name: str) -> list[Path]:
         for entry in entries.values():
             if entry.is_dir(follow_symlinks=False):
                 waiting.append((folder / entry.name, above))
-            elif entry.is_symlink() and entry.is_dir():
+            elif entry.is_symlink() and os.path.isdir(entry.path):  # a link to itself is none, and no error
                 real = os.path.realpath(entry.path)
                 if not (limits().follow_links or is_below(real, parent)):
                     log.warning(
