@@ -137,14 +137,15 @@ class Filler:
 
     def _check_direction(self, number: Slot, words: Sequence[Slot]) -> Refused | None:
         """Refuse a size beside directions of its quantity none of which is its own: those of other frames. All have been printed."""
-        value = self._look_up(number)[0]
+        found = self._found
+        value = (found.get(number.fact_key) or self._look_up(number))[0]
         assert not isinstance(value, str)
         own = (value > 0) - (value < 0)
         own = -own if number.direction == "side:offset_x" else own  # positive to the right
         if not own:
             return None
         for slot in words:
-            word = self._look_up(slot)
+            word = found.get(slot.fact_key) or self._look_up(slot)
             assert isinstance(word, Fact)
             if _DIRECTIONS.get(str(self._exact_side(slot, word)[0] if slot.is_size else word[0]), 0) != -own:
                 return None

@@ -75,12 +75,14 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
         filled: list[str] = []
         is_reasoning = name == "reasoning_trace"
         for number, sentence in enumerate(read_text(getattr(written, name), language, num_frames, facts.step_s), 1):
-            plain = filler.fill(sentence, is_reasoning=is_reasoning) if isinstance(sentence, Sentence) else sentence
-            if isinstance(plain, Refused):
-                problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
-            elif isinstance(sentence, Sentence):
+            plain: str | Refused = (
+                sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=is_reasoning)
+            )
+            if isinstance(plain, str):
                 states.append(sentence.state)
                 filled.append(plain)
+            else:
+                problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
         texts[name] = "".join(filled)
     if problems:
         return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))
