@@ -10,13 +10,26 @@ import numpy as np
 
 from cosfly.compiled import njit, words_of
 from cosfly.png.checksum import adler32
-from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY, code_lengths, codes_of
+from cosfly.png.huffman import (
+    BASE_LENGTH,
+    BASE_WAY,
+    END,
+    LENGTH_ORDER,
+    LOOK_BITS,
+    MORE_LENGTH,
+    MORE_WAY,
+    MOST_LITERALS,
+    MOST_WAYS,
+    code_lengths,
+    codes_of,
+)
 
-BLOCK_TOKENS = 1 << 16
+BAND_BYTES = 85_000  # unpacked, at least: of a smaller band the lengths of its codes take more than a thousandth
+BAND_END = b"\0\0\xff\xff"  # of a block that holds nothing and ends at a byte
+BLOCK_TOKENS = 1 << 17
 BLOCK_HEAD_BYTES = 1024  # more than the lengths of all codes of a block take
 LONGEST, WINDOW = 258, 32768
 SHORTEST = 4  # bytes of a repetition; of fewer the codes are shorter
-END = 256  # the symbol behind a block's last
 # A token is a byte, or a repetition: these marks and its length.
 REPEATS, IS_ABOVE, LENGTH_BITS = np.uint32(1 << 16), np.uint32(1 << 15), np.uint32(511)
 SYMBOL_OF_LENGTH = np.zeros(LONGEST + 1, np.int64)
@@ -24,46 +37,66 @@ for _s, _base in enumerate(BASE_LENGTH.tolist()):
     SYMBOL_OF_LENGTH[_base:] = END + 1 + _s
 
 
-def deflate(lines: np.ndarray, near: int, above: int) -> bytes:
-    """Pack rows, (h, stride) uint8, as a zlib stream.
+def band_rows(height_px: int, num_bands: int) -> np.ndarray:
+    """Where bands of rows begin, and the row behind the last, (num_bands + 1,) int64."""
+    return np.arange(num_bands + 1) * height_px // num_bands
+
+
+def deflate(lines: np.ndarray, near: int, above: int, num_bands: int = 1) -> list[memoryview]:
+    """Pack rows, (h, stride) uint8, as a zlib stream, in parts: bands of rows of which each can be unpacked without the others.
 
     Args:
         near, above: how many bytes back the pixel before and the one above stand; above 0: nothing repeats there.
     """
     data = np.zeros(lines.size + 8, np.uint8)
     data[:-8] = lines.reshape(-1)
-    # Codes of one optimal code take 9 bits a byte at most.
-    out = np.empty(lines.size * 9 // 8 + BLOCK_HEAD_BYTES * (2 + lines.size // BLOCK_TOKENS), np.uint8)
+    out = np.empty(
+        lines.size * LOOK_BITS // 8 + BLOCK_HEAD_BYTES * (2 + num_bands + lines.size // BLOCK_TOKENS), np.uint8
+    )
     out[:2] = 0x78, 0x01
-    end = _pack(data, words_of(data), near, above if above < WINDOW else 0, words_of(out))
-    return b"".join((out[:end].data, adler32(lines).to_bytes(4, "big")))
+    bounds = band_rows(len(lines), num_bands) * lines.shape[1]
+    ends = _pack(data, words_of(data), bounds, near, above if above < WINDOW else 0, words_of(out))
+    end = ends[-1] + 4
+    out[end - 4 : end] = np.frombuffer(adler32(lines).to_bytes(4, "big"), np.uint8)
+    ends[-1] = end
+    return [out[ends[k] : ends[k + 1]].data for k in range(num_bands)]
 
 
 @njit(cache=True, nogil=True)
-def _pack(data, words, near, above, out):  # type: ignore[no-untyped-def]
-    """Write all blocks, from the third byte of `out` on; gives where the stream ends. data: the rows and eight bytes more."""
-    tokens = np.empty(BLOCK_TOKENS, np.uint32)
-    counts = np.zeros(286, np.int64)
-    size, at, is_last = len(data) - 8, np.int64(0), False
+def _pack(data, words, bounds, near, above, out):  # type: ignore[no-untyped-def]
+    """Write the blocks of all bands, from the third byte of `out` on; gives 0 and where they end. data: the rows and eight bytes more."""
+    tokens, counts = np.empty(BLOCK_TOKENS, np.uint32), np.zeros(MOST_LITERALS, np.int64)
+    num = len(bounds) - 1
+    ends = np.zeros(num + 1, np.int64)
     place, hold, held = np.int64(2), np.uint64(0), np.int64(0)  # whole bytes in `out`, and the `held` bits behind them
-    while not is_last:
-        at, num_tokens = _tokenise(data, words, at, size, near, above, tokens, counts)
-        is_last = at == size
-        counts[END] = 1
-        lengths = code_lengths(counts, np.int64(15))
-        # Ways are two at most, of one bit each.
-        ways = np.zeros(30, np.int64)
-        near_way, above_way = _way_of(near), _way_of(above)
-        ways[near_way] = ways[above_way] = 1
-        place, hold, held = _put(np.int64(is_last) | 2 << 1, np.int64(3), out, place, hold, held)
-        place, hold, held = _write_lengths(lengths, ways, out, place, hold, held)
-        codes, is_second = codes_of(lengths), np.int64(above_way > near_way)
-        near_tail = (1 - is_second) | (near - BASE_WAY[near_way]) << 1
-        above_tail = is_second | (above - BASE_WAY[above_way]) << 1
-        tails = (near_tail, 1 + MORE_WAY[near_way], above_tail, 1 + MORE_WAY[above_way])
-        place, hold, held = _write_tokens(tokens[:num_tokens], codes, lengths, tails, out, place, hold, held)
-        place, hold, held = _put(codes[END], lengths[END], out, place, hold, held)
-    return place + (held + 7 >> 3)
+    # Ways are two at most, of one bit each.
+    ways = np.zeros(MOST_WAYS, np.int64)
+    near_way, above_way = _way_of(near), _way_of(above)
+    ways[near_way] = ways[above_way] = 1
+    is_second = np.int64(above_way > near_way)
+    near_tail = (1 - is_second) | (near - BASE_WAY[near_way]) << 1
+    above_tail = is_second | (above - BASE_WAY[above_way]) << 1
+    tails = (near_tail, 1 + MORE_WAY[near_way], above_tail, 1 + MORE_WAY[above_way])
+    for band in range(num):
+        at, size = bounds[band], bounds[band + 1]
+        while at < size:
+            at, num_tokens = _tokenise(data, words, at, bounds[band], size, near, above, tokens, counts)
+            counts[END] = 1
+            lengths = code_lengths(counts, np.int64(LOOK_BITS))
+            is_last = band == num - 1 and at == size
+            place, hold, held = _put(np.int64(is_last) | 2 << 1, np.int64(3), out, place, hold, held)
+            place, hold, held = _write_lengths(lengths, ways, out, place, hold, held)
+            codes = codes_of(lengths)
+            place, hold, held = _write_tokens(tokens[:num_tokens], codes, lengths, tails, out, place, hold, held)
+            place, hold, held = _put(codes[END], lengths[END], out, place, hold, held)
+        if band < num - 1:
+            place, hold, held = _put(np.int64(0), np.int64(3), out, place, hold, held)
+            place, hold, held = place + (held + 7 >> 3), np.uint64(0), np.int64(0)
+            out[place] = np.uint64(0xFFFF0000)
+            place += len(BAND_END)
+        ends[band + 1] = place
+    ends[num] += held + 7 >> 3
+    return ends
 
 
 @njit(cache=True, nogil=True)
@@ -76,16 +109,16 @@ def _way_of(back):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _tokenise(data, words, at, size, near, above, tokens, counts):  # type: ignore[no-untyped-def]
+def _tokenise(data, words, at, first, size, near, above, tokens, counts):  # type: ignore[no-untyped-def]
     """Fill a block with tokens and count their symbols. Gives how far it came, and how many they are."""
     counts.fill(0)
     n = np.int64(0)
     four = np.uint64(0xFFFFFFFF)
     while n < len(tokens) and at < size:
         length, marks = np.int64(0), REPEATS
-        if at >= near and (words[at] ^ words[at - near]) & four == 0:
+        if at - first >= near and (words[at] ^ words[at - near]) & four == 0:
             length = _num_same(data, words, at, near, size)
-        if above > 0 and at >= above and length < LONGEST and words[at] == words[at - above]:
+        if above > 0 and at - first >= above and length < LONGEST and words[at] == words[at - above]:
             other = _num_same(data, words, at, above, size)
             if other > length + 2:  # whose way back is so much longer
                 length, marks = other, REPEATS | IS_ABOVE

@@ -1,82 +1,138 @@
 """Unpacking deflate streams into a place that they must fill (RFC 1951): several literals at a look, repetitions eight bytes at a time.
 
+A stream can be given as bands: parts that begin at a byte of the source, fill a part of the place that is known, and repeat nothing
+from before it. Three of them are unpacked in turns, so that one's look into its table hides the others'. A band must end where
+the next one begins, in the source and in the place: then what all give is what the stream gives from its beginning on.
+
 Everywhere below, `hold` has the next `held` bits of the source, lowest first, and `position` is the byte behind them; words[k] are the
-eight bytes from the k-th on. A function that finds the stream broken gives a negative place.
+eight bytes from the k-th on. A function that finds the stream broken gives a negative position, or False.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from cosfly.compiled import int64, njit, words_of
-from cosfly.png.huffman import BASE_LENGTH, BASE_WAY, LENGTH_ORDER, MORE_LENGTH, MORE_WAY
+from cosfly.png.huffman import (
+    BASE_LENGTH,
+    BASE_WAY,
+    BROKEN,
+    END,
+    LENGTH_ORDER,
+    LOOK,
+    LOOK_BITS,
+    MORE_LENGTH,
+    MORE_WAY,
+    MOST_LITERALS,
+    MOST_WAYS,
+    fill,
+    fill_fixed,
+    find_runs,
+    next_long,
+    next_symbol,
+)  # fmt: skip
 
-LOOK_BITS = 11
-LOOK = np.uint64((1 << LOOK_BITS) - 1)
+LANES = 3  # bands that are unpacked in turns
 LOOKS = 56 // LOOK_BITS  # in the bits that one fetch has at least
-MOST_AT_ONCE = 3  # literals of a look
-SPARE = 32  # bytes behind what a stream fills, which looks and copies may write
+SPARE = 32  # bytes that looks and copies may write behind theirs; nearer to the end of a band they go byte by byte
 STORED, FIXED, OWN = 0, 1, 2  # forms of a block
-END = 256
-MOST_LITERALS, MOST_WAYS = 286, 30
-BROKEN = np.int64(-1)
+# What a lane has: its band, negative where none is left, and where that begins and ends in `out`; whether it is between two blocks, and whether
+# the one that it reads is the stream's last. How far it is, unsigned: of a signed index numba looks whether it counts from the end.
+BAND, FIRST, BEHIND, IS_BETWEEN, IS_LAST = range(5)
+POSITION, HOLD, HELD, AT = range(4)
+NEXT, OPEN, USED = 0, 1, 2  # in a tally: the band that is taken next, lanes that have one, where the stream ends
+LONGEST = np.uint64(258)  # bytes of a repetition
+ZERO, ONE, THREE, FOUR, EIGHT, LOW, FULL, FETCHED = (np.uint64(n) for n in (0, 1, 3, 4, 8, 15, 63, 56))
 
 
-class Code(NamedTuple):
-    """A Huffman code. table (2 ** LOOK_BITS,) uint16: symbol * 16 + length by the next bits, 0 for what is longer, which is found by
-    symbols, in the order of their codes, and by length: ends, the first code that is longer, from the left in 16 bits; firsts, what a
-    code of that length is less than its place in symbols."""
+def inflate(packed: bytes | memoryview, starts: np.ndarray, ends: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, int]:  # fmt: skip
+    """Unpack a stream of one band or several.
 
-    table: np.ndarray
-    symbols: np.ndarray
-    ends: np.ndarray
-    firsts: np.ndarray
-
-
-def inflate(packed: bytes, start: int, size: int) -> tuple[np.ndarray, int]:
-    """Unpack the stream that begins at a byte.
-
+    Args:
+        starts, ends: (n,) int64, where each band begins and ends in `packed`; of the last, bytes behind its stream count.
+        bounds: (n + 1,) int64, where each begins in what is unpacked, and the size of it all.
     Returns:
-        (size,) uint8, and where the stream ends, negative if it is broken or does not fill the size.
+        (size,) uint8, and where the stream ends, negative if it is broken, does not fill the size or has no such bands.
     """
-    out = np.empty(size + SPARE, np.uint8)
-    source, room = np.frombuffer(packed, np.uint8), out[:size]
+    source, room = np.frombuffer(packed, np.uint8), np.empty(bounds[-1], np.uint8)
+    source.flags.writeable = False  # whosever bytes they are: compiled for such, once
     if len(source) < 8:
         return room, -1
-    return room, int(_blocks(source, words_of(source), start, out, words_of(out)))
+    return room, int(_unpack(source, words_of(source), starts, ends, bounds, room, words_of(room)))
 
 
 @njit(cache=True, nogil=True)
-def _blocks(source, words, position, out, out_words):  # type: ignore[no-untyped-def]
-    room, at, is_last = len(out) - SPARE, np.int64(0), False
-    hold, held = np.uint64(0), np.int64(0)
+def _unpack(source, words, starts, ends, bounds, out, out_words):  # type: ignore[no-untyped-def]
+    lanes, flow, tally = np.full((LANES, 5), -1, np.int64), np.zeros((LANES, 4), np.uint64), np.zeros(3, np.int64)
+    # Codes of literals by lane, then of ways; and of each lane, the up to three literals that the next bits begin with.
+    tables, symbols = np.zeros((2 * LANES, 1 << LOOK_BITS), np.uint16), np.zeros((2 * LANES, MOST_LITERALS + MOST_WAYS), np.int64)  # fmt: skip
+    limits, runs = np.zeros((2 * LANES, 2, 16), np.int64), np.zeros((LANES, 1 << LOOK_BITS), np.uint32)
     lengths = np.zeros(MOST_LITERALS + MOST_WAYS + 4, np.int64)
-    literal, way = _new_code(), _new_code()
-    runs = np.zeros(1 << LOOK_BITS, np.uint32)
-    while not is_last:
-        position, hold, held = _fetch(source, words, position, hold, held)
-        is_last = hold & np.uint64(1) != 0
-        form = np.int64(hold >> np.uint64(1) & np.uint64(3))
-        hold, held = hold >> np.uint64(3), held - 3
-        if held < 0:
-            return BROKEN
-        if form == STORED:
-            position, at = _copy_stored(source, position - (held >> 3), out, at, room)
-            hold, held = np.uint64(0), np.int64(0)
-        elif form == FIXED:
-            _fixed_codes(lengths, literal, way)
-        elif form == OWN:
-            position, hold, held = _own_codes(source, words, position, hold, held, lengths, literal, way)
-        if position < 0 or form > OWN:
-            return BROKEN
-        if form != STORED:
-            _find_runs(literal.table, runs)
-            position, hold, held, at = _symbols(source, words, position, hold, held, out, out_words, at, room, literal, runs, way)  # fmt: skip
-            if position < 0:
+    for lane in range(LANES):
+        _take(lanes, flow, tally, lane, starts, bounds)
+    while tally[OPEN] > 0:
+        one = np.int64(0)
+        for lane in range(LANES):
+            if lanes[lane, IS_BETWEEN] == 1 and not _next_block(source, words, lanes, flow, tally, lane, tables, symbols, limits, runs, lengths, starts, ends, bounds, out):  # fmt: skip
                 return BROKEN
-    return position - (held >> 3) if at == room and held >= 0 else BROKEN
+            if lanes[lane, BAND] >= 0:
+                one = np.int64(lane)
+        first, num = (int64(0), int64(LANES)) if tally[OPEN] == LANES else (one, int64(1))
+        if tally[OPEN] > 0 and not _symbols(source, words, lanes, flow, first, num, tables, symbols, limits, runs, out, out_words):  # fmt: skip
+            return BROKEN
+    return tally[USED]
+
+
+@njit(cache=True, nogil=True)
+def _take(lanes, flow, tally, lane, starts, bounds):  # type: ignore[no-untyped-def]
+    """Let a lane begin the next band, or close it where there is none."""
+    band, had_one = tally[NEXT], lanes[lane, BAND] >= 0
+    has_one = band < len(starts)
+    tally[OPEN] += np.int64(has_one) - np.int64(had_one)
+    lanes[lane, BAND], lanes[lane, IS_BETWEEN] = BROKEN, 0
+    if has_one:
+        tally[NEXT] = band + 1
+        lanes[lane, BAND], lanes[lane, FIRST], lanes[lane, BEHIND] = band, bounds[band], bounds[band + 1]
+        lanes[lane, IS_BETWEEN], lanes[lane, IS_LAST] = 1, 0
+        flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = starts[band], 0, 0, bounds[band]
+
+
+@njit(cache=True, nogil=True)
+def _next_block(
+    source, words, lanes, flow, tally, lane, tables, symbols, limits, runs, lengths, starts, ends, bounds, out
+):  # type: ignore[no-untyped-def]
+    """Read the head of a lane's next block, whose codes it then has; where its band is done, of the next band's first."""
+    while lanes[lane, BAND] >= 0:
+        position, hold, held, at = np.int64(flow[lane, POSITION]), flow[lane, HOLD], np.int64(flow[lane, HELD]), np.int64(flow[lane, AT])  # fmt: skip
+        is_end, is_end_of_all = at == lanes[lane, BEHIND], lanes[lane, BAND] == len(starts) - 1
+        if lanes[lane, IS_LAST] == 1:
+            tally[USED] = position - (held >> 3)
+            _take(lanes, flow, tally, lane, starts, bounds)
+            return is_end and is_end_of_all
+        if is_end and not is_end_of_all and held == 0 and position == ends[lanes[lane, BAND]]:
+            _take(lanes, flow, tally, lane, starts, bounds)
+            continue
+        position, hold, held = _fetch(source, words, position, hold, held)
+        lanes[lane, IS_LAST], form = np.int64(hold & ONE), np.int64(hold >> ONE & THREE)
+        hold, held = hold >> THREE, held - 3
+        if held < 0 or form > OWN:
+            return False
+        if form == STORED:
+            position, at = _copy_stored(source, position - (held >> 3), out, at, lanes[lane, BEHIND])
+            if position < 0:
+                return False
+            flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = position, 0, 0, at
+            continue
+        if form == FIXED:
+            fill_fixed(tables, symbols, limits, (lane, LANES + lane), lengths)
+        else:
+            position, hold, held = _own_codes(source, words, position, hold, held, tables, symbols, limits, (lane, LANES + lane), lengths)  # fmt: skip
+        if position < 0:
+            return False
+        find_runs(tables[lane], runs[lane])
+        flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], lanes[lane, IS_BETWEEN] = position, hold, held, 0
+        return True
+    return True
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -91,98 +147,8 @@ def _fetch(source, words, position, hold, held):  # type: ignore[no-untyped-def]
     return position, hold, held
 
 
-# --- codes ------------------------------------------------------------------------------------------------------------
-
-
 @njit(cache=True, nogil=True)
-def _new_code():  # type: ignore[no-untyped-def]
-    table, symbols = np.zeros(1 << LOOK_BITS, np.uint16), np.zeros(MOST_LITERALS + MOST_WAYS, np.int64)
-    return Code(table, symbols, np.zeros(16, np.int64), np.zeros(16, np.int64))
-
-
-@njit(cache=True, nogil=True)
-def _fill(code, lengths):  # type: ignore[no-untyped-def]
-    """Fill the tables of a code of these lengths; False where they are none."""
-    table, symbols, ends, firsts = code
-    counts = np.zeros(16, np.int64)
-    for length in lengths:
-        counts[length] += length > 0
-    starts, codes = np.zeros(17, np.int64), np.zeros(17, np.int64)
-    left, word = np.int64(1), np.int64(0)
-    for n in range(1, 16):
-        left = left * 2 - counts[n]
-        if left < 0:
-            return False
-        starts[n + 1] = starts[n] + counts[n]
-        word = word + counts[n - 1] << 1
-        codes[n] = word
-        ends[n] = word + counts[n] << 16 - n
-        firsts[n] = starts[n] - word
-    table.fill(0)
-    for s in range(len(lengths)):
-        n = lengths[s]
-        if n == 0:
-            continue
-        symbols[starts[n]] = s
-        starts[n] += 1
-        if n <= LOOK_BITS:
-            turned, word = np.int64(0), codes[n]
-            for _ in range(n):
-                turned = turned << 1 | word & 1
-                word >>= 1
-            for at in range(turned, len(table), 1 << n):
-                table[at] = s * 16 + n
-        codes[n] += 1
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _find_runs(table, runs):  # type: ignore[no-untyped-def]
-    """Of the next bits, the up to three literals that they begin with: bits, how many (16s), the bytes (256s); 0 where there is none."""
-    for at in range(len(table)):
-        word, used, num, rest = np.int64(0), np.int64(0), 0, np.int64(at)
-        while num < MOST_AT_ONCE:
-            entry = np.int64(table[rest])
-            width = entry & 15
-            if entry == 0 or entry >> 4 >= END or used + width > LOOK_BITS:
-                break
-            word |= entry >> 4 << (8 + 8 * num)
-            used, num, rest = used + width, num + 1, rest >> width
-        runs[at] = word | num << 4 | used
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _next(hold, code):  # type: ignore[no-untyped-def]
-    """The next symbol * 16 + its length, -1 where the bits are no code."""
-    entry = np.int64(code.table[np.int64(hold & LOOK)])
-    return entry if entry != 0 else _next_long(hold, code)
-
-
-@njit(cache=True, nogil=True)
-def _next_long(hold, code):  # type: ignore[no-untyped-def]
-    """As `_next`, of codes that are longer than a look: those of each length follow each other, read from the left."""
-    word = np.int64(hold & np.uint64(0xFFFF))
-    word = (word & 0x5555) << 1 | word >> 1 & 0x5555
-    word = (word & 0x3333) << 2 | word >> 2 & 0x3333
-    word = (word & 0x0F0F) << 4 | word >> 4 & 0x0F0F
-    word = (word & 0x00FF) << 8 | word >> 8
-    for n in range(LOOK_BITS + 1, 16):
-        if word < code.ends[n]:
-            return code.symbols[code.firsts[n] + (word >> 16 - n)] * 16 + n
-    return BROKEN
-
-
-@njit(cache=True, nogil=True)
-def _fixed_codes(lengths, literal, way):  # type: ignore[no-untyped-def]
-    for s in range(288):
-        lengths[s] = 8 if s < 144 else 9 if s < 256 else 7 if s < 280 else 8
-    _fill(literal, lengths[:288])
-    lengths.fill(5)
-    _fill(way, lengths[:MOST_WAYS])
-
-
-@njit(cache=True, nogil=True)
-def _own_codes(source, words, position, hold, held, lengths, literal, way):  # type: ignore[no-untyped-def]
+def _own_codes(source, words, position, hold, held, tables, symbols, limits, rows, lengths):  # type: ignore[no-untyped-def]
     """Read the codes of a block."""
     position, hold, held = _fetch(source, words, position, hold, held)
     num_literals = np.int64(hold & np.uint64(31)) + 257
@@ -197,12 +163,12 @@ def _own_codes(source, words, position, hold, held, lengths, literal, way):  # t
         position, hold, held = _fetch(source, words, position, hold, held)
         lengths[LENGTH_ORDER[k]] = np.int64(hold & np.uint64(7))
         hold, held = hold >> np.uint64(3), held - 3
-    if not _fill(literal, lengths[: len(LENGTH_ORDER)]):
+    if not fill(tables, symbols, limits, rows[0], lengths[: len(LENGTH_ORDER)]):
         return broken
     at, total = np.int64(0), num_literals + num_ways
     while at < total:
         position, hold, held = _fetch(source, words, position, hold, held)
-        entry = _next(hold, literal)
+        entry = next_symbol(hold, tables, symbols, limits, rows[0])
         if entry < 0 or (held < (entry & 15) + 7 and position < len(source)):
             return broken
         hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
@@ -213,7 +179,9 @@ def _own_codes(source, words, position, hold, held, lengths, literal, way):  # t
         for _ in range(times):
             lengths[at] = value
             at += 1
-    if not _fill(literal, lengths[:num_literals]) or not _fill(way, lengths[num_literals:total]):
+    if not fill(tables, symbols, limits, rows[0], lengths[:num_literals]) or not fill(
+        tables, symbols, limits, rows[1], lengths[num_literals:total]
+    ):
         return broken
     return position, hold, held
 
@@ -228,9 +196,6 @@ def _repeated(symbol, hold, before):  # type: ignore[no-untyped-def]
     if symbol == 17:
         return int64(0), 3 + np.int64(hold & np.uint64(7)), int64(3)
     return int64(0), 11 + np.int64(hold & np.uint64(127)), int64(7)
-
-
-# --- bytes ------------------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
@@ -248,63 +213,146 @@ def _copy_stored(source, position, out, at, room):  # type: ignore[no-untyped-de
     return position + n, at + n
 
 
+# --- symbols ----------------------------------------------------------------------------------------------------------
+# `_symbols` takes nearly all of the time. What is inlined into it gets no arrays: numba would count their owners at each symbol.
+
+
 @njit(cache=True, nogil=True)
-def _symbols(source, words, position, hold, held, out, out_words, at, room, literal, runs, way):  # type: ignore[no-untyped-def]
-    """Unpack a block's symbols up to its end."""
-    broken = BROKEN, hold, held, at
+def _symbols(source, words, lanes, flow, first, num, tables, symbols, limits, runs, out, out_words):  # type: ignore[no-untyped-def]
+    """Unpack symbols of one lane, or of all three in turns, until a block ends; False where there are none."""
+    last = np.uint64(len(words))
+    room_a, room_b, room_c = _room(lanes[first, BEHIND]), _room(lanes[1, BEHIND]), _room(lanes[2, BEHIND])
     while True:
-        position, hold, held, at = _literals(words, position, hold, held, out_words, at, room, runs)
-        position, hold, held = _fetch(source, words, position, hold, held)
-        entry = _next(hold, literal)
-        s = entry >> 4
-        hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
-        if entry < 0 or held < 0 or s >= MOST_LITERALS:
-            return broken
-        if s == END:
-            return position, hold, held, at
-        if s < END:
-            out[at] = s
-            at += 1
+        a, run_a = (flow[first, POSITION], flow[first, HOLD], flow[first, HELD], flow[first, AT]), ONE
+        if num == 1:
+            while run_a != ZERO and a[0] < last and a[3] < room_a:
+                a = _filled(a, words[a[0]])
+                for _ in range(LOOKS):
+                    run_a = np.uint64(runs[first, a[1] & LOOK])
+                    out_words[a[3]] = run_a >> EIGHT  # zeros behind them, where the next ones come
+                    a = _moved(a, run_a)
         else:
-            n, hold, held = _more(hold, held, BASE_LENGTH[s - 257], MORE_LENGTH[s - 257])
-            position, hold, held = _fetch(source, words, position, hold, held)
-            entry = _next(hold, way)
-            s = entry >> 4
-            if entry < 0 or s >= MOST_WAYS:
-                return broken
-            hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
-            back, hold, held = _more(hold, held, BASE_WAY[s], MORE_WAY[s])
-            if held < 0 or back > at or at + n > room:
-                return broken
-            _repeat(out_words, at, back, n)
-            at += n
-        if at > room:
-            return broken
+            b, run_b = (flow[1, POSITION], flow[1, HOLD], flow[1, HELD], flow[1, AT]), ONE
+            c, run_c = (flow[2, POSITION], flow[2, HOLD], flow[2, HELD], flow[2, AT]), ONE
+            while (run_a != ZERO and run_b != ZERO and run_c != ZERO and a[0] < last and b[0] < last and c[0] < last
+                    and a[3] < room_a and b[3] < room_b and c[3] < room_c):  # fmt: skip
+                a, b, c = _filled(a, words[a[0]]), _filled(b, words[b[0]]), _filled(c, words[c[0]])
+                for _ in range(LOOKS):
+                    run_a, run_b, run_c = np.uint64(runs[0, a[1] & LOOK]), np.uint64(runs[1, b[1] & LOOK]), np.uint64(runs[2, c[1] & LOOK])  # fmt: skip
+                    out_words[a[3]], out_words[b[3]], out_words[c[3]] = run_a >> EIGHT, run_b >> EIGHT, run_c >> EIGHT
+                    a, b, c = _moved(a, run_a), _moved(b, run_b), _moved(c, run_c)
+            flow[1, POSITION], flow[1, HOLD], flow[1, HELD], flow[1, AT] = b
+            flow[2, POSITION], flow[2, HOLD], flow[2, HELD], flow[2, AT] = c
+        flow[first, POSITION], flow[first, HOLD], flow[first, HELD], flow[first, AT] = a
+        for lane in range(first, first + num):
+            position, hold, held, at = flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT]
+            room = _room(lanes[lane, BEHIND])
+            if position < last and at < room and runs[lane, hold & LOOK] != 0:
+                continue  # another lane ended the turn
+            if position < last and at + LONGEST < room:
+                position, hold, held, at = _filled((position, hold, held, at), words[position])
+                entry = np.int64(tables[lane, hold & LOOK])
+                if entry == 0:
+                    entry = next_long(hold, symbols, limits, lane)
+                s, length = entry >> 4, np.uint64(entry & 15)
+                hold, held = hold >> length, held - length
+                if entry >= 0 and s < END:
+                    out_words[at] = np.uint64(s)
+                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = (
+                        position,
+                        hold,
+                        held,
+                        at + ONE,
+                    )
+                    continue
+                if s > END and s < MOST_LITERALS:
+                    n, hold, length = _more(hold, BASE_LENGTH[s - 257], MORE_LENGTH[s - 257])
+                    held -= length
+                    entry = np.int64(tables[LANES + lane, hold & LOOK])
+                    if entry == 0:
+                        entry = next_long(hold, symbols, limits, LANES + lane)
+                    s, length = entry >> 4, np.uint64(entry & 15)
+                    if entry < 0 or s >= MOST_WAYS:
+                        return False
+                    back, hold, more = _more(hold >> length, BASE_WAY[s], MORE_WAY[s])
+                    held -= length + more
+                    if back > np.int64(at) - lanes[lane, FIRST]:
+                        return False
+                    _repeat(out_words, np.int64(at), back, n)
+                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = (
+                        position,
+                        hold,
+                        held,
+                        at + np.uint64(n),
+                    )
+                    continue
+            if not _symbol(source, words, lanes, flow, lane, tables, symbols, limits, out):
+                return False
+            if lanes[lane, IS_BETWEEN] == 1:
+                return True
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _literals(words, position, hold, held, out_words, at, room, runs):  # type: ignore[no-untyped-def]
-    """Unpack literals while their codes are short."""
-    while position < len(words) and at <= room:
-        hold |= words[position] << np.uint64(held)
-        position += 63 - held >> 3
-        held |= 56
-        for _ in range(LOOKS):
-            run = runs[hold & LOOK]
-            if run == 0:
-                return position, hold, held, at
-            out_words[at] = run >> 8  # zeros behind them, where the next ones come
-            at += np.int64(run >> 4 & 3)
-            hold >>= np.uint64(run & 15)
-            held -= np.int64(run & 15)
-    return position, hold, held, at
+def _filled(a, word):  # type: ignore[no-untyped-def]
+    position, hold, held, at = a
+    return position + (FULL - held >> THREE), hold | word << held, held | FETCHED, at
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _more(hold, held, base, num_bits):  # type: ignore[no-untyped-def]
-    """A number and the bits that are added to it."""
-    value = base + np.int64(hold & (np.uint64(1) << np.uint64(num_bits)) - np.uint64(1))
-    return value, hold >> np.uint64(num_bits), held - num_bits
+def _moved(a, run):  # type: ignore[no-untyped-def]
+    """Behind a run; one of 0 leaves a lane where it is, and so do all that follow."""
+    position, hold, held, at = a
+    return position, hold >> (run & LOW), held - (run & LOW), at + (run >> FOUR & THREE)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _room(behind):  # type: ignore[no-untyped-def]
+    """Before where a lane may be written by words."""
+    return np.uint64(max(behind - SPARE + 1, 0))
+
+
+@njit(cache=True, nogil=True)
+def _symbol(source, words, lanes, flow, lane, tables, symbols, limits, out):  # type: ignore[no-untyped-def]
+    """Unpack any symbol of a lane, byte by byte, near an end of the source or of its band as well; False where there is none."""
+    at, behind = np.int64(flow[lane, AT]), lanes[lane, BEHIND]
+    position, hold, held = _fetch(
+        source, words, np.int64(flow[lane, POSITION]), flow[lane, HOLD], np.int64(flow[lane, HELD])
+    )
+    entry = next_symbol(hold, tables, symbols, limits, lane)
+    s = entry >> 4
+    hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
+    if entry < 0 or held < 0 or s >= MOST_LITERALS or (s < END and at >= behind):
+        return False
+    if s < END:
+        out[at] = s
+        at += 1
+    elif s == END:
+        lanes[lane, IS_BETWEEN] = 1
+    else:
+        n, hold, more = _more(hold, BASE_LENGTH[s - 257], MORE_LENGTH[s - 257])
+        held -= np.int64(more)
+        position, hold, held = _fetch(source, words, position, hold, held)
+        entry = next_symbol(hold, tables, symbols, limits, LANES + lane)
+        s = entry >> 4
+        if entry < 0 or s >= MOST_WAYS:
+            return False
+        hold, held = hold >> np.uint64(entry & 15), held - (entry & 15)
+        back, hold, more = _more(hold, BASE_WAY[s], MORE_WAY[s])
+        held -= np.int64(more)
+        if held < 0 or back > at - lanes[lane, FIRST] or at + n > behind:
+            return False
+        for k in range(at, at + n):
+            out[k] = out[k - back]
+        at += n
+    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = position, hold, held, at
+    return True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _more(hold, base, num_bits):  # type: ignore[no-untyped-def]
+    """A number and the bits that are added to it; what is held behind them, and how many they are."""
+    bits = np.uint64(num_bits)
+    return base + np.int64(hold & (ONE << bits) - ONE), hold >> bits, bits
 
 
 @njit(cache=True, nogil=True, inline="always")

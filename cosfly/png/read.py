@@ -16,11 +16,13 @@ import numpy as np
 from cosfly.compiled import njit
 from cosfly.errors import InputError
 from cosfly.png.checksum import adler32
+from cosfly.png.deflate import BAND_END, band_rows
 from cosfly.png.inflate import inflate
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
 MOST_NAMED = 8  # chunks
+ZLIB_HEAD_BYTES = 2
 CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
 
 
@@ -64,16 +66,10 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     Raises:
         InputError: it is none, damaged, of another kind, or larger than pictures may be.
     """
-    width, height, kind, packed, others, num_behind = _chunks(data, where)
+    width, height, kind, spans, others, num_behind = _chunks(data, where)
     channels = CHANNELS[kind]
     check_pixels(width * height, str(where), f"{width} x {height} px")
-    if len(packed) < 2 or (packed[0] & 15) != 8 or (packed[0] * 256 + packed[1]) % 31 or packed[1] & 32:
-        raise _broken(where, "a stream that is none of zlib's")
-    out, used = inflate(packed, 2, height * (1 + width * channels))
-    if used < 0:
-        raise _broken(where, "a compressed stream that does not unpack to the picture")
-    if used + 4 > len(packed) or adler32(out) != int.from_bytes(packed[used : used + 4], "big"):
-        raise _broken(where, "pixels that do not agree with their checksum")
+    out = _unpacked(data, spans, height, 1 + width * channels, where)
     lines = out.reshape(height, 1 + width * channels)
     if (lines[:, 0] > 4).any():
         raise _broken(where, "a row with a filter that does not exist")
@@ -84,15 +80,46 @@ def _broken(where: object, got: str) -> InputError:
     return InputError("the image does not decode", where=str(where), got=got, expected="a whole PNG")
 
 
-def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes, tuple[str, ...], int]:
-    """Walk through the chunks: width, height, colour type, the packed pixels, names of other chunks, bytes behind the end."""
+def _unpacked(
+    data: bytes | memoryview, spans: list[tuple[int, int]], height: int, stride: int, where: object
+) -> np.ndarray:
+    """Unpack the stream whose parts stand in these places of the file: by bands where they are such, else from its beginning on."""
+    packed, out, used = data, np.empty(0, np.uint8), -1
+    # What ends a band stands at the end of nobody else's parts but by chance.
+    if 1 < len(spans) <= height and all(data[end - len(BAND_END) : end] == BAND_END for _, end in spans[:-1]):
+        out, used = _inflated(data, spans, band_rows(height, len(spans)) * stride, where)
+    if used < 0:
+        if len(spans) != 1:
+            packed = b"".join(memoryview(data)[start:end] for start, end in spans)
+            spans = [(0, len(packed))]
+        out, used = _inflated(packed, spans, np.array([0, height * stride]), where)
+    if used < 0:
+        raise _broken(where, "a compressed stream that does not unpack to the picture")
+    if used + 4 > spans[-1][1] or adler32(out) != int.from_bytes(packed[used : used + 4], "big"):
+        raise _broken(where, "pixels that do not agree with their checksum")
+    return out
+
+
+def _inflated(packed: bytes | memoryview, spans: list[tuple[int, int]], bounds: np.ndarray, where: object) -> tuple[np.ndarray, int]:  # fmt: skip
+    """Unpack zlib's stream in these places of the bytes by `inflate`, to these places."""
+    start, end = spans[0]
+    head = packed[start : min(start + ZLIB_HEAD_BYTES, end)]
+    if len(head) < ZLIB_HEAD_BYTES or (head[0] & 15) != 8 or (head[0] * 256 + head[1]) % 31 or head[1] & 32:
+        raise _broken(where, "a stream that is none of zlib's")
+    starts, ends = (np.array(places, np.int64) for places in zip(*spans, strict=True))
+    starts[0] += ZLIB_HEAD_BYTES
+    return inflate(packed, starts, ends, bounds)
+
+
+def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, list[tuple[int, int]], tuple[str, ...], int]:  # fmt: skip
+    """Walk through the chunks: width, height, colour type, where the packed pixels are, names of other chunks, bytes behind the end."""
     if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if depth != 8 or kind not in CHANNELS or packing or filters or interlace or not width or not height:
         raise _broken(where, f"{depth} bits, colour type {kind}, interlace {interlace}, {width} x {height} px")
-    position, parts, others, view = len(PNG_SIGNATURE), list[memoryview](), list[str](), memoryview(data)
+    position, spans, others, view = len(PNG_SIGNATURE), list[tuple[int, int]](), list[str](), memoryview(data)
     while position + 12 <= len(data):
         length, name = CHUNK.unpack_from(data, position)
         end = position + 8 + length
@@ -101,9 +128,9 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
         if zlib.crc32(view[position + 4 : end]) != NUMBER.unpack_from(data, end)[0]:
             raise _broken(where, f"a damaged {name.decode('latin-1')} chunk at byte {position}")
         if name == b"IDAT":
-            parts.append(view[position + 8 : end])
+            spans.append((position + 8, end))
         elif name == b"IEND":
-            return width, height, kind, b"".join(parts), tuple(others), len(data) - end - 4
+            return width, height, kind, spans, tuple(others), len(data) - end - 4
         elif name != b"IHDR" and len(others) < MOST_NAMED:
             others.append(name.decode("latin-1"))
         position = end + 4

@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 
 from cosfly.compiled import njit
-from cosfly.png.deflate import deflate
+from cosfly.png.deflate import BAND_BYTES, deflate
 from cosfly.reading.arrays import PNG_SIGNATURE
 
 CHANNELS, COLOUR_TYPE = 3, 2
@@ -26,7 +26,7 @@ def colours_png(rgb: np.ndarray, rows_alone: np.ndarray) -> bytes:
     lines[:, 0] = AVERAGE
     lines[rows_alone, 0] = SUB
     _filter(np.ascontiguousarray(rgb).reshape(height, -1), lines)
-    return _png(lines, deflate(lines, CHANNELS, 0))
+    return _png(lines, deflate(lines, CHANNELS, 0, min(max(lines.size // BAND_BYTES, 1), height)))
 
 
 def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
@@ -39,13 +39,17 @@ def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
     return _png(lines, deflate(lines, CHANNELS, lines.shape[1]))
 
 
-def _png(lines: np.ndarray, packed: bytes) -> bytes:
+def _png(lines: np.ndarray, parts: list[memoryview]) -> bytes:
     height, stride = lines.shape
     head = struct.pack(">IIBBBBB", stride // CHANNELS, height, 8, COLOUR_TYPE, 0, 0, 0)
-    return PNG_SIGNATURE + _chunk(b"IHDR", head) + _chunk(b"IDAT", packed) + _chunk(b"IEND", b"")
+    return (
+        PNG_SIGNATURE
+        + _chunk(b"IHDR", head)
+        + b"".join([*(_chunk(b"IDAT", part) for part in parts), _chunk(b"IEND", b"")])
+    )
 
 
-def _chunk(name: bytes, data: bytes) -> bytes:
+def _chunk(name: bytes, data: bytes | memoryview) -> bytes:
     checksum = zlib.crc32(data, zlib.crc32(name))
     return b"".join((struct.pack(">I", len(data)), name, data, struct.pack(">I", checksum)))
 
