@@ -32,6 +32,7 @@ LONGEST, WINDOW = 258, 32768
 SHORTEST = 4  # bytes of a repetition; of fewer the codes are shorter
 # A token is a byte, or a repetition: these marks and its length.
 REPEATS, IS_ABOVE, LENGTH_BITS = np.uint32(1 << 16), np.uint32(1 << 15), np.uint32(511)
+FOUR, FOURTH, FIRST_FOUR = np.uint64(4), np.uint64(0xFF000000), np.uint64(0xFFFFFFFF)  # bytes of a word
 SYMBOL_OF_LENGTH = np.zeros(LONGEST + 1, np.int64)
 for _s, _base in enumerate(BASE_LENGTH.tolist()):
     SYMBOL_OF_LENGTH[_base:] = END + 1 + _s
@@ -113,10 +114,27 @@ def _tokenise(data, words, at, first, size, near, above, tokens, counts):  # typ
     """Fill a block with tokens and count their symbols. Gives how far it came, and how many they are."""
     counts.fill(0)
     n = np.int64(0)
-    four = np.uint64(0xFFFFFFFF)
+    # Four literals together, each counted in a table of its own: an addition to what was written just now waits for it.
+    kinds = np.zeros((4, 256), np.uint32)
+    here, back, place = np.uint64(at), np.uint64(near), np.uint64(0)
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     while n < len(tokens) and at < size:
+        if above == 0 and at - first >= near:
+            # Where the fourth byte from here differs from its pixel before, none of these four begins a repetition.
+            here, place, end = np.uint64(at), np.uint64(n), np.uint64(max(min(size, at + len(tokens) - n) - 4, 0))
+            while here <= end and (words[here] ^ words[here - back]) & FOURTH != 0:
+                a, b, c, d = data[here], data[here + one], data[here + two], data[here + three]
+                tokens[place], tokens[place + one], tokens[place + two], tokens[place + three] = a, b, c, d
+                kinds[0, a] += 1
+                kinds[1, b] += 1
+                kinds[2, c] += 1
+                kinds[3, d] += 1
+                here, place = here + FOUR, place + FOUR
+            at, n = np.int64(here), np.int64(place)
+            if at == size or n == len(tokens):
+                break
         length, marks = np.int64(0), REPEATS
-        if at - first >= near and (words[at] ^ words[at - near]) & four == 0:
+        if at - first >= near and (words[at] ^ words[at - near]) & FIRST_FOUR == 0:
             length = _num_same(data, words, at, near, size)
         if above > 0 and at - first >= above and length < LONGEST and words[at] == words[at - above]:
             other = _num_same(data, words, at, above, size)
@@ -131,6 +149,8 @@ def _tokenise(data, words, at, first, size, near, above, tokens, counts):  # typ
             counts[data[at]] += 1
             at += 1
         n += 1
+    for s in range(256):
+        counts[s] += np.int64(kinds[0, s]) + np.int64(kinds[1, s]) + np.int64(kinds[2, s]) + np.int64(kinds[3, s])
     return at, n
 
 
@@ -178,7 +198,24 @@ def _write_lengths(lengths, ways, out, place, hold, held):  # type: ignore[no-un
 def _write_tokens(tokens, codes, lengths, tails, out, place, hold, held):  # type: ignore[no-untyped-def]
     """Write tokens. tails: what follows the length of a repetition of the pixel before, its bits; the same of the one above."""
     near_tail, near_bits, above_tail, above_bits = tails
-    for token in tokens:
+    entries = np.empty(256, np.uint64)
+    for s in range(256):
+        entries[s] = codes[s] << 4 | lengths[s]
+    at, num, four, low = np.uint64(0), np.uint64(len(tokens)), np.uint64(4), np.uint64(15)
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
+    while at < num:
+        if at + four <= num:  # four literals together
+            a, b, c, d = tokens[at], tokens[at + one], tokens[at + two], tokens[at + three]
+            if a | b | c | d < REPEATS:
+                w, x, y, z = entries[np.uint64(a)], entries[np.uint64(b)], entries[np.uint64(c)], entries[np.uint64(d)]
+                first = w >> four | x >> four << (w & low)
+                second = y >> four | z >> four << (y & low)
+                word, width = first | second << ((w & low) + (x & low)), (w & low) + (x & low) + (y & low) + (z & low)
+                place, hold, held = _put(word, np.int64(width), out, place, hold, held)
+                at += four
+                continue
+        token = tokens[at]
+        at += one
         if token < REPEATS:
             place, hold, held = _put(codes[token], lengths[token], out, place, hold, held)
         else:
