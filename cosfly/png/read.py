@@ -37,27 +37,23 @@ class Png:
     lines: np.ndarray
     others: tuple[str, ...] = ()
     num_behind: int = 0
-    _is_undone: bool = False
+    _pixels: np.ndarray | None = None
 
     def rows(self, wanted: np.ndarray) -> np.ndarray:
         """Give some rows, (k, w, channels) uint8; of the others those are undone that these lean on."""
-        if not self._is_undone:
+        if self._pixels is None:
             stand_alone = self.lines[:, 0] <= 1
             first = np.maximum.accumulate(np.where(stand_alone, np.arange(self.height_px), 0))[wanted]
             if (wanted - first + 1).sum() < self.height_px // 2:
                 found = _undone_alone(self.lines, first, wanted, self.channels)
                 return found.reshape(len(wanted), self.width_px, self.channels)
-        return self._undone()[wanted, 1:].reshape(len(wanted), self.width_px, self.channels)
+        return self.pixels()[wanted]
 
     def pixels(self) -> np.ndarray:
         """Give the picture, (h, w, channels) uint8."""
-        return self._undone()[:, 1:].reshape(self.height_px, self.width_px, self.channels)
-
-    def _undone(self) -> np.ndarray:
-        if not self._is_undone:
-            _undo(self.lines, self.channels)
-            self._is_undone = True
-        return self.lines
+        if self._pixels is None:
+            self._pixels = _undone(self.lines, self.channels).reshape(self.height_px, self.width_px, self.channels)
+        return self._pixels
 
 
 def parse_png(data: bytes | memoryview, where: object) -> Png:
@@ -148,75 +144,69 @@ def _nearest(left, up, corner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _undo(lines, channels):  # type: ignore[no-untyped-def]
-    """Undo the filters of rows, in place; a row leans on the one before it. A row of zeros stands before the first."""
-    height, stride = lines.shape
-    nothing = np.zeros(stride, np.uint8)
+def _undone(lines, channels):  # type: ignore[no-untyped-def]
+    """Undo the filters of rows, (h, w * channels); a row leans on the one before it. A row of zeros stands before the first."""
+    height, size = lines.shape[0], lines.shape[1] - 1
+    found, nothing = np.empty((height, size), np.uint8), np.zeros(size, np.uint8)
     for y in range(height):
-        row, above = lines[y], lines[y - 1] if y > 0 else nothing
-        if row[0] == 2:
-            for x in range(1, stride):
-                row[x] = (row[x] + above[x]) & 255
-        elif row[0] != 0 and channels == 3:
-            _undo_colours(row, above)
-        elif row[0] != 0:
-            for first in range(1, 1 + channels):
+        kind, row, target, above = lines[y, 0], lines[y, 1:], found[y], found[y - 1] if y > 0 else nothing
+        if kind == 0:
+            for x in range(size):
+                target[x] = row[x]
+        elif kind == 2:
+            for x in range(size):
+                target[x] = (row[x] + above[x]) & 255
+        elif channels == 3:
+            _undo_colours(kind, row, above, target)
+        else:
+            for first in range(channels):
                 left, corner = np.int64(0), np.int64(0)
-                for x in range(first, stride, channels):
+                for x in range(first, size, channels):
                     up = np.int64(above[x])
-                    guess = left if row[0] == 1 else (left + up) >> 1 if row[0] == 3 else _nearest(left, up, corner)
+                    guess = left if kind == 1 else (left + up) >> 1 if kind == 3 else _nearest(left, up, corner)
                     left, corner = (np.int64(row[x]) + guess) & 255, up
-                    row[x] = left
-        row[0] = 0
-
-
-@njit(cache=True, nogil=True)
-def _undone_alone(lines, first, wanted, channels):  # type: ignore[no-untyped-def]
-    """Undo a copy of some rows, (k, w * channels): of each those from its first on, as it leans on these."""
-    found = np.empty((len(wanted), lines.shape[1] - 1), np.uint8)
-    for k in range(len(wanted)):
-        part = lines[first[k] : wanted[k] + 1].copy()
-        _undo(part, channels)
-        found[k] = part[-1, 1:]
+                    target[x] = left
     return found
 
 
 @njit(cache=True, nogil=True)
-def _undo_colours(row, above):  # type: ignore[no-untyped-def]
+def _undone_alone(lines, first, wanted, channels):  # type: ignore[no-untyped-def]
+    """Undo some rows, (k, w * channels): of each those from its first on, as it leans on these."""
+    found = np.empty((len(wanted), lines.shape[1] - 1), np.uint8)
+    for k in range(len(wanted)):
+        found[k] = _undone(lines[first[k] : wanted[k] + 1], channels)[-1]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _undo_colours(kind, row, above, target):  # type: ignore[no-untyped-def]
     """Undo a row of three channels that leans on its left: they are computed beside each other, as each has to wait for its own left."""
     # Unsigned throughout: of a signed index numba looks whether it counts from the end, which takes as long as all the rest.
-    red, green, blue = np.uint32(0), np.uint32(0), np.uint32(0)
-    x, one, two, three, size, byte = (
-        np.uint64(1),
-        np.uint64(1),
-        np.uint64(2),
-        np.uint64(3),
-        np.uint64(len(row)),
-        np.uint32(255),
-    )
-    if row[0] == 1:
+    red, green, blue, byte = np.uint32(0), np.uint32(0), np.uint32(0), np.uint32(255)
+    x, one, two, three, size = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(len(row))
+    if kind == 1:
         while x < size:
             red = (row[x] + red) & byte
             green = (row[x + one] + green) & byte
             blue = (row[x + two] + blue) & byte
-            row[x], row[x + one], row[x + two] = red, green, blue
+            target[x], target[x + one], target[x + two] = red, green, blue
             x += three
-    elif row[0] == 3:
+    elif kind == 3:
         while x < size:
             red = (row[x] + ((red + above[x]) >> one)) & byte
             green = (row[x + one] + ((green + above[x + one]) >> one)) & byte
             blue = (row[x + two] + ((blue + above[x + two]) >> one)) & byte
-            row[x], row[x + one], row[x + two] = red, green, blue
+            target[x], target[x + one], target[x + two] = red, green, blue
             x += three
     else:
         corners = np.int64(0), np.int64(0), np.int64(0)
         lefts = np.int64(0), np.int64(0), np.int64(0)
-        for k in range(1, len(row), 3):
+        for k in range(0, len(row), 3):
             ups = np.int64(above[k]), np.int64(above[k + 1]), np.int64(above[k + 2])
             lefts = (
                 (row[k] + _nearest(lefts[0], ups[0], corners[0])) & 255,
                 (row[k + 1] + _nearest(lefts[1], ups[1], corners[1])) & 255,
                 (row[k + 2] + _nearest(lefts[2], ups[2], corners[2])) & 255,
             )
-            row[k], row[k + 1], row[k + 2] = lefts
+            target[k], target[k + 1], target[k + 2] = lefts
             corners = ups
