@@ -15,20 +15,26 @@ import signal
 import threading
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from release_tampering import forge
-from test_release_export import TWO_SPLITS, make_release, rows_by_id
-from test_release_package import all_bytes
+from release_tampering import errors_in, forge
+from test_release_export import NUM_POINTS, TOWNS, TWO_SPLITS, make_release, rows_by_id
+from test_release_package import CFG, all_bytes, build, make_caption, make_inspection
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.config import build as build_config
 from cosfly.errors import CosflyError, InputError, ResumeError, VerifyError
+from cosfly.products.captions import write_captions
+from cosfly.products.inspection import write_inspection
+from cosfly.products.playback import find_flights, read_flight
 from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
 from release.columns import PICTURES
+from release.export.contract import ExportConfig
+from release.export.stage import run as export
 from release.get import remote as remotes
 from release.get import stage
 from release.get.choice import Choice
@@ -37,6 +43,7 @@ from release.get.stage import NOT_ASKED_FOR
 from release.get.stage import run as get
 from release.record import content_digest, read_record
 from release.verify.verify import verify
+from specimens import make_playback_tree
 
 
 def choice(**wanted) -> Choice:
@@ -177,6 +184,34 @@ def test_a_part_is_a_release_of_the_wanted_rows(wanted, is_wanted, dataset, tmp_
     assert record.history.flights.left_out.get(NOT_ASKED_FOR, 0) == left
     assert (record.licence, record.credits, record.maps) == (whole.licence, whole.credits, whole.maps)
     assert whole.content_digest in (found / "README.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def namesakes(tmp_path_factory) -> Path:
+    """A release of two towns whose trajectories have one name, so that ids begin with the town."""
+    root = tmp_path_factory.mktemp("namesakes")
+    for seed, town in enumerate(TOWNS[:2]):
+        make_playback_tree(root / "tree", 1, NUM_POINTS, seed, width_px=96, height_px=54, towns=(town,))
+    flights = [read_flight(folder) for folder in find_flights(root / "tree")]
+    flights = [replace(f, given_id=f"{f.town}_{f.trajectory}_{f.variant}") for f in flights]
+    write_captions(root / "captions.jsonl", [make_caption(flight, 6, window=[2, 3, 4, 5, 6]) for flight in flights])
+    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **TWO_SPLITS}))
+
+
+def test_a_town_whose_trajectory_has_a_namesake_in_another(namesakes, tmp_path):
+    """It keeps its ids, which alone it would not need, in every form; an id of the other town's is still found."""
+    found = get(choice(towns=["Town01"]), str(namesakes), tmp_path / "out")
+    ids = rows_by_id(found).keys()
+    assert ids == {name for name in rows_by_id(namesakes) if name.startswith("Town01_trajectory_")}
+    report = verify(export(ExportConfig(format="webdataset", shard_mb=1), found, tmp_path / "export"))
+    assert report.is_ok, report
+
+    def of_another_town(rows):
+        for row in rows:
+            row["sample_id"] = row["sample_id"].replace("Town01_", "Town02_")
+
+    assert "sample_id" in errors_in(forge(found, tmp_path / "forged", of_another_town), "rows")
 
 
 def test_a_part_opens_with_datasets_by_split(dataset, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ A source is small and pickles: worker processes open the files themselves.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from operator import itemgetter
@@ -64,13 +64,32 @@ def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
     return FlightRows(entry.name, source.rows(entry), entry.given_id, entry.num_frames)
 
 
-def with_ids(entries: list[Entry]) -> list[Entry]:
-    """Give the entries what their sample ids must begin with; None where two flights have one name."""
+def with_ids(entries: list[Entry], shown: Mapping[str, str] | None = None) -> list[Entry]:
+    """Give the entries what their sample ids must begin with; None where two flights have one name.
+
+    Args:
+        shown: of a part of a release, which another town or run with a trajectory of the same name may have been left out of, the sample id
+            of a row of each entry.
+    """
+    places = [entry.place for entry in entries]
+    elsewhere = [
+        _left_out(place, (shown or {}).get(entry.name, "")) for entry, place in zip(entries, places, strict=True)
+    ]
     try:
-        ids = flight_ids([entry.place for entry in entries])
+        ids = flight_ids([*places, *{place for place in elsewhere if place is not None}])
     except (InputError, TypeError):
         return entries
     return [Entry(e.name, e.parts, e.num_rows, ids[e.place], e.num_frames) for e in entries]
+
+
+def _left_out(place: Place, sample_id: str) -> Place | None:
+    """Give a flight that must have stood beside this one where its rows have such an id: of another town, or of another run."""
+    own = f"{place.trajectory}_{place.variant}_frame_"
+    if sample_id.startswith(f"{place.run}_{place.town}_{own}"):
+        return Place("", place.town, place.trajectory, place.variant)
+    return (
+        Place(place.run, "", place.trajectory, place.variant) if sample_id.startswith(f"{place.town}_{own}") else None
+    )
 
 
 # --- shards -----------------------------------------------------------------------------------------------------------
@@ -78,10 +97,11 @@ def with_ids(entries: list[Entry]) -> list[Entry]:
 
 @dataclass(frozen=True)
 class Shards:
-    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last)."""
+    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last). is_part: of a whole release."""
 
     folder: Path
     files: tuple[FrameFile, ...]
+    is_part: bool = False
 
     def entries(self, names: list[str]) -> list[Entry]:
         """Find which rows are of which flight, in the order in which they stand.
@@ -90,15 +110,18 @@ class Shards:
             InputError: a shard cannot be read.
         """
         parts: dict[str, list[tuple[str, int, int, int]]] = defaultdict(list)
+        shown: dict[str, str] = {}
         for name in names:
             path = self.folder / name
             with open_table(path, tree=self.folder) as table:
                 for group in range(table.num_row_groups):
-                    places = read_row_group(path, table, group, list(PLACE))
+                    places = read_row_group(path, table, group, [*PLACE, "sample_id"])
                     for place, begin, end in flight_spans(places):
                         parts[flight_name(place)].append((name, group, begin, end))
+                        shown.setdefault(flight_name(place), str(places.column("sample_id")[begin]))
         entries = [Entry(name, tuple(own), sum(end - begin for *_, begin, end in own)) for name, own in parts.items()]
-        return with_ids([entry for entry in entries if entry.name.count("/") == len(PLACE) - 1])
+        entries = [entry for entry in entries if entry.name.count("/") == len(PLACE) - 1]
+        return with_ids(entries, shown if self.is_part else None)
 
     def rows(self, entry: Entry) -> list[Row]:
         found: list[Row] = []

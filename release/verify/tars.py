@@ -100,6 +100,7 @@ def found_tars(
     wanted = {"json"} | {"depth.png" if file == "depth" and coding == "millimetre_png" else ENDINGS[file] for file in files}  # fmt: skip
     last: list[tuple[str, int, int]] | None = None  # of the frame before
     parts, counts = defaultdict[str, list[tuple[str, int, int]]](list), Counter[str]()
+    shown: dict[str, str] = {}  # nothing says whether it was a part that was exported
     for shard in shards:
         for key, members in frames_in(folder, shard):
             endings = [ending for ending, _ in members]
@@ -116,6 +117,7 @@ def found_tars(
                 findings.error("leak", f"{shard}: {key}", f"a row of {row['split']}", "the shard's split")
             name = "/".join(str(row[name]) for name in PLACE)
             own = parts[name]
+            shown.setdefault(name, str(row["sample_id"]))
             begin, end = members[0][1].header, members[-1][1].offset + members[-1][1].size
             if own is last and own[-1][0] == shard:  # the flight goes on
                 own[-1] = (shard, own[-1][1], end)
@@ -126,7 +128,7 @@ def found_tars(
     entries = [
         Entry(name, tuple(own), counts[name]) for name, own in parts.items() if name.count("/") == len(PLACE) - 1
     ]
-    return tars, with_ids(entries)
+    return tars, with_ids(entries, shown)
 
 
 def frames_in(folder: Path, shard: str, begin: int = 0, end: int | None = None) -> Iterator[Frame]:

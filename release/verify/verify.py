@@ -133,7 +133,7 @@ def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Fin
 def _verify_rows(folder: Path, record: ReleaseRecord, is_readable: bool, how: _How, findings: Findings) -> None:
     """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
     shards = [shard.path for shard in record.shards]
-    source = Shards(folder, tuple(record.settings.modalities))
+    source = Shards(folder, tuple(record.settings.modalities), record.part_of is not None)
     if not is_readable:
         findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
         return
