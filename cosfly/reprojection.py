@@ -48,8 +48,8 @@ class View:
 @dataclass(frozen=True)
 class Agreement:
     """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there (agree), lie behind
-    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. error: median of those on
-    planes, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
+    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. planes: of
+    those that agree, on planes there; error: median of these, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
     the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
     shifted: points of one thing that is farther or nearer there, as most of it is; 0 where there is none.
     """
@@ -59,6 +59,7 @@ class Agreement:
     hidden: int
     through: int
     same: int
+    planes: int
     error: float
     correlation: float
     tint: float
@@ -94,7 +95,9 @@ def compare_views(
     correlation, tint, shade = _agreement_of(colours, least_contrast)
     error = median_of(errors) if len(errors) >= LEAST_PLANES else np.nan
     seen, agree, hidden, through, same = counts.tolist()
-    return Agreement(seen, agree, hidden, through, same, error, correlation, tint, shade, _num_shifted(firm, moved))
+    return Agreement(
+        seen, agree, hidden, through, same, len(errors), error, correlation, tint, shade, _num_shifted(firm, moved)
+    )
 
 
 def correlate_colours(

@@ -13,9 +13,11 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from specimens_foreign import write_foreign_tree
 from test_release_package import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 
@@ -27,6 +29,7 @@ from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import Flight, find_flights, read_flight, write_flight
+from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from release.package.config import ReleaseConfig
 from release.package.depth import encoded
@@ -272,6 +275,20 @@ def other_size(root: Path) -> None:
         shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
 
 
+def other_kind(frame_file: str, kind: str):
+    """Give what writes a picture anew in another form of PNG, with the same pixels as far as that can be."""
+
+    def change(root: Path) -> None:
+        path = first_flight(root) / "frames_playback/frame_00005" / frame_file
+        picture = Image.fromarray(parse_picture(path.read_bytes(), path)[..., ::-1])
+        if kind == "16 bits":
+            path.write_bytes(cv2.imencode(".png", np.asarray(picture, np.uint16) * 257)[1].tobytes())
+        else:
+            (picture.quantize(256) if kind == "a palette" else picture.convert("L")).save(path)
+
+    return change
+
+
 def captions_of(change):
     return lambda root: rewrite_captions(root, change)
 
@@ -286,6 +303,9 @@ def not_finite(root: Path) -> None:
 DAMAGES = {
     "depth cut by 100 bytes": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/depth.npy", 100), "depth.npy"),
     "a picture cut short": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/rgb.png", 20), "rgb.png"),
+    "a picture of 16 bits": (other_kind("rgb.png", "16 bits"), "16 bits, colour type 2"),
+    "a picture with a palette": (other_kind("rgb.png", "a palette"), "colour type 3"),
+    "a mask of grey": (other_kind("instance.png", "grey"), "8 bits, colour type 0"),
     "a frame that is missing": (lambda r: shutil.rmtree(first_flight(r) / "frames_playback/frame_00005"), "frames are missing"),
     "a picture that is missing": (lambda r: (first_flight(r) / "frames_playback/frame_00005/instance.png").unlink(), "missing or empty"),
     "1e999 in a trajectory": (not_finite, "not finite"),

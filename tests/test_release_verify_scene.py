@@ -13,7 +13,7 @@ from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
 WHOLE = Agreement(
-    seen=2000, agree=2000, hidden=0, through=0, same=2000, shifted=0, error=0.0, correlation=0.97, tint=0.0, shade=0.0
+    seen=2000, agree=2000, hidden=0, through=0, same=2000, planes=1700, shifted=0, error=0.0, correlation=0.97, tint=0.0, shade=0.0
 )  # fmt: skip
 
 
@@ -52,3 +52,18 @@ def test_the_next_frames_place_must_explain_coarse_colours_better_to_be_theirs(w
     findings = judged(found, others, width_px)
     assert [kind.code for kind in findings.kinds.values()] == ["scene_colour"] * is_found
     assert all("if it were the next frame's" in str(kind) for kind in findings.kinds.values())
+
+
+@pytest.mark.parametrize(("usual", "worst", "is_found"), [(0.3, 5.5, False), (0.3, -7.0, True), (2.0, 9.0, False)])
+def test_one_frame_may_not_be_brighter_than_those_beside_it(usual, worst, is_found):
+    """2 and 9 are of an honest flight in dense fog."""
+    found = [replace(WHOLE, shade=usual * (-1) ** k) for k in range(20)]
+    found[12] = replace(WHOLE, shade=worst)
+    findings = judged(found, [np.nan] * 20)
+    assert [kind.code for kind in findings.kinds.values()] == ["scene_colour"] * is_found
+
+
+@pytest.mark.parametrize(("planes", "is_found"), [(300, False), (20, True)])
+def test_depth_without_planes_is_found(planes, is_found):
+    findings = judged([replace(WHOLE, planes=planes, error=np.nan)] * 20, [np.nan] * 20)
+    assert [kind.code for kind in findings.kinds.values()] == ["scene_depth"] * is_found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,10 @@ from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
 
 CHUNK_FRAME_BYTES = 12  # of a PNG's chunk: length, name, checksum
+# Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release take.
+KIND = struct.Struct(">BBxxB")
+KINDS = ((8, 2, 0), (8, 6, 0))
+CONVERT = "convert it without loss, as Pillow's Image.open(FILE).convert('RGB').save(FILE), and inspect the tree again"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 RENDER = "render it again, or put the file back"
 
@@ -40,6 +45,10 @@ def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], w
             expected=f"{size_px[0]} x {size_px[1]} px",
             fix=RENDER,
         )
+    bits, colour_type, interlace = KIND.unpack_from(data, PNG_HEADER_BYTES)
+    if (bits, colour_type, interlace) not in KINDS:
+        got = f"{bits} bits, colour type {colour_type}{', interlaced' if interlace else ''}"
+        raise InputError("a PNG of another kind", where=where, got=got, expected="8 bits, RGB or RGBA (2 or 6), not interlaced", fix=CONVERT)  # fmt: skip
     if not is_known and (chunk := next(_broken_chunks(data), None)):
         raise InputError(
             "a picture is damaged", where=where, got=f"chunk {chunk} does not have its checksum", fix=RENDER

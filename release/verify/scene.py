@@ -14,7 +14,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cosfly.items import advance
-from cosfly.reprojection import Agreement, View, compare_views, correlate_colours, is_zoomed, usual_correlations
+from cosfly.reprojection import (
+    LEAST_PAIRS,
+    Agreement,
+    View,
+    compare_views,
+    correlate_colours,
+    is_zoomed,
+    usual_correlations,
+)
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
 from release.verify.pictures import check_picture, decode, least_step, view_of
@@ -39,6 +47,10 @@ COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
 # Grey levels: of a pale square the grain alone, 4 from frame to frame, leaves honest frames a correlation of 0.7.
 CONTRAST = 10.0
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
+# Grey levels of brightness beside the frame before, and times the median of a flight: honest 3.3 and, in dense fog, 9 where 2 are usual.
+SHADE, SHADE_TIMES = 6.0, 8.0
+# Of the points that agree, as float32, on planes: depth that was made rough has none. Honest 0.8 and more in the median of a flight.
+PLANES_LEAST = 0.1
 # How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
 # before as usual in the flight, and of others. A pixel of a coarse picture
 # holds several details, of which it shows one: honest 0.037 at 320 px wide, below 0 at 1280 px.
@@ -157,7 +169,7 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
     if is_zoomed(
         flight.intrinsics[k], flight.intrinsics[i]
     ):  # other detail is seen: depth and instances tell, colours do not
-        pairs.found[-1] = replace(pairs.found[-1], correlation=np.nan, tint=np.nan)
+        pairs.found[-1] = replace(pairs.found[-1], correlation=np.nan, tint=np.nan, shade=np.nan)
     if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
         moved = replace(view, colours=previous.colours)
         pairs.elsewhere[-2] = correlate_colours(
@@ -197,6 +209,13 @@ def _judge_blocks(flight: FlightRows, steps: np.ndarray, findings: Findings) -> 
         findings.error("scene_colour", flight.name, f"pixels that differ {over / inside:.2f} times as much over every {BLOCK_PX}th edge as elsewhere", f"at most {BLOCKS_MOST:g}: pictures that no lossy coding cut into blocks")  # fmt: skip
 
 
+def _judge_planes(flight: FlightRows, found: list[Agreement], findings: Findings) -> None:
+    """What is drawn is made of planes, and its depth is exact."""
+    shares = [pair.planes / pair.agree for pair in found if pair.agree >= LEAST_AGREE]
+    if len(shares) >= LEAST_PAIRS and np.median(shares) < PLANES_LEAST:
+        findings.error("scene_depth", flight.name, f"depth of which {np.median(shares):.0%} of the points lie on planes", f"at least {PLANES_LEAST:.0%}: depth as it was drawn, without noise")  # fmt: skip
+
+
 def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
     """Find the pairs of frames that do not show one world."""
     if not pairs.found:
@@ -221,6 +240,10 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
     least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
     if np.isfinite(usuals).any() and not flight.is_foreign and np.nanmedian(usuals) < least_colour:
         findings.error("scene_colour", flight.name, f"colours that agree by {np.nanmedian(usuals):.2f} from frame to frame", "pictures of this flight")  # fmt: skip
+    if rounded_as == "float32" and not flight.is_foreign:
+        _judge_planes(flight, pairs.found, findings)
+    shades = np.abs([pair.shade for pair in pairs.found])
+    shade_most = max(SHADE, SHADE_TIMES * float(np.nanmedian(shades))) if np.isfinite(shades).any() else np.inf
     better = BETTER_BY if flight.size_px[0, 0] >= COARSE_PX else BETTER_BY_COARSE
     compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, usuals, drops, strict=True)
     for i, gap, pair, elsewhere, usual_colour, drop in compared:
@@ -243,6 +266,8 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             findings.error("scene_instance", where, f"{pair.same / pair.agree:.1%} of the instances of the frame before", f"at least {SAME_LEAST:.0%} where the depth agrees")  # fmt: skip
         if pair.correlation < usual_colour - drop:
             findings.error("scene_colour", where, f"a picture that resembles the one before by {pair.correlation:.2f}, its camera's way allowed for (1: the same)", f"at least {usual_colour - drop:.2f}, by the flight's other frames: look whether it is of this frame")  # fmt: skip
+        elif abs(pair.shade) > shade_most and gap <= NEAR_FRAMES and not flight.is_foreign:
+            findings.error("scene_colour", where, f"a picture that is {abs(pair.shade):.0f} grey levels {'brighter' if pair.shade > 0 else 'darker'} than the frame before", f"at most {shade_most:.0f}, by the flight's other frames")  # fmt: skip
         elif pair.tint > usual_tint + TINT:
             findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
         elif elsewhere > pair.correlation + (better if pair.correlation < usual_colour - UNUSUAL else BETTER_BY_USUAL):
