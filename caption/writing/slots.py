@@ -78,10 +78,10 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
             plain: str | Refused = (
                 sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=is_reasoning)
             )
-            if isinstance(plain, str):
+            if isinstance(plain, str) and isinstance(sentence, Sentence):
                 states.append(sentence.state)
                 filled.append(plain)
-            else:
+            elif isinstance(plain, Refused):
                 problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
         texts[name] = "".join(filled)
     if problems:
