@@ -128,11 +128,12 @@ THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand 
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 FIFTH_SET = Path(__file__).with_name("prose_fifth.jsonl")
 SIXTH_SET = Path(__file__).with_name("prose_sixth.jsonl")  # hard styles, whose wordings are kept from the reader
-# Two thirds in plain styles, a third in freer ones, three hands on flights of three maps that had seen nothing of the reader. The first two
-# were read while rules were written; the ninth was looked at by nobody, and its wordings are kept from the reader.
+# Plain styles and freer ones, six hands on flights of three maps that had seen nothing of the reader. The first two were read while rules
+# were written; the ninth and the tenth (three hands) were looked at by nobody, and their wordings are kept from the reader.
 SEVENTH_SET = Path(__file__).with_name("prose_seventh.jsonl")
 EIGHTH_SET = Path(__file__).with_name("prose_eighth.jsonl")
 NINTH_SET = Path(__file__).with_name("prose_ninth.jsonl")
+TENTH_SET = Path(__file__).with_name("prose_tenth.jsonl")
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 

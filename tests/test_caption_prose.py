@@ -26,6 +26,7 @@ from specimens_prose import (
     SECOND_SET,
     SEVENTH_SET,
     SIXTH_SET,
+    TENTH_SET,
     THIRD_SET,
     WINDOWS,
     Case,
@@ -104,13 +105,14 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         # Not met: hard styles and common ones. Wanted are 3 % flagged, too.
         (SIXTH_SET, 2, 0.43, 0.54, 0.29),
         (NINTH_SET, 2, 0.54, 0.67, 0.46),
+        (TENTH_SET, 5, 0.43, 0.61, 0.40),
     ],
-    ids=["gold", "second", "third", "fourth", "fifth", "seventh", "eighth", "sixth", "ninth"],
+    ids=["gold", "second", "third", "fourth", "fifth", "seventh", "eighth", "sixth", "ninth", "tenth"],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(
     path: Path, flagged_at_most: int, of_all: float, numbers: float, sides: float
 ):
-    """Bounds of what is reached on sets that are read by now, and on two that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
+    """Bounds of what is reached on sets that are read by now, and on three that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
     captions = list(read_gold_prose(path))
     flagged, caught = measure(
         (one.language, one.facts, one.coc, [(error.kind, error.in_text(one.coc)) for error in one.errors])
