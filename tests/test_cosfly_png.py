@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
-import platform
 import struct
-import subprocess
-import sys
 import zlib
 
 import cv2
@@ -298,25 +295,3 @@ def test_a_whole_picture_is_written_in_bands_of_one_block():
     assert data.count(b"IDAT") == 8
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), picture)
     np.testing.assert_array_equal(parse_png(data, "x").pixels(), picture)
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries are not told")
-def test_freed_memory_is_not_asked_for_again():
-    """A process of its own: what is set stays set."""
-    code = """if 1:
-        import resource, numpy as np
-        from cosfly.freed_memory import keep_freed_memory
-        def num_pages():
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-            for _ in range(20):
-                arrays = [np.ones(3 << 20, np.uint8) for _ in range(4)]
-                del arrays
-            return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-        without = num_pages()
-        keep_freed_memory()
-        num_pages()
-        print(without, num_pages())
-    """
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    without, kept = map(int, found.stdout.split())
-    assert kept < 3000 < without  # 12 MB are 3,072 pages

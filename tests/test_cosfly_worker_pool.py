@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -229,3 +230,25 @@ def test_a_workers_log_lines_reach_the_stages_log(tmp_path, caplog):
     run_items(stage_in(tmp_path), [Item("a")], make_talking_worker, workers=1)
     assert "a speaks of 7" in caplog.text
     assert "not this" not in caplog.text
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries are not told")
+def test_freed_memory_is_not_asked_for_again():
+    """A process of its own: what is set stays set."""
+    code = """if 1:
+        import resource, numpy as np
+        from cosfly.worker import _keep_freed_memory
+        def num_pages():
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+            for _ in range(20):
+                arrays = [np.ones(3 << 20, np.uint8) for _ in range(4)]
+                del arrays
+            return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+        without = num_pages()
+        _keep_freed_memory()
+        num_pages()
+        print(without, num_pages())
+    """
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    without, kept = map(int, found.stdout.split())
+    assert kept < 3000 < without  # 12 MB are 3,072 pages

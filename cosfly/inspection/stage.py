@@ -11,7 +11,6 @@ from collections import Counter
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.freed_memory import keep_freed_memory
 from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
 from cosfly.inspection.report import write_report
 from cosfly.inspection.settings import InspectConfig
@@ -47,7 +46,6 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     obstacles = None if box_map is None else obstacle_index(box_map)
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
     recorded = recorded_digests(data)
-    keep_freed_memory()
 
     def work(item: Item) -> Outcome:
         inspected = inspect_flight(data / item.payload, data, by_id, box_map, obstacles, cfg, recorded)
