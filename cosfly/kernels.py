@@ -25,6 +25,7 @@ NO_OBSTACLE_KINDS = GROUND_KINDS | {KINDS["Water"], KINDS["Sky"]}
 # Ends of the five rays relative to the target's hip point, m (subsec:appendix_planner_tastar).
 RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0.3, 0.0, 0.0], [-0.3, 0.0, 0.0]])
 RAY_SPREAD_M = 0.8  # the longest of the offsets
+CORNER = 3.0**0.5  # so many times what a turned box grows by, its corners come out of its extent at most
 
 
 # Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in BoxIndex.grid.
@@ -267,19 +268,20 @@ def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
         return found
     cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
     ox, oy = index.grid[ORIGIN_X], index.grid[ORIGIN_Y]
-    first_x = max(int(np.floor((min(ax, bx) - inflate_m - ox) / cell)), 0)
-    last_x = min(int(np.floor((max(ax, bx) + inflate_m - ox) / cell)), num_x - 1)
+    reach = CORNER * inflate_m
+    first_x = max(int(np.floor((min(ax, bx) - reach - ox) / cell)), 0)
+    last_x = min(int(np.floor((max(ax, bx) + reach - ox) / cell)), num_x - 1)
     dx = bx - ax
     for ix in range(first_x, last_x + 1):
-        t0, t1 = 0.0, 1.0  # the part of the segment within inflate_m of this column of cells
+        t0, t1 = 0.0, 1.0  # the part of the segment within reach of this column of cells
         if abs(dx) > 1e-12:
-            t0, t1 = (ox + ix * cell - inflate_m - ax) / dx, (ox + (ix + 1) * cell + inflate_m - ax) / dx
+            t0, t1 = (ox + ix * cell - reach - ax) / dx, (ox + (ix + 1) * cell + reach - ax) / dx
             if t0 > t1:
                 t0, t1 = t1, t0
             t0, t1 = max(t0 - 1e-9, 0.0), min(t1 + 1e-9, 1.0)
         y0, y1 = ay + t0 * (by - ay), ay + t1 * (by - ay)
-        first_y = max(int(np.floor((min(y0, y1) - inflate_m - oy) / cell)), 0)
-        last_y = min(int(np.floor((max(y0, y1) + inflate_m - oy) / cell)), num_y - 1)
+        first_y = max(int(np.floor((min(y0, y1) - reach - oy) / cell)), 0)
+        last_y = min(int(np.floor((max(y0, y1) + reach - oy) / cell)), num_y - 1)
         for iy in range(first_y, last_y + 1):
             for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
                 box = index.members[place]
