@@ -16,6 +16,7 @@ DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another, and
 
 # Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+CORNER_SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
 
 
 def rotation_matrix(pitch_rad: float, yaw_rad: float, roll_rad: float) -> np.ndarray:
@@ -106,8 +107,7 @@ def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
 
 def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0.0) -> np.ndarray:
     """Give the eight corners of a box that is turned about z, (8, 3)."""
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
-    return signs * half_extents @ rotation_matrix(0.0, yaw_rad, 0.0).T + center
+    return CORNER_SIGNS * half_extents @ rotation_matrix(0.0, yaw_rad, 0.0).T + center
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.issues import Report
-from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, read_meta, tree_of
+from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, read_meta
+from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
 from cosfly.reading.arrays import array_header, picture_size
 from cosfly.reading.files import sha256_file
@@ -28,6 +29,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
         of each frame that is complete so far its annotation, None in a tree without.
     """
     assert flight.folder is not None
+    tree = tree_of_flight(flight.folder)
     size = (flight.camera.width_px, flight.camera.height_px)
     complete: dict[int, FrameMeta | None] = {}
     absent = [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
@@ -46,7 +48,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
             elif name == "meta.json":
                 meta = _check_meta(flight, i, report)
             else:
-                _check_header(path, size, where, report)
+                _check_header(path, size, tree, where, report)
         if len(report.issues) == problems_before:
             complete[i] = meta
     known = {Path(frame_name(i)).name for i in range(len(flight))}
@@ -71,15 +73,15 @@ def _has_any(flight: Flight, name: str) -> bool:
     return any((flight.frame_folder(i) / name).exists() for i in range(len(flight)))
 
 
-def _check_header(path: Path, size: tuple[int, int], where: str, report: Report) -> None:
+def _check_header(path: Path, size: tuple[int, int], tree: Path, where: str, report: Report) -> None:
     """Check type and (width, height) of a picture or a depth image, by its header."""
     is_depth = path.suffix == ".npy"
     expected = f"float32 ({size[1]}, {size[0]})" if is_depth else f"a PNG of {size[0]} x {size[1]} px"
     try:
         if is_depth:
-            found: object = str(array_header(path, tree=tree_of(path.parent)))
+            found: object = str(array_header(path, tree=tree))
         else:
-            found = picture_size(path, tree=tree_of(path.parent)) or "no PNG header"
+            found = picture_size(path, tree=tree) or "no PNG header"
     except InputError as error:
         found = error.got or error.what
     if found != (expected if is_depth else size):

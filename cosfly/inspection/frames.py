@@ -27,15 +27,15 @@ from cosfly.products.frames import (
     FrameMeta,
     OthersMeta,
     frame_name,
-    tree_of,
 )
 from cosfly.products.kinds import KIND_NAMES, KINDS
+from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import read_bytes
 from cosfly.runner import advance
 
-SMALL_PX = (128, 72)  # frames are shrunk to this before they are compared with each other
+SMALL_PX, SMALL_ROWS = (128, 72), 5  # frames are shrunk to this, of every fifth row, before they are compared with each other
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street still has more than 5
 # The centre of the person's box and its visible surface are at most a half height apart along the optical axis.
 SURFACE_TOLERANCE_M = PERSON_HALF_EXTENTS_M[2] + 0.3
@@ -77,18 +77,19 @@ def check_frames(
     Args:
         metas, told: annotations, and what they tell of others, by frame.
     """
-    numbers, jumps = FrameNumbers(), Jumps(flight)
+    assert flight.folder is not None
+    numbers, jumps, tree = FrameNumbers(), Jumps(flight), tree_of_flight(flight.folder)
     previous: tuple[int, np.ndarray] | None = None
     for i in indices:
         advance()
         where = frame_name(i)
         try:
-            picture = unpack(_read(flight, i, checksums), Path(where))
+            picture = unpack(_read(flight, i, tree, checksums), Path(where))
         except InputError as error:
             report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
             continue
         numbers.num_checked += 1
-        small = cv2.resize(picture.colours, SMALL_PX, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA)
         if small.std() < BLANK_STD:
             report.error("blank_frame", f"{where}/rgb.png", f"standard deviation {small.std():.2f}", "a picture")
         if previous is not None and (previous[1] == small).all() and _moved(flight, previous[0], i):
@@ -107,12 +108,12 @@ def check_frames(
     return numbers
 
 
-def _read(flight: Flight, i: int, checksums: Checksums) -> dict[str, bytes]:
+def _read(flight: Flight, i: int, tree: Path, checksums: Checksums) -> dict[str, bytes]:
     """Read the pictures of a frame that are there; `check_files` said which are not."""
     folder, files = flight.frame_folder(i), dict[str, bytes]()
     for name in FILE_NAMES.values():
         if (path := folder / name).exists():
-            files[name] = read_bytes(path, what="image", tree=tree_of(folder))
+            files[name] = read_bytes(path, what="image", tree=tree)
             checksums.compare(f"{frame_name(i)}/{name}", files[name])
     return files
 

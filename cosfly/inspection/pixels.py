@@ -95,7 +95,9 @@ def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> Look:
         red, green, blue = (picture.colours[..., k] for k in range(3))
         magenta = (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
         return Look(0.0, 0, float(magenta.mean()), 0.0, None)
-    pairs, equal, bright, kinds, counts, box = _look(picture.colours, picture.instance, picture.depth, left_out)
+    all_pairs, all_equal, all_bright, kinds, counts, box = _look(picture.colours, picture.instance, picture.depth, left_out)  # fmt: skip
+    ids = np.unique(np.append(np.flatnonzero(all_pairs), 0))  # few of all; 0 also where there is none
+    pairs, equal, bright = all_pairs[ids], all_equal[ids], all_bright[ids]
     candidates = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs) & (bright >= DARK * pairs)
     largest = int(np.argmax(np.where(candidates, pairs, 0)))
     # A renderer that draws all surfaces without grain misses no texture.
@@ -103,7 +105,7 @@ def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> Look:
     is_judged = bool(candidates[largest]) and others_equal < GRAINLESS * others
     flat = float(pairs[largest]) / num_pixels if is_judged else 0.0
     person = None if box[2] < 0 else (int(box[0]), int(box[1]), int(box[2]), int(box[3]))
-    return Look(flat, int(kinds[largest]), counts[0] / num_pixels, counts[1] / num_pixels, person)
+    return Look(flat, int(kinds[ids[largest]]), counts[0] / num_pixels, counts[1] / num_pixels, person)
 
 
 @njit(cache=True, nogil=True)

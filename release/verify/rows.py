@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cosfly.geometry import BODY_FROM_CAMERA, rotation_matrices
+from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.products.captions import FIELDS, Coc, Language
 from cosfly.products.frames import Camera
 from cosfly.products.playback import EVENTS, Flight
@@ -135,8 +135,7 @@ class FlightRows:
     @cached_property
     def projected_corners(self) -> np.ndarray:
         """The corners of a person of ours at each row's target, (n, 8, 2) px; NaN where one lies behind the camera."""
-        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
-        corners = self.target_m[:, None, :] + signs * np.array(PERSON_HALF_EXTENTS_M)
+        corners = self.target_m[:, None, :] + CORNER_SIGNS * np.array(PERSON_HALF_EXTENTS_M)
         body = np.einsum("nji,nkj->nki", self.rotations, corners - self.pose[:, None, :3])
         x, y, z = np.moveaxis(body @ BODY_FROM_CAMERA, 2, 0)
         fx, fy, cx, cy = (values[:, None] for values in self.intrinsics.T)
