@@ -84,7 +84,7 @@ def signals_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _keep_freed_memory() -> None:
+def keep_freed_memory() -> None:
     """Let this process keep up to 64 MiB of what it frees, for the next frame: its arrays are megabytes each, and what the system gives anew it clears page by page.
 
     Where another C library allocates, nothing changes.
@@ -105,7 +105,7 @@ def work_through(connection: Connection, manner: Manner) -> None:
     logging.getLogger().handlers = [voice]
     set_levels(manner.log_level)
     use_limits(manner.reading)
-    _keep_freed_memory()
+    keep_freed_memory()
     threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:
         start: Start | None = _received(connection)

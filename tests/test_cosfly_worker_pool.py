@@ -237,7 +237,7 @@ def test_freed_memory_is_not_asked_for_again():
     """A process of its own: what is set stays set."""
     code = """if 1:
         import resource, numpy as np
-        from cosfly.worker import _keep_freed_memory
+        from cosfly.worker import keep_freed_memory
         def num_pages():
             before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
             for _ in range(20):
@@ -245,7 +245,7 @@ def test_freed_memory_is_not_asked_for_again():
                 del arrays
             return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
         without = num_pages()
-        _keep_freed_memory()
+        keep_freed_memory()
         num_pages()
         print(without, num_pages())
     """

@@ -35,7 +35,10 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import read_bytes
 from cosfly.runner import advance
 
-SMALL_PX, SMALL_ROWS = (128, 72), 5  # frames are shrunk to this, of every fifth row, before they are compared with each other
+SMALL_PX, SMALL_ROWS = (
+    (128, 72),
+    5,
+)  # frames are shrunk to this, of every fifth row, before they are compared with each other
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street still has more than 5
 # The centre of the person's box and its visible surface are at most a half height apart along the optical axis.
 SURFACE_TOLERANCE_M = PERSON_HALF_EXTENTS_M[2] + 0.3

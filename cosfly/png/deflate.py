@@ -26,13 +26,16 @@ from cosfly.png.huffman import (
 
 BAND_BYTES = 85_000  # unpacked, at least: of a smaller band the lengths of its codes take more than a thousandth
 BAND_END = b"\0\0\xff\xff"  # of a block that holds nothing and ends at a byte
-BLOCK_TOKENS = 1 << 17
+BLOCK_SYMBOLS = 1 << 17
 BLOCK_HEAD_BYTES = 1024  # more than the lengths of all codes of a block take
 LONGEST, WINDOW = 258, 32768
 SHORTEST = 4  # bytes of a repetition; of fewer the codes are shorter
-# A token is a byte, or a repetition: these marks and its length.
-REPEATS, IS_ABOVE, LENGTH_BITS = np.uint32(1 << 16), np.uint32(1 << 15), np.uint32(511)
+IS_ABOVE, LENGTH_BITS = (
+    np.int64(1 << 15),
+    np.int64(511),
+)  # of a repetition: whether it is of the row above, and its length
 FOUR, FOURTH, FIRST_FOUR = np.uint64(4), np.uint64(0xFF000000), np.uint64(0xFFFFFFFF)  # bytes of a word
+LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 SYMBOL_OF_LENGTH = np.zeros(LONGEST + 1, np.int64)
 for _s, _base in enumerate(BASE_LENGTH.tolist()):
     SYMBOL_OF_LENGTH[_base:] = END + 1 + _s
@@ -52,7 +55,7 @@ def deflate(lines: np.ndarray, near: int, above: int, num_bands: int = 1) -> lis
     data = np.zeros(lines.size + 8, np.uint8)
     data[:-8] = lines.reshape(-1)
     out = np.empty(
-        lines.size * LOOK_BITS // 8 + BLOCK_HEAD_BYTES * (2 + num_bands + lines.size // BLOCK_TOKENS), np.uint8
+        lines.size * LOOK_BITS // 8 + BLOCK_HEAD_BYTES * (2 + num_bands + lines.size // BLOCK_SYMBOLS), np.uint8
     )
     out[:2] = 0x78, 0x01
     bounds = band_rows(len(lines), num_bands) * lines.shape[1]
@@ -66,9 +69,9 @@ def deflate(lines: np.ndarray, near: int, above: int, num_bands: int = 1) -> lis
 @njit(cache=True, nogil=True)
 def _pack(data, words, bounds, near, above, out):  # type: ignore[no-untyped-def]
     """Write the blocks of all bands, from the third byte of `out` on; gives 0 and where they end. data: the rows and eight bytes more."""
-    tokens, counts = np.empty(BLOCK_TOKENS, np.uint32), np.zeros(MOST_LITERALS, np.int64)
-    num = len(bounds) - 1
-    ends = np.zeros(num + 1, np.int64)
+    repeats, counts = np.empty((BLOCK_SYMBOLS, 2), np.int64), np.zeros(MOST_LITERALS, np.int64)
+    num_bands = len(bounds) - 1
+    ends = np.zeros(num_bands + 1, np.int64)
     place, hold, held = np.int64(2), np.uint64(0), np.int64(0)  # whole bytes in `out`, and the `held` bits behind them
     # Ways are two at most, of one bit each.
     ways = np.zeros(MOST_WAYS, np.int64)
@@ -78,25 +81,28 @@ def _pack(data, words, bounds, near, above, out):  # type: ignore[no-untyped-def
     near_tail = (1 - is_second) | (near - BASE_WAY[near_way]) << 1
     above_tail = is_second | (above - BASE_WAY[above_way]) << 1
     tails = (near_tail, 1 + MORE_WAY[near_way], above_tail, 1 + MORE_WAY[above_way])
-    for band in range(num):
+    for band in range(num_bands):
         at, size = bounds[band], bounds[band + 1]
         while at < size:
-            at, num_tokens = _tokenise(data, words, at, bounds[band], size, near, above, tokens, counts)
+            begin = at
+            at, num = _find(data, words, begin, bounds[band], size, near, above, repeats, counts)
             counts[END] = 1
             lengths = code_lengths(counts, np.int64(LOOK_BITS))
-            is_last = band == num - 1 and at == size
+            is_last = band == num_bands - 1 and at == size
             place, hold, held = _put(np.int64(is_last) | 2 << 1, np.int64(3), out, place, hold, held)
             place, hold, held = _write_lengths(lengths, ways, out, place, hold, held)
             codes = codes_of(lengths)
-            place, hold, held = _write_tokens(tokens[:num_tokens], codes, lengths, tails, out, place, hold, held)
+            place, hold, held = _write_symbols(
+                data, words, begin, at, repeats[:num], codes, lengths, tails, out, place, hold, held
+            )
             place, hold, held = _put(codes[END], lengths[END], out, place, hold, held)
-        if band < num - 1:
+        if band < num_bands - 1:
             place, hold, held = _put(np.int64(0), np.int64(3), out, place, hold, held)
             place, hold, held = place + (held + 7 >> 3), np.uint64(0), np.int64(0)
             out[place] = np.uint64(0xFFFF0000)
             place += len(BAND_END)
         ends[band + 1] = place
-    ends[num] += held + 7 >> 3
+    ends[num_bands] += held + 7 >> 3
     return ends
 
 
@@ -110,48 +116,57 @@ def _way_of(back):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _tokenise(data, words, at, first, size, near, above, tokens, counts):  # type: ignore[no-untyped-def]
-    """Fill a block with tokens and count their symbols. Gives how far it came, and how many they are."""
+def _find(data, words, at, first, size, near, above, repeats, counts):  # type: ignore[no-untyped-def]
+    """Find the repetitions of a block and count its symbols: bytes that none of them holds stand for themselves. Gives how far it came, and how many they are.
+
+    Of a repetition `repeats` gets its place and its length with its marks.
+    """
     counts.fill(0)
-    n = np.int64(0)
+    n, num = np.int64(0), np.int64(0)  # of symbols, and of repetitions among them
     # Four literals together, each counted in a table of its own: an addition to what was written just now waits for it.
     kinds = np.zeros((4, 256), np.uint32)
-    here, back, place = np.uint64(at), np.uint64(near), np.uint64(0)
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    while n < len(tokens) and at < size:
+    here, back = np.uint64(at), np.uint64(near)
+    byte, eight, sixteen, last = np.uint64(255), np.uint64(8), np.uint64(16), np.uint64(24)
+    while n < BLOCK_SYMBOLS and at < size:
         if above == 0 and at - first >= near:
-            # Where the fourth byte from here differs from its pixel before, none of these four begins a repetition.
-            here, place, end = np.uint64(at), np.uint64(n), np.uint64(max(min(size, at + len(tokens) - n) - 4, 0))
-            while here <= end and (words[here] ^ words[here - back]) & FOURTH != 0:
-                a, b, c, d = data[here], data[here + one], data[here + two], data[here + three]
-                tokens[place], tokens[place + one], tokens[place + two], tokens[place + three] = a, b, c, d
-                kinds[0, a] += 1
-                kinds[1, b] += 1
-                kinds[2, c] += 1
-                kinds[3, d] += 1
-                here, place = here + FOUR, place + FOUR
-            at, n = np.int64(here), np.int64(place)
-            if at == size or n == len(tokens):
+            # Where the fourth byte from here differs from its pixel before, none of these four begins a repetition, and rarely where it does not.
+            here, end = np.uint64(at), np.uint64(max(min(size, at + BLOCK_SYMBOLS - n) - 4, 0))
+            while here <= end:
+                word = words[here]
+                differs = word ^ words[here - back]
+                if differs & FOURTH == 0:
+                    # Of eight bytes each that is as before has its top bit here; four in a row make a repetition.
+                    same = ~(((differs & LOW_BITS) + LOW_BITS) | differs | LOW_BITS)
+                    if same & same >> eight & same >> sixteen & same >> last & FIRST_FOUR != 0:
+                        break
+                kinds[0, word & byte] += 1
+                kinds[1, word >> eight & byte] += 1
+                kinds[2, word >> sixteen & byte] += 1
+                kinds[3, word >> last & byte] += 1
+                here += FOUR
+            n += np.int64(here) - at
+            at = np.int64(here)
+            if at == size or n == BLOCK_SYMBOLS:
                 break
-        length, marks = np.int64(0), REPEATS
+        length, marks = np.int64(0), np.int64(0)
         if at - first >= near and (words[at] ^ words[at - near]) & FIRST_FOUR == 0:
             length = _num_same(data, words, at, near, size)
         if above > 0 and at - first >= above and length < LONGEST and words[at] == words[at - above]:
             other = _num_same(data, words, at, above, size)
             if other > length + 2:  # whose way back is so much longer
-                length, marks = other, REPEATS | IS_ABOVE
+                length, marks = other, IS_ABOVE
         if length >= SHORTEST:
-            tokens[n] = marks | np.uint32(length)
+            repeats[num, 0], repeats[num, 1] = at, marks | length
+            num += 1
             counts[SYMBOL_OF_LENGTH[length]] += 1
             at += length
         else:
-            tokens[n] = data[at]
             counts[data[at]] += 1
             at += 1
         n += 1
     for s in range(256):
         counts[s] += np.int64(kinds[0, s]) + np.int64(kinds[1, s]) + np.int64(kinds[2, s]) + np.int64(kinds[3, s])
-    return at, n
+    return at, num
 
 
 @njit(cache=True, nogil=True)
@@ -195,38 +210,35 @@ def _write_lengths(lengths, ways, out, place, hold, held):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True)
-def _write_tokens(tokens, codes, lengths, tails, out, place, hold, held):  # type: ignore[no-untyped-def]
-    """Write tokens. tails: what follows the length of a repetition of the pixel before, its bits; the same of the one above."""
+def _write_symbols(data, words, at, stop, repeats, codes, lengths, tails, out, place, hold, held):  # type: ignore[no-untyped-def]
+    """Write the bytes from `at` to `stop`. tails: what follows the length of a repetition of the pixel before, its bits; the same of the one above."""
     near_tail, near_bits, above_tail, above_bits = tails
     entries = np.empty(256, np.uint64)
     for s in range(256):
         entries[s] = codes[s] << 4 | lengths[s]
-    at, num, four, low = np.uint64(0), np.uint64(len(tokens)), np.uint64(4), np.uint64(15)
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    while at < num:
-        if at + four <= num:  # four literals together
-            a, b, c, d = tokens[at], tokens[at + one], tokens[at + two], tokens[at + three]
-            if a | b | c | d < REPEATS:
-                w, x, y, z = entries[np.uint64(a)], entries[np.uint64(b)], entries[np.uint64(c)], entries[np.uint64(d)]
-                first = w >> four | x >> four << (w & low)
-                second = y >> four | z >> four << (y & low)
-                word, width = first | second << ((w & low) + (x & low)), (w & low) + (x & low) + (y & low) + (z & low)
-                place, hold, held = _put(word, np.int64(width), out, place, hold, held)
-                at += four
-                continue
-        token = tokens[at]
-        at += one
-        if token < REPEATS:
-            place, hold, held = _put(codes[token], lengths[token], out, place, hold, held)
-        else:
-            length = np.int64(token & LENGTH_BITS)
+    four, low, byte = np.uint64(4), np.uint64(15), np.uint64(255)
+    eight, sixteen, last = np.uint64(8), np.uint64(16), np.uint64(24)
+    for k in range(len(repeats) + 1):
+        end = repeats[k, 0] if k < len(repeats) else stop
+        here, fours = np.uint64(at), np.uint64(at + (end - at) // 4 * 4)
+        while here < fours:  # four literals together
+            word = words[here]
+            w, x = entries[word & byte], entries[word >> eight & byte]
+            y, z = entries[word >> sixteen & byte], entries[word >> last & byte]
+            first = w >> four | x >> four << (w & low)
+            second = y >> four | z >> four << (y & low)
+            bits, width = first | second << ((w & low) + (x & low)), (w & low) + (x & low) + (y & low) + (z & low)
+            place, hold, held = _put(bits, np.int64(width), out, place, hold, held)
+            here += four
+        for i in range(np.int64(fours), end):
+            place, hold, held = _put(codes[data[i]], lengths[data[i]], out, place, hold, held)
+        if k < len(repeats):
+            length, is_above = repeats[k, 1] & LENGTH_BITS, repeats[k, 1] & IS_ABOVE != 0
             s = SYMBOL_OF_LENGTH[length]
-            value, num_bits = (
-                codes[s] | (length - BASE_LENGTH[s - 257]) << lengths[s],
-                lengths[s] + MORE_LENGTH[s - 257],
-            )
-            is_above = token & IS_ABOVE != 0
+            value = codes[s] | (length - BASE_LENGTH[s - 257]) << lengths[s]
+            num_bits = lengths[s] + MORE_LENGTH[s - 257]
             value |= (above_tail if is_above else near_tail) << num_bits
             num_bits += above_bits if is_above else near_bits
             place, hold, held = _put(value, num_bits, out, place, hold, held)
+            at = end + length
     return place, hold, held

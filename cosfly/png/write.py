@@ -34,8 +34,7 @@ def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
     height, width = red.shape
     lines = np.empty((height, 1 + CHANNELS * width), np.uint8)
     lines[:, 0] = NONE
-    for k, channel in enumerate((red, green, blue)):
-        lines[:, 1 + k :: CHANNELS] = channel
+    _interleave(*(np.ascontiguousarray(channel) for channel in (red, green, blue)), lines)
     return _png(lines, deflate(lines, CHANNELS, lines.shape[1]))
 
 
@@ -52,6 +51,16 @@ def _png(lines: np.ndarray, parts: list[memoryview]) -> bytes:
 def _chunk(name: bytes, data: bytes | memoryview) -> bytes:
     checksum = zlib.crc32(data, zlib.crc32(name))
     return b"".join((struct.pack(">I", len(data)), name, data, struct.pack(">I", checksum)))
+
+
+@njit(cache=True, nogil=True)
+def _interleave(red, green, blue, lines):  # type: ignore[no-untyped-def]
+    """Fill rows with three channels, (h, w) each, behind the filter of each row."""
+    height, width = red.shape
+    for y in range(height):
+        r, g, b, line = red[y], green[y], blue[y], lines[y, 1:]
+        for x in range(width):
+            line[CHANNELS * x], line[CHANNELS * x + 1], line[CHANNELS * x + 2] = r[x], g[x], b[x]
 
 
 @njit(cache=True, nogil=True)

@@ -125,7 +125,9 @@ def main() -> None:
     for _ in range(given.repeats):
         with tempfile.TemporaryDirectory() as scratch:
             begin_s = time.monotonic()
-            inputs = [given.run / name for name in ("simplify/step2_simplified.json", "plan/drone_trace.json", "render")]
+            inputs = [
+                given.run / name for name in ("simplify/step2_simplified.json", "plan/drone_trace.json", "render")
+            ]
             run(InspectConfig(), *inputs, Path(scratch) / "inspect", workers=2)
             whole_s = time.monotonic() - begin_s
             busy_s = sum(event.seconds or 0.0 for event in read_events(Path(scratch) / "inspect") if event.event == "item_done")  # fmt: skip

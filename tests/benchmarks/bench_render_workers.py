@@ -40,6 +40,7 @@ from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import backend
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.stage import RenderConfig, open_renderer, script_flight
+from cosfly.worker import keep_freed_memory
 
 NUM_FLIGHTS = 4
 LEAD_S = 0.5  # between the word and the first frame that counts: the first flight's shadows
@@ -127,6 +128,7 @@ def worker(talk: Connection, folder: Path, out: Path, number: int, num_workers: 
     if num_workers > 1:
         os.environ["LP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // num_workers))  # as the stage does
     cv2.setNumThreads(1)
+    keep_freed_memory()
     cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
     box_map, traces = read_boxes(folder / FILES[0]), read_traces(folder / FILES[1])
     renderer: Any = open_renderer("gl", box_map, cfg.width_px, cfg.height_px)
