@@ -14,7 +14,7 @@ import numpy as np
 from cosfly.compiled import njit
 
 COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
-NEAR_M = 0.3
+NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
 LEAST_CONTRAST = 4.0  # grey levels: less is a wall or a fog
 LEAST_PAIRS = 4  # of frames, for one to be unusual among them
@@ -51,7 +51,7 @@ class Agreement:
     it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. planes: of
     those that agree, on planes there; error: median of these, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
     the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
-    shifted: points of one thing that is farther or nearer there, as most of it is; 0 where there is none.
+    shifted: points of one thing that is farther there, as most of it is; 0 where there is none.
     """
 
     seen: int
@@ -106,6 +106,23 @@ def correlate_colours(
     """Give the correlation of `compare_views` alone, which takes a fraction of its time."""
     colours = _carried(one, other, intrinsics, others_intrinsics, only_colours=True)[2]
     return _agreement_of(colours, least_contrast)[0]
+
+
+def way_px(one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray) -> float:
+    """Give how far things lie apart in two pictures, px: the median of nine points of the first; 0 where none of them has a depth."""
+    height, width = one.depth.shape
+    u, v = (
+        places.reshape(-1) for places in np.meshgrid(width * np.arange(1, 6, 2) // 6, height * np.arange(1, 6, 2) // 6)
+    )
+    depth_m = one.depth[v, u].astype(np.float64)
+    fx, fy, cx, cy = intrinsics
+    here = np.stack([(u + 0.5 - cx) / fx * depth_m, (v + 0.5 - cy) / fy * depth_m, depth_m], axis=1)
+    x, y, z = ((here @ one.rotation.T + one.position_m - other.position_m) @ other.rotation).T
+    is_known = (depth_m > 0.0) & (depth_m < FAR_M) & (z > NEAR_M)
+    fx, fy, cx, cy = others_intrinsics
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ways = np.hypot(fx * x / z + cx - u - 0.5, fy * y / z + cy - v - 0.5)[is_known]
+    return median_of(ways) if len(ways) else 0.0
 
 
 def _carried(
@@ -205,7 +222,7 @@ def _compare_colours(colours):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, intrinsics, others, turn, shift, moving, flat, only_colours):  # type: ignore[no-untyped-def]  # fmt: skip
     """Counts (5,), errors (k,), colours (k, 6) of points here and there, where both are known; of points among nothing but their own thing
-    its id, of those with its depth and of the others. only_colours: points that come out where there are none are left out of everything."""
+    its id, of those with its depth and of those that are farther. only_colours: points that come out where there are none are left out of everything."""
     height, width = depth_a.shape
     fx, fy, cx, cy = intrinsics
     other_fx, other_fy, other_cx, other_cy = others
@@ -222,7 +239,7 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
         for i in range(COLUMNS):
             u = int((i + 0.5) * width / COLUMNS)
             d = float(depth_a[v, u])
-            if not (d > 0.0 and d < 999.0) or (has_ids and moving[inst_a[v, u, 0]]):
+            if not (d > 0.0 and d < FAR_M) or (has_ids and moving[inst_a[v, u, 0]]):
                 continue
             x, y = (u + 0.5 - cx) / fx * d, (v + 0.5 - cy) / fy * d
             px = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * d + shift[0]
@@ -238,11 +255,11 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             has_colours = k >= 0 and k < len(colours_b) and j < len(colours_a)
             if only_colours and not has_colours:
                 continue
-            best, is_through, is_same, is_free, is_whole = 1e9, True, not has_ids, True, has_ids
+            best, least, is_through, is_same, is_free, is_whole = 1e9, 1e9, True, not has_ids, True, has_ids
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
                     off = float(depth_b[row + dy, column + dx]) - z
-                    best = min(best, abs(off))
+                    best, least = min(best, abs(off)), min(least, off)
                     if off <= 0.05 * z + 0.3:
                         is_through = False
                     if has_ids:
@@ -264,7 +281,9 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
                 if is_there:
                     firm[num_firm] = own
                     num_firm += 1
-                else:
+                elif (
+                    least > 0.0
+                ):  # farther all round: what is nearer may be another side of the thing, that hides this one
                     moved[num_moved] = own
                     num_moved += 1
             if is_there:

@@ -17,6 +17,7 @@ from cosfly.reprojection import (
     grid_rows,
     median_of,
     usual_correlations,
+    way_px,
 )
 
 
@@ -64,6 +65,33 @@ def test_of_two_roads_in_one_plane_either_may_show(kinds, is_same):
     found = compare_views(*views, np.array([80.0, 80.0, 80.0, 45.0]))
     assert found.agree > 1000
     assert found.same == (found.agree if is_same else 0)
+
+
+CAMERA = np.array([80.0, 80.0, 80.0, 45.0])
+
+
+def building_at(depth_m: float) -> View:
+    """A picture full of one building's wall."""
+    instance = np.zeros((90, 160, 3), np.uint8)
+    instance[:] = (KINDS["Buildings"], 7, 0)
+    return View(np.full((90, 160), depth_m, np.float32), instance, None, np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("before_m", "after_m", "is_found"), [(20.0, 23.0, True), (23.0, 20.0, False), (20.0, 20.0, False)]
+)
+def test_a_thing_that_is_farther_has_moved_and_one_that_is_nearer_may_hide_itself(before_m, after_m, is_found):
+    """From behind a corner another wall of the same building stands before the one that was seen."""
+    assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).shifted > 0) == is_found
+
+
+def test_way_between_two_pictures():
+    """A wall at 20 m, 80 px focal length: 0.5 m to the side are 2 px, and a camera that looks at nothing tells none."""
+    here = building_at(20.0)
+    beside = View(here.depth, here.instance, None, np.eye(3), np.array([0.5, 0.0, 0.0]))
+    assert_allclose(way_px(here, beside, CAMERA, CAMERA), 2.0)
+    assert_allclose(way_px(here, here, CAMERA, CAMERA), 0.0, atol=1e-12)
+    assert way_px(building_at(1000.0), beside, CAMERA, CAMERA) == 0.0
 
 
 @pytest.mark.parametrize("rain", [0.0, 60.0])

@@ -17,8 +17,10 @@ WHOLE = Agreement(
 )  # fmt: skip
 
 
-def judged(found: list[Agreement], elsewhere: list[float], width_px: int = 480, rain: float = 0.0) -> Findings:
-    """What is found in a flight of which each frame says this of the one before."""
+def judged(
+    found: list[Agreement], elsewhere: list[float], width_px: int = 480, rain: float = 0.0, way_px: float = 20.0
+) -> Findings:
+    """What is found in a flight of which each frame says this of the one before; way_px: from each frame to the next."""
     camera = {"fx": 400.0, "fy": 400.0, "cx": 240.0, "cy": 135.0}
     row = {
         "intrinsics": camera, "width_px": width_px, "height_px": 270, "weather_params": {"precipitation": rain},
@@ -27,7 +29,7 @@ def judged(found: list[Agreement], elsewhere: list[float], width_px: int = 480, 
     rows = [{**row, "frame_index": k} for k in range(len(found) + 1)]
     flight = FlightRows("run/Town/trajectory/ORI", rows, given_id="trajectory_ORI")
     findings = Findings()
-    pairs = scene._Pairs(list(range(1, len(rows))), [1] * len(found), found, elsewhere)
+    pairs = scene._Pairs(list(range(1, len(rows))), [1] * len(found), found, elsewhere, [way_px] * len(found))
     scene._judge(flight, pairs, "float32", findings)
     return findings
 
@@ -43,15 +45,25 @@ def test_colours_may_differ_more_from_frame_to_frame_where_it_rains(rain, worst,
 
 
 @pytest.mark.parametrize(
-    ("width_px", "elsewhere", "is_found"), [(320, 0.958, False), (320, 0.97, True), (1280, 0.958, True)]
+    ("way_px", "elsewhere", "is_found"),
+    [(0.5, 0.956, False), (1.9, 0.926, False), (1.9, 0.99, True), (2.1, 0.956, True), (5.7, 0.919, False)],
 )
-def test_the_next_frames_place_must_explain_coarse_colours_better_to_be_theirs(width_px, elsewhere, is_found):
-    """0.921 and 0.958 are of an honest flight of 320 px."""
+def test_frames_that_lie_on_each_other_tell_little_of_their_order(way_px, elsewhere, is_found):
+    """Honest frames were better by 0.067 where the next frame lies half a pixel away, by 0.037 at 1.9 px and 0.03 farther away."""
     found, others = [WHOLE] * 20, [np.nan] * 20
-    found[12], others[12] = replace(WHOLE, correlation=0.921), elsewhere
-    findings = judged(found, others, width_px)
+    found[12], others[12] = replace(WHOLE, correlation=0.889), elsewhere
+    findings = judged(found, others, 320, way_px=way_px)
     assert [kind.code for kind in findings.kinds.values()] == ["scene_colour"] * is_found
     assert all("if it were the next frame's" in str(kind) for kind in findings.kinds.values())
+
+
+@pytest.mark.parametrize(
+    ("width_px", "usual", "is_found"), [(160, 0.77, False), (160, 0.6, True), (320, 0.77, True), (1280, 0.85, False)]
+)
+def test_the_coarser_pictures_are_the_less_their_colours_agree(width_px, usual, is_found):
+    """0.77 is of an honest flight of 160 px."""
+    findings = judged([replace(WHOLE, correlation=usual)] * 20, [np.nan] * 20, width_px)
+    assert [kind.code for kind in findings.kinds.values()] == ["scene_colour"] * is_found
 
 
 @pytest.mark.parametrize(("usual", "worst", "is_found"), [(0.3, 5.5, False), (0.3, -7.0, True), (2.0, 9.0, False)])

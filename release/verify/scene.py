@@ -22,6 +22,7 @@ from cosfly.reprojection import (
     correlate_colours,
     is_zoomed,
     usual_correlations,
+    way_px,
 )
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
@@ -39,11 +40,9 @@ SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
 # Below the median of a flight's frames of one zoom; honest 0.08, and under heavy rain by night, whose streaks and wet ground are other ones in
 # every frame, 0.152.
 COLOUR_DROP, COLOUR_DROP_RAIN = 0.15, 0.2  # dry; where it rains as hard as it can
-COLOUR_LEAST, COLOUR_LEAST_SMALL, SMALL_PX = (
-    0.82,
-    0.65,
-    160,
-)  # that median itself, honest 0.92; of pictures narrower than so much 0.70
+# That median itself, by the width of the pictures: the coarser, the less of a detail lies in the same pixel again. Honest 0.94 and more at
+# 320 px; at 160 px 0.90 and more, but 0.77 in a flight over Delft.
+COLOUR_LEAST, COLOUR_LEAST_AT_PX = (0.65, 0.82), (160.0, 320.0)
 # Grey levels: of a pale square the grain alone, 4 from frame to frame, leaves honest frames a correlation of 0.7.
 CONTRAST = 10.0
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
@@ -52,10 +51,10 @@ SHADE, SHADE_TIMES = 6.0, 8.0
 # Of the points that agree, as float32, on planes: depth that was made rough has none. Honest 0.8 and more in the median of a flight.
 PLANES_LEAST = 0.1
 # How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
-# before as usual in the flight, and of others. A pixel of a coarse picture
-# holds several details, of which it shows one: honest 0.037 at 320 px wide, below 0 at 1280 px.
-BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.03, 0.04
-BETTER_BY_COARSE, COARSE_PX = 0.045, 640
+# before as usual in the flight, of others (honest 0.03 at most), and of frames that lie nearer to each other than so much: rows of colours are
+# a pixel off at most, and honest frames 0.5 px apart agreed better by 0.067 with the next one's place.
+BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.045, 0.04
+BETTER_BY_NEAR, NEAR_PX = 0.1, 2.0
 # Of the lesser of both neighbours, in hue and in detail: honest 0.6 and 0.9 of ours; and what these must have for that to mean something.
 LOOKS_LEAST, LOOK_LEAST = (0.2, 0.6), 2.0
 # Steps over edges of blocks to those elsewhere: honest 0.998 to 1.004 over a flight; JPEG of quality 40 1.85. So many edges, for that to mean something.
@@ -68,12 +67,14 @@ ROUGH_ERROR, TIMES_ROUGH = 1e-3, 20.0
 
 @dataclass
 class _Pairs:
-    """What neighbouring frames say of each other: row of the later one, agreement, correlation of its colours at the next frame's place."""
+    """What neighbouring frames say of each other: row of the later one, agreement, correlation of its colours at the next frame's place, and
+    how far away that is."""
 
     rows: list[int] = field(default_factory=list)
     gaps: list[int] = field(default_factory=list)
     found: list[Agreement] = field(default_factory=list)
     elsewhere: list[float] = field(default_factory=list)
+    ways_px: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,9 @@ def _compare(flight: FlightRows, i: int, view: View, before: list[tuple[int, Vie
         flight.intrinsics[k], flight.intrinsics[i]
     ):  # other detail is seen: depth and instances tell, colours do not
         pairs.found[-1] = replace(pairs.found[-1], correlation=np.nan, tint=np.nan, shade=np.nan)
+    pairs.ways_px.append(np.nan)
     if len(before) == 2 and previous.colours is not None and len(pairs.found) >= 2:
+        pairs.ways_px[-2] = way_px(previous, view, flight.intrinsics[k], flight.intrinsics[i])
         moved = replace(view, colours=previous.colours)
         pairs.elsewhere[-2] = correlate_colours(
             before[0][1], moved, flight.intrinsics[before[0][0]], flight.intrinsics[i], least_contrast=CONTRAST
@@ -216,6 +219,11 @@ def _judge_planes(flight: FlightRows, found: list[Agreement], findings: Findings
         findings.error("scene_depth", flight.name, f"depth of which {np.median(shares):.0%} of the points lie on planes", f"at least {PLANES_LEAST:.0%}: depth as it was drawn, without noise")  # fmt: skip
 
 
+def _better_by(way: float, *, is_unusual: bool) -> float:
+    """How much better a frame's colours must agree with the next frame's place, `way` px away, to be from there."""
+    return BETTER_BY_NEAR if way < NEAR_PX else BETTER_BY if is_unusual else BETTER_BY_USUAL
+
+
 def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
     """Find the pairs of frames that do not show one world."""
     if not pairs.found:
@@ -237,16 +245,15 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
     usuals, drops = usual_correlations(colours, flight.intrinsics[pairs.rows, 0], drop_most)
     tints = np.array([pair.tint for pair in pairs.found])
     usual_tint = float(np.nanmedian(tints)) if np.isfinite(tints).any() else np.nan
-    least_colour = COLOUR_LEAST if flight.size_px[0, 0] >= SMALL_PX else COLOUR_LEAST_SMALL
+    least_colour = float(np.interp(flight.size_px[0, 0], COLOUR_LEAST_AT_PX, COLOUR_LEAST))
     if np.isfinite(usuals).any() and not flight.is_foreign and np.nanmedian(usuals) < least_colour:
         findings.error("scene_colour", flight.name, f"colours that agree by {np.nanmedian(usuals):.2f} from frame to frame", "pictures of this flight")  # fmt: skip
     if rounded_as == "float32" and not flight.is_foreign:
         _judge_planes(flight, pairs.found, findings)
     shades = np.abs([pair.shade for pair in pairs.found])
     shade_most = max(SHADE, SHADE_TIMES * float(np.nanmedian(shades))) if np.isfinite(shades).any() else np.inf
-    better = BETTER_BY if flight.size_px[0, 0] >= COARSE_PX else BETTER_BY_COARSE
-    compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, usuals, drops, strict=True)
-    for i, gap, pair, elsewhere, usual_colour, drop in compared:
+    compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, pairs.ways_px, usuals, drops, strict=True)
+    for i, gap, pair, elsewhere, way, usual_colour, drop in compared:
         if pair.seen < LEAST_SEEN:
             continue
         share, through = pair.agree / pair.seen, pair.through / pair.seen
@@ -258,7 +265,7 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             findings.error("scene_depth", where, got, expected)
             continue
         if gap <= NEAR_FRAMES and pair.shifted and not flight.is_foreign:
-            findings.error("scene_depth", where, f"a thing of {pair.shifted} points at another distance than in the frame before", "what stands still at its place")  # fmt: skip
+            findings.error("scene_depth", where, f"a thing of {pair.shifted} points farther away than in the frame before", "what stands still at its place")  # fmt: skip
             continue
         if pair.agree < LEAST_AGREE:
             continue
@@ -270,5 +277,5 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             findings.error("scene_colour", where, f"a picture that is {abs(pair.shade):.0f} grey levels {'brighter' if pair.shade > 0 else 'darker'} than the frame before", f"at most {shade_most:.0f}, by the flight's other frames")  # fmt: skip
         elif pair.tint > usual_tint + TINT:
             findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
-        elif elsewhere > pair.correlation + (better if pair.correlation < usual_colour - UNUSUAL else BETTER_BY_USUAL):
+        elif elsewhere > pair.correlation + _better_by(way, is_unusual=pair.correlation < usual_colour - UNUSUAL):
             findings.error("scene_colour", where, f"a picture that resembles the one before by {pair.correlation:.3f}, and would by {elsewhere:.3f} if it were the next frame's", "pictures in their frames' order: compare it with those beside it")  # fmt: skip
