@@ -257,8 +257,12 @@ FAR_OFF_M = np.array([50_000.137, -50_000.291, 0.0])  # no whole numbers, which 
 
 @pytest.mark.parametrize("offset_m", [np.zeros(3), FAR_OFF_M], ids=["here", "fifty_km"])
 @pytest.mark.parametrize(("least_m", "most_m", "bound_m"), [(25.0, 35.0, 0.0002), (450.0, 550.0, 0.001)])
-def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(least_m, most_m, bound_m, offset_m):
-    """At 30 m and at 500 m, on slanted faces too; and where the map reaches to a box a hundred kilometres off."""
+@pytest.mark.parametrize("software", ["llvmpipe", "nobody"])
+def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(
+    software, least_m, most_m, bound_m, offset_m, monkeypatch
+):
+    """At 30 m and at 500 m, on slanted faces too; where the map reaches to a box a hundred kilometres off; and as on hardware that snaps."""
+    monkeypatch.setattr("cosfly.render.gl.backend.SOFTWARE", software)
     near = [(least_m + 5.37, 12.3 * k, 3.1) for k in range(-2, 3)]
     far = [(k, y, 10.0) for k, y in ((most_m - 50.0, -80.0), (most_m - 45.0, 0.0), (most_m - 60.0, 90.0))]
     centers = np.array([*near, *far, (0.0, 0.0, -0.5)]) + offset_m

@@ -37,6 +37,7 @@ LARGEST_SHADOW_AREA_M = 420.0
 MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
+SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
 # Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full while the last is still being
 # drawn, and keeps every list for good: without this a process grows by a seventh over thousands of frames, on a loaded machine.
 MOST_WAITING = 30_000
@@ -91,7 +92,7 @@ class GlRenderer:
         self.context = open_context()
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
-        self._is_software = "llvmpipe" in self.device
+        self._is_software = SOFTWARE in self.device
         self.scene, self.look, self.num_others = build_scene(box_map, num_others), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
@@ -118,7 +119,8 @@ class GlRenderer:
         make = self.context.program
         of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
         of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
-        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, define or "")
+        snaps = "" if self._is_software else "#define SNAPS\n"
+        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, snaps + (define or ""))
         materials, near_movers = (
             [
                 make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))

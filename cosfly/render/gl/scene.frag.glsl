@@ -4,6 +4,11 @@ in vec3 v_local_normal;
 in vec3 v_world;
 in vec3 v_normal;
 in float v_depth;
+#ifdef SNAPS
+in vec3 v_from_camera;
+uniform vec4 lens;
+uniform mat3 camera_from_world;
+#endif
 flat in vec3 f_half;
 flat in vec4 f_color;
 flat in uint f_tag;
@@ -32,6 +37,19 @@ const int PLAIN = 0, FACADE = 1, ROAD = 2, SIDEWALK = 3, GRASS = 4, LEAVES = 5, 
     CONCRETE = 20, TILES = 21;
 const int material = MATERIAL;
 const bool near_movers = NEAR_MOVERS;   // whether this text is for pixels that somebody who moves may darken: two loops that every pixel pays for
+
+// Depth of the surface at the middle of the pixel. Hardware draws triangles as if their corners stood on a grid of 1 / 256 pixel, so that what it
+// interpolates is of a place beside the middle, though of the same plane; the plane is cut with the pixel's ray. llvmpipe has no such grid.
+float depth_here() {
+#ifdef SNAPS
+    vec3 ray = vec3((gl_FragCoord.xy - lens.zw) / lens.xy, 1.0) * camera_from_world;
+    vec3 plane = cross(dFdx(v_from_camera), dFdy(v_from_camera));
+    float depth = dot(plane, v_from_camera) / dot(plane, ray);
+    return abs(depth - v_depth) < 0.02 * v_depth ? depth : v_depth;   // of a plane seen edge-on nothing is cut
+#else
+    return v_depth;
+#endif
+}
 
 struct Surface { vec3 albedo; vec3 normal; float mirror; float shade; vec3 glow; };
 
@@ -460,6 +478,6 @@ void main() {
 #ifdef WEATHER
     out_color.rgb = noised(out_color.rgb);
 #endif
-    out_depth = v_depth;
+    out_depth = depth_here();
     out_tag = f_tag & 0xffff00ffu;
 }

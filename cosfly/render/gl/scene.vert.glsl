@@ -10,6 +10,9 @@ out vec3 v_local_normal;
 out vec3 v_world;
 out vec3 v_normal;
 out float v_depth;
+#ifdef SNAPS
+out vec3 v_from_camera;           // in the world's axes, where most planes are even
+#endif
 flat out vec3 f_half;
 flat out vec4 f_color;
 flat out uint f_tag;
@@ -24,8 +27,11 @@ void main() {
     f_half = in_half;
     f_color = in_color;
     f_tag = in_tag;
-    vec3 c = camera_from_world * (in_center - camera_position + turned(in_quaternion, v_local));
+    vec3 from_camera = in_center - camera_position + turned(in_quaternion, v_local), c = camera_from_world * from_camera;
     v_depth = c.z;
+#ifdef SNAPS
+    v_from_camera = from_camera;
+#endif
     // Image row 0 is the top: y is not flipped, so that the buffers need no flipping after reading.
     float n = clip_m.x, f = clip_m.y;
     gl_Position = vec4(2.0 * (lens.x * c.x + lens.z * c.z) / image_size.x - c.z,
