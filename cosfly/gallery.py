@@ -64,7 +64,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     """Reads a frame of a playback tree, writes it as one PNG: colours, depth, instances, and boxes with ids and distances.
 
     Args:
-        frame: its folder in the tree; None: the frame of the first clean flight that shows most of the target.
+        frame: its folder, as `frame_in` takes it; None: the frame of the first clean flight that shows most of the target.
         box_map: what was drawn, for a frame without `debug.png`.
     Returns:
         the frame's folder in the tree.
@@ -72,7 +72,9 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         InputError: no such frame, one without pictures, or neither `debug.png` nor a map.
     """
     folder = (
-        best_frame(tree, "rgb.png", "depth.npy", "instance.png", "meta.json") if frame is None else inside(tree, frame)
+        best_frame(tree, "rgb.png", "depth.npy", "instance.png", "meta.json")
+        if frame is None
+        else frame_in(tree, frame)
     )
     meta, rgb = read_meta(folder), read_rgb(folder)
     if (folder / DEBUG_FILE).exists():
@@ -94,6 +96,18 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     picture = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
     write_bytes(out_png, rgb_bytes(picture))
     return folder.relative_to(tree).as_posix()
+
+
+def frame_in(tree: Path, frame: str | Path) -> Path:
+    """Give the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it.
+
+    Raises:
+        InputError: the name leads out of the tree.
+    """
+    place = Path(frame).resolve()
+    if place.is_dir() and place.is_relative_to(tree.resolve()):
+        return tree / place.relative_to(tree.resolve())
+    return inside(tree, str(frame))
 
 
 def best_frame(tree: Path, *names: str) -> Path:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.depth_study.picture import PROFILE_STEPS, steady_stretch
 from cosfly.depth_study.study import BITS, ENTROPY_BINS, Study, edge_correlation, entropy_bits, quantised, run
 from cosfly.errors import InputError
 from cosfly.products.frames import frame_name
@@ -66,6 +67,9 @@ def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     assert "32-bit float" in (tmp_path / "any/depth_study.md").read_text()
     answer = CliRunner().invoke(app, ["depth-study", "--frame", str(frame), "--out", str(tmp_path / "out")])
     assert answer.exit_code == 0, answer.output
+    named = ["--data", str(tree), "--frame", frame.relative_to(tree).as_posix(), "--out", str(tmp_path / "named")]
+    assert CliRunner().invoke(app, ["depth-study", *named]).exit_code == 0
+    assert (tmp_path / "named/depth_study.md").read_text() == (tmp_path / "out/depth_study.md").read_text()
     study = Study.model_validate(
         {k: v for k, v in read_json(tmp_path / "out/depth_study.json").items() if not k.startswith("schema")}
     )
@@ -91,6 +95,41 @@ def test_what_cannot_hold_the_depths_is_named(tmp_path):
     assert study.left_out == {"16-bit PNG of millimetres": "depths beyond 65.5 m"}
     np.save(tmp_path / "depth.npy", (ramp(np.float32) * 1e6).astype(np.float32))
     assert run(tmp_path / "depth.npy", tmp_path / "out").left_out["16-bit float"] == "depths beyond 65504 m"
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("hole", [np.nan, np.inf, -np.inf])
+def test_pixels_without_depth_of_others_are_invalid_ones(tmp_path, hole):
+    """Their figures are those of a frame whose invalid pixels are 0, in every coding."""
+    values = ramp(np.float64)
+    for name, invalid in (("ours", 0.0), ("theirs", hole)):
+        values[:, :7] = invalid
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "depth.npy", values)
+    ours, theirs = (run(tmp_path / name, tmp_path / f"of {name}") for name in ("ours", "theirs"))
+    assert theirs.rows == ours.rows
+    assert theirs.left_out == {}
+    assert theirs.share_measured == 1 - 7 / 128
+
+
+def test_whole_numbers_are_asked_for_their_unit(tmp_path):
+    np.save(tmp_path / "depth.npy", (ramp(np.float64) * 1000).astype(np.uint16))
+    with pytest.raises(InputError, match=r"unit.*uint16.*metres as float32 or float64.*/ 1000") as caught:
+        run(tmp_path / "depth.npy", tmp_path / "out")
+    assert caught.value.where == tmp_path / "depth.npy"
+
+
+def test_the_profile_is_where_steps_are_seen():
+    """A floor that rises by 20 steps of 8 bits over a row, in a frame with a far wall; noise above, a hole beside."""
+    truth = np.tile(np.linspace(10.0, 10.0 + 20 * 90 / 255, 160), (60, 1))
+    truth[:20] = np.random.default_rng(0).uniform(10, 100, (20, 160))
+    truth[20:40, 80] = 0.0
+    truth[59] = 100.0
+    row, first, length = steady_stretch(truth, truth > 0)
+    part = truth[row, first : first + length]
+    assert row >= 20
+    assert 0 not in part
+    assert PROFILE_STEPS / 2 < abs(part[-1] - part[0]) / (90 / 255) < PROFILE_STEPS * 2
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,8 @@ def test_four_pictures_of_a_frame(trees, tmp_path):
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(trees[False], tmp_path / "b.png", box_map=street())
     assert name in result.output
+    for frame in (name, str(trees[False] / name)):
+        assert four_panels(trees[False], tmp_path / "b.png", frame=frame, box_map=street()) == name
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.asarray(Image.open(tmp_path / "b.png")))
 
 

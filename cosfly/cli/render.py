@@ -139,7 +139,9 @@ def render_sample(
     data: options.Data = None,
     frame: Annotated[
         str | None,
-        typer.Option(help="Folder of a frame in the tree. [default: a frame that shows the target whole]"),
+        typer.Option(
+            help="Folder of a frame, from the tree on or as a path. [default: a frame that shows the target whole]"
+        ),
     ] = None,
     map_: Annotated[
         Path | None, typer.Option("--map", help="Boxes that were drawn: boxes_3d.json; needed without debug.png.")

@@ -19,13 +19,17 @@ def depth_study(
     frame: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of a frame, or a .npy of depth, float32 or float64. [default: a frame of the tree that shows the target whole]"
+            help="Folder of a frame, from the tree on or as a path, or a .npy of depth in metres, float32 or float64. [default: a frame of the tree that shows the target whole]"
         ),
     ] = None,
 ) -> None:
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
     from cosfly.depth_study import study
-    from cosfly.gallery import best_frame
+    from cosfly.gallery import best_frame, frame_in
 
-    study.run(frame or best_frame(options.data_folder(data), "depth.npy"), out)
+    if frame is None:
+        frame = best_frame(options.data_folder(data), "depth.npy")
+    elif data and not frame.exists():
+        frame = frame_in(options.data_folder(data), frame)
+    study.run(frame, out)
     typer.echo(out / "depth_study.md")

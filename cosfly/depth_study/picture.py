@@ -11,7 +11,8 @@ from cosfly.topview import INK, PAPER, Color, draw_line, draw_text, png_bytes
 PANEL_PX = (480, 270)  # width, height of each of six
 GAP_PX, TITLE_PX = 14, 30
 PROFILE_COLORS: dict[str, Color] = {"8-bit": (215, 60, 50), "10-bit": (240, 150, 40), "truth": (30, 30, 30)}
-PROFILE_PX = 160  # pixels of a row that the profile shows: more, and no step is seen
+MOST_PROFILE_PX, LEAST_PROFILE_PX = 160, 16  # of a row
+PROFILE_STEPS = 6.0  # of 8 bits: of more none is seen
 
 
 def draw_study(
@@ -27,7 +28,10 @@ def draw_study(
     grey = np.where(measured, np.clip((decoded["8-bit"] - low) / (high - low), 0, 1) * 255.0, 0).astype(np.uint8)
     fine = "32-bit float" if "64-bit float" in decoded else "16-bit"
     panels = [
-        ("(a) colours", np.full((*truth.shape, 3), PAPER, np.uint8) if rgb is None else rgb),
+        (
+            "(a) colours" if rgb is not None else "(a) no colours beside it",
+            np.full((*truth.shape, 3), PAPER, np.uint8) if rgb is None else rgb,
+        ),
         ("(b) 8 bits, as grey", cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)),
         (f"(c) float32, inferno reversed, to {high:.0f} m", depth_colors(truth.astype(np.float32), high)),
         _errors("(d) error of 8 bits", decoded["8-bit"], truth, measured),
@@ -54,24 +58,28 @@ def _errors(title: str, values: np.ndarray, truth: np.ndarray, measured: np.ndar
     return f"{title}, up to {most * 100:.3g} cm", shown
 
 
-def smoothest_row(truth: np.ndarray, measured: np.ndarray) -> tuple[int, int]:
-    """Give row and first column of the stretch of PROFILE_PX measured pixels that is smoothest: there steps are seen best."""
-    length = min(PROFILE_PX, truth.shape[1])
-    steps = np.abs(np.diff(np.where(measured, truth, np.nan).astype(np.float64), n=2, axis=1))
-    best, place = np.inf, (truth.shape[0] // 2, 0)
+def steady_stretch(truth: np.ndarray, measured: np.ndarray) -> tuple[int, int, int]:
+    """Give row, first column and length of a stretch of measured pixels whose depth changes evenly, by about PROFILE_STEPS of 8 bits and slowly."""
+    known = truth[measured]
+    step_m = float(known.max() - known.min()) / 255.0
+    depth = np.where(measured, truth, np.nan).astype(np.float64)
+    best, place = np.inf, (truth.shape[0] // 2, 0, min(MOST_PROFILE_PX, truth.shape[1]))
     for y in range(0, truth.shape[0], max(1, truth.shape[0] // 60)):
-        for x in range(0, truth.shape[1] - length + 1, max(1, length // 2)):
-            part = steps[y, x : x + length - 2]
-            span = abs(float(truth[y, x + length - 1]) - float(truth[y, x]))
-            if not np.isnan(part).any() and span > 0 and part.max(initial=0.0) / span < best:
-                best, place = part.max(initial=0.0) / span, (y, x)
+        for length in (MOST_PROFILE_PX, MOST_PROFILE_PX // 3, LEAST_PROFILE_PX):
+            for x in range(0, truth.shape[1] - length + 1, max(1, length // 2)):
+                part = depth[y, x : x + length]
+                steps = abs(part[-1] - part[0]) / step_m
+                if not steps > 0 or np.isnan(part).any():
+                    continue
+                uneven = float(np.abs(part - np.linspace(part[0], part[-1], length)).max()) / step_m
+                if (badness := abs(np.log(steps / PROFILE_STEPS)) + uneven + 4.0 * steps / length) < best:
+                    best, place = badness, (y, x, length)
     return place
 
 
 def _profile(truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]) -> np.ndarray:
-    """Draw the depth along a stretch of a row, in 8 bits, 10 bits and as it is."""
-    y, x = smoothest_row(truth, measured)
-    length = min(PROFILE_PX, truth.shape[1])
+    """Draw the depth along a stretch of a row: as it is, as a line, and over that in 8 and 10 bits, a step at each pixel."""
+    y, x, length = steady_stretch(truth, measured)
     width, height = PANEL_PX
     panel = np.full((height, width, 3), 255, np.uint8)
     curves = {
@@ -79,10 +87,14 @@ def _profile(truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndar
         for name in PROFILE_COLORS
     }
     low, high = (edge(curve.min() if edge is min else curve.max() for curve in curves.values()) for edge in (min, max))
-    columns = 50.0 + np.arange(length) * (width - 70.0) / max(1, length - 1)
-    for name, curve in curves.items():
-        rows = height - 30.0 - (curve - low) / ((high - low) or 1.0) * (height - 60.0)
-        draw_line(panel, np.stack([columns, rows], axis=1), PROFILE_COLORS[name], 2 if name == "truth" else 1)
+    edges = 50.0 + np.arange(length + 1) * (width - 70.0) / length
+    for name in reversed(PROFILE_COLORS):
+        rows = height - 30.0 - (curves[name] - low) / ((high - low) or 1.0) * (height - 60.0)
+        if name == "truth":
+            places = np.stack([(edges[1:] + edges[:-1]) / 2.0, rows], axis=1)
+        else:
+            places = np.stack([np.repeat(edges, 2)[1:-1], np.repeat(rows, 2)], axis=1)
+        draw_line(panel, places, PROFILE_COLORS[name], 3 if name == "truth" else 1)
     left = 60
     for name, color in PROFILE_COLORS.items():
         left = draw_text(panel, name, left, 18, 0.45, color) + 16

@@ -71,12 +71,12 @@ def run(frame: Path, out: Path) -> Study:
     """Read a frame folder, or a `.npy` of depth; write the study into a folder, with a figure; give it.
 
     Raises:
-        InputError: there is no depth image, or it holds fewer than two different depths.
+        InputError: there is no depth image, it is not of metres, or it holds fewer than two different depths.
     """
     file = frame / "depth.npy" if frame.is_dir() else frame
     data = read_bytes(file, what="depth image")
     truth = _truth(data, file)
-    measured = np.isfinite(truth) & (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
+    measured = (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
     known = truth[measured]
     if not known.size or known.min() == known.max() or known.min() < 0:
         got = "no measured pixel" if not known.size else f"{known.min():g} to {known.max():g} m"
@@ -106,10 +106,20 @@ def run(frame: Path, out: Path) -> Study:
 
 
 def _truth(data: bytes, file: Path) -> np.ndarray:
-    kind = (
-        np.float64 if parse_array_header(memoryview(data), file, what="depth image").dtype == np.float64 else np.float32
-    )
-    return parse_array(data, file, dtype=kind, ndim=2, what="depth image")
+    """Read depth, (h, w) m; what others write for a pixel without, NaN or infinity, becomes INVALID_DEPTH_M.
+
+    Raises:
+        InputError: it is no array of this form, or of whole numbers, which may be millimetres as well as 256ths of a metre.
+    """
+    kind = parse_array_header(memoryview(data), file, what="depth image").dtype
+    if kind.kind in "iu":
+        raise InputError(
+            "a depth image whose unit nobody knows", where=file, got=str(kind), expected="metres as float32 or float64",
+            fix='np.save("depth.npy", image / 1000.0), where it holds millimetres',
+        )  # fmt: skip
+    wanted = np.float64 if kind == np.float64 else np.float32
+    truth = parse_array(data, file, dtype=wanted, ndim=2, what="depth image")
+    return np.where(np.isfinite(truth), truth, wanted(INVALID_DEPTH_M))
 
 
 # --- codings ----------------------------------------------------------------------------------------------------------
