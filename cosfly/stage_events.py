@@ -134,8 +134,8 @@ def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
 
 
 def lost_steps(folder: Path) -> int:
-    """Count the steps, as frames, that workers had done of items which were lost with them: they are in no product."""
-    return sum(event.steps or 0 for event in read_events(folder) if event.event in LOSSES)
+    """Count the steps, as frames, that were done of items which then failed or were lost with their worker: they are in no product."""
+    return sum(event.steps or 0 for event in read_events(folder) if event.event in LOSSES or event.status == "failed")
 
 
 # --- what the system says of a process --------------------------------------------------------------------------------

@@ -294,7 +294,7 @@ class StageFolder:
             self._lock.release()
         log.info("%s: %s, %.1f s", self.stage, tally, manifest.seconds)
         if lost:
-            log.info("%s: %d steps of lost workers were done again, or left out with their item", self.stage, lost)
+            log.info("%s: %d steps of lost workers and failed items were done again, or left out", self.stage, lost)
 
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None

@@ -1,8 +1,11 @@
 """`cosfly bench`: figures and picture from events that are known."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 from toy_workers import make_counting_worker, make_worker, stage_in
 from typer.testing import CliRunner
 
@@ -11,6 +14,7 @@ from cosfly.bench.measure import row_of, run
 from cosfly.bench.picture import COLORS, draw_events, draw_scaling
 from cosfly.bench.tables import Bench, markdown, stage_rows, tables
 from cosfly.cli import app
+from cosfly.cli.bench import _tables
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.runner import Item, run_items
 from cosfly.settings import RunConfig
@@ -74,9 +78,14 @@ def test_tables_are_those_of_the_paper():
     scaling, faults, _ = tables(bench)
     assert [dict(zip(scaling.head, row, strict=True))["speed-up"] for row in scaling.rows] == ["1.00x", "2.00x"]
     last = dict(zip(faults.head, faults.rows[-1], strict=True))
-    assert (last["fault"], last["lost frames"], last["same"], last["restarts"]) == ("kill", "30", "yes", "1")
+    assert (last["fault"], last["lost"], last["same"], last["restarts"]) == ("kill", "30", "yes", "1")
     text = markdown(bench)
     assert "| 2 | 10.0 | 200 | 200 | 20.00 | 2.00x |" in text
+    terminal = Console(width=80, file=io.StringIO())
+    terminal.print(*_tables(bench))
+    shown = terminal.file.getvalue()
+    assert "…" not in shown, "eighty columns hold all heads"
+    assert "successful frames/s speed-up" in shown
     picture = cv2.imdecode(np.frombuffer(draw_scaling(bench), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert (picture == COLORS["worker_died"]).all(axis=2).sum() > 1000, "a bar of one restart"
 
@@ -91,6 +100,19 @@ def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
     assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
     (row,) = stage_rows(tmp_path, ["s", "t"])
     assert (row.launches, row.restarts, row.modes) == (2, 1, {"worker_died": 1})
+
+
+def test_frames_of_a_trajectory_that_fails_are_counted_and_left_out(tmp_path):
+    """Its worker lives: it fails by itself after four of nine steps."""
+    items = [Item("a", num_steps=9), Item("b", "fail", num_steps=4)]
+    folder = stage_in(tmp_path)
+    finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1)
+    (tmp_path / "s/product").write_text("x")
+    folder.finish([tmp_path / "s/product"], finished.tally)
+    manifest = read_manifest(tmp_path / "s")
+    assert (manifest.counts.kept, manifest.counts.failed, manifest.facts["lost_steps"]) == (1, {"render": 1}, 4)
+    row = row_of(read_events(tmp_path / "s"), manifest, 1, counts_frames=True)
+    assert (row.attempted, row.successful, row.failed) == (13, 9, 1)
 
 
 def test_what_cannot_be_measured(tmp_path):

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from cosfly.config import Config
+from cosfly.errors import RenderError
 from cosfly.runner import Item, Outcome, advance
 from cosfly.stage_folder import StageFolder
 from cosfly.store import atomic_folder
@@ -57,6 +58,8 @@ def make_counting_worker(folder: Path):
             mark.touch()
             time.sleep(1.5)  # for a heartbeat with the steps that will be lost
             os.kill(os.getpid(), signal.SIGKILL)
+        if item.payload == "fail":
+            raise RenderError("a frame that cannot be drawn", where=item.item_id)
         return Outcome()
 
     return work

@@ -35,7 +35,7 @@ def bench(
     cfg = options.resolve(run / "run.yaml", overrides)
     bench = measure.run(cfg, run, out, stage, counts, {"kill": kills, "stall": stalls}, cfg.seed)
     for table in _tables(bench):
-        console.print(table)
+        console.print(table, "")
     typer.echo(out)
 
 
@@ -48,7 +48,8 @@ def _tables(bench: Bench) -> list[Table]:
 
     found = []
     for title, head, rows in tables(bench):
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        # Eighty columns hold the widest.
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False)
         for number, name in enumerate(head):
             table.add_column(name, justify="right" if number else "left")
         for row in rows:
