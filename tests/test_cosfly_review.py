@@ -213,12 +213,26 @@ def test_what_the_page_saves_is_what_the_command_takes(product):
     assert "<b>bad" not in again
 
 
+@pytest.mark.slow
+def test_the_pages_do_not_scroll_sideways(product):
+    """Neither on a desk nor on a phone, with every flight open."""
+    pages = (product.with_name("report.html"), review.write_page(product))
+    with browser(product.parent / "profile") as tab:
+        for path in pages:
+            for width in (1400, 390):
+                tab.open(path, width=width)
+                tab.run("document.querySelectorAll('details').forEach(one => { one.open = true; })")
+                assert tab.run("document.querySelectorAll('details[open]').length") == 4
+                assert tab.run("document.documentElement.scrollWidth") <= width, (path.name, width)
+
+
 def test_the_page_shows_plots_and_a_map_of_every_flight(product):
     page = product.with_name("report.html").read_text(encoding="utf-8")
     flights = len(folders_of(product))
     assert page.count('class="plan"') == flights
     for title, _, _ in PLOTS.values():
         assert page.count(f"<figcaption>{title} ") == flights
+    assert " , mean" not in page, "visibility has no unit"
 
 
 def test_a_page_of_hundreds_of_flights_is_bounded(product):

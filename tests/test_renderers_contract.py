@@ -481,6 +481,18 @@ def test_a_missing_extra_is_named(monkeypatch):
         open_renderer("pyrender", street(), *SIZE)
 
 
+def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
+    """PyOpenGL is there and fails to load libEGL, which is an ImportError too."""
+    pytest.importorskip("pyrender")
+
+    def fail(*_):
+        raise ImportError("Unable to load EGL library", "libEGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(sys.modules["pyrender"], "OffscreenRenderer", fail)
+    with pytest.raises(EnvironmentMissing, match=r"EGL.*libEGL\.so\.1.*apt-get install libegl1 libgl1 libgl1-mesa-dri"):
+        open_renderer("pyrender", street(), *SIZE)
+
+
 # --- others -----------------------------------------------------------------------------------------------------------
 
 BESIDE = PosedOther(

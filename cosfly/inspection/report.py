@@ -216,8 +216,9 @@ def _plot(
         parts.append(f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} {PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}")  # fmt: skip
         pen_is_down = True
     mean = float(np.mean(known))
+    told = f"{min(known):.2f} to {max(known):.2f}{for_html(f' {unit}' if unit else '')}, mean {mean:.2f}"
     return (
-        f"<figure><figcaption>{for_html(title)} <small>{min(known):.2f} to {max(known):.2f} {for_html(unit)}, mean {mean:.2f}</small></figcaption>"
+        f"<figure><figcaption>{for_html(title)} <small>{told}</small></figcaption>"
         f'<svg viewBox="0 0 {PLOT_WIDTH:.0f} {PLOT_HEIGHT:.0f}" preserveAspectRatio="none"><path d="{"".join(parts)}"/></svg>'
         f"<small>{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s</small></figure>"
     )

@@ -54,13 +54,15 @@ def _open_screen(width_px: int, height_px: int) -> Any:
         import pyrender
         import trimesh  # noqa: F401
         from pyrender.shader_program import ShaderProgramCache
-    except ImportError as error:
+
+        screen = pyrender.OffscreenRenderer(width_px, height_px)
+    except ModuleNotFoundError as error:
         raise EnvironmentMissing(
             "the renderer pyrender is not installed", got=str(error), fix='pip install "cosfly[pyrender]"'
         ) from None
-    try:
-        screen = pyrender.OffscreenRenderer(width_px, height_px)
-    except Exception as error:  # PyOpenGL raises its own, pyrender's platforms bare assertions
+    except (
+        Exception
+    ) as error:  # PyOpenGL raises its own, an ImportError without libEGL; pyrender's platforms bare assertions
         raise EnvironmentMissing(
             "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {contract.DEBIAN_PACKAGES}"
         ) from None
