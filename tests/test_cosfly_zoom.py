@@ -17,14 +17,17 @@ from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, NothingKept, RenderError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
-from cosfly.products.boxes import MapHeader, write_boxes
+from cosfly.maps.stage import MapsConfig
+from cosfly.maps.stage import run as make_map
+from cosfly.products.boxes import MapHeader, check_ground, write_boxes
 from cosfly.products.frames import level_name, read_meta
 from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import find_flights, read_flight, write_flight
 from cosfly.products.segments import Segment
 from cosfly.products.traces import DroneTrace
+from cosfly.render import weather_gallery
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.sense import check_flight, check_ground
+from cosfly.render.sense import check_flight
 from cosfly.render.stage import RenderConfig, run
 from cosfly.render.zoom.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.stage_folder import read_failures, read_manifest
@@ -260,7 +263,13 @@ def test_a_map_without_ground_is_an_error(tmp_path):
     walls = replace(walls.select(np.isin(walls.kinds, [3, 4])), header=MapHeader(name="walls"))
     inputs = write_inputs(tmp_path / "inputs", [circling(3)])
     write_boxes(inputs[0], walls)
-    with pytest.raises(InputError, match=r"boxes_3d\.json: the map has no ground.*ground_z_m"):
-        run(RenderConfig.model_validate(SMALL), *inputs, tmp_path / "render")
+    of_these_boxes = MapsConfig.model_validate({"source": "boxes", "boxes": {"path": inputs[0]}})
+    for begin in (
+        lambda: make_map(of_these_boxes, tmp_path / "maps"),  # before anybody walks or flies there
+        lambda: run(RenderConfig.model_validate(SMALL), *inputs, tmp_path / "render"),
+        lambda: weather_gallery.run(RenderConfig(), inputs[0], inputs[2], tmp_path / "gallery"),
+    ):
+        with pytest.raises(InputError, match=r"boxes_3d\.json: the map has no ground.*ground_z_m"):
+            begin()
     check_ground(replace(walls, header=MapHeader(name="walls", ground_z_m=0.0)), inputs[0])
     check_ground(street(), inputs[0])

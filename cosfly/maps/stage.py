@@ -16,7 +16,7 @@ from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
-from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
 from cosfly.stage_folder import Resume, StageFolder, Tally
 from cosfly.store import write_bytes
@@ -59,13 +59,18 @@ def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
-    """Reads the source's files, if it has any; writes `boxes_3d.json` and the overview `map.png`."""
+    """Reads the source's files, if it has any; writes `boxes_3d.json` and the overview `map.png`.
+
+    Raises:
+        InputError: a file is malformed, or nothing in it says where the ground is: no later stage could tell.
+    """
     inputs = getattr(cfg, cfg.source).inputs()
     stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "boxes_3d.json"
     if stage.is_complete:
         return product
     box_map = load_map(cfg, seed=seed)
+    check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
     view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))

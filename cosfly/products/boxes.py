@@ -16,7 +16,7 @@ from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
-from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
 from cosfly.reading.documents import MISSING, check_schema, read_json, validation_errors
 from cosfly.store import dump_json, write_bytes
@@ -197,6 +197,20 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
         raise InputError("a box id occurs more than once", where=where, got=str(ids[counts > 1][0]))
+
+
+def check_ground(box_map: BoxMap, path: Path) -> None:
+    """Check that a map says where its ground is: a height, a grid of heights, or one box of it.
+
+    Raises:
+        InputError: it does not; a plane at height 0 would be an invention.
+    """
+    told = box_map.header.model_fields_set & {"ground_z_m", "ground"}
+    if not told and not box_map.is_any_of(GROUND_KINDS).any():
+        raise InputError(
+            "the map has no ground", where=path, got="neither ground_z_m nor heights in the header, and no box of the ground",
+            expected="where people stand", fix="put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground",
+        )  # fmt: skip
 
 
 class _Box(BaseModel):

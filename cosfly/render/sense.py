@@ -1,34 +1,16 @@
-"""Whether a map and a flight can be drawn at all: where the ground is, and that nobody stands below it or looks out of a wall."""
+"""Whether a flight can be drawn at all: nobody stands below the ground or looks out of a wall."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from cosfly.errors import InputError, RenderError
+from cosfly.errors import RenderError
 from cosfly.kernels import signed_distances
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.render.perturbation import STEP_UP_M, Surroundings
 
 TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
-
-
-def check_ground(box_map: BoxMap, path: Path) -> None:
-    """Check that a map says where its ground is: a height, a grid of heights, or one box of it.
-
-    Raises:
-        InputError: it does not; a plane at height 0 would be an invention.
-    """
-    told = box_map.header.model_fields_set & {"ground_z_m", "ground"}
-    if not told and not box_map.is_any_of(GROUND_KINDS).any():
-        raise InputError(
-            "the map has no ground", where=path, got="neither ground_z_m nor heights in the header, and no box of the ground",
-            expected="where people stand", fix="put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground",
-        )  # fmt: skip
 
 
 def check_flight(trace: DroneTrace, surroundings: Surroundings) -> None:

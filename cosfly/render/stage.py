@@ -18,7 +18,7 @@ from cosfly.chance import rng_for
 from cosfly.config import MayDiffer
 from cosfly.errors import ConfigError, InputError
 from cosfly.overlay import Overlay
-from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.boxes import BoxMap, check_ground, read_boxes
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
 from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION
 from cosfly.products.others import Company, read_others
@@ -33,7 +33,7 @@ from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.others import NOBODY, Cast, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Perturbed, Poses, Surroundings, perturb
-from cosfly.render.sense import check_flight, check_ground
+from cosfly.render.sense import check_flight
 from cosfly.render.weather import WeatherConfig, coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.render.zoom.lens import ZoomConfig, cameras_of
 from cosfly.runner import Item, Outcome, Watch, Work, run_items

@@ -13,7 +13,7 @@ from cosfly.chance import rng_for
 from cosfly.errors import InputError
 from cosfly.frame_views import encode_picture
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.products.boxes import read_boxes
+from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.weather import resolved
 from cosfly.render.contract import PosedPerson, Renderer
@@ -67,7 +67,9 @@ def run(
             got=index,
             expected=f"0 to {len(trace.time_s) - 1}",
         )
-    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look)
+    box_map = read_boxes(boxes)
+    check_ground(box_map, boxes)
+    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
     try:
         pictures = _drawn(
             renderer, pools, trace, index, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg), seed, advance

@@ -17,13 +17,13 @@ from pydantic import BaseModel, Field
 
 from cosfly.chance import rng_for
 from cosfly.geometry import box_iou, intrinsic_matrix
-from cosfly.products.boxes import read_boxes
+from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.frames import Camera, level_name
 from cosfly.products.traces import read_traces
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, draw_frame
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.sense import check_flight, check_ground
+from cosfly.render.sense import check_flight
 from cosfly.render.stage import RenderConfig, open_renderer, script_flight
 from cosfly.render.zoom.fidelity import KERNELS, compare, digital_zoom, enlarged_camera
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
