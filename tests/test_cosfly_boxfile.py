@@ -115,6 +115,8 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
     with pytest.raises(ConfigError, match=r"maps\.boxes: boxes_3d\.json has its own types.*got metres_per_unit"):
         load(BoxesConfig(path=tmp_path / "own.json", metres_per_unit=0.01))
+    with pytest.raises(ConfigError, match=r"and ground.*got ground_z_m"):
+        load(BoxesConfig(path=tmp_path / "own.json", ground_z_m=4.0))
 
 
 def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):

@@ -180,9 +180,9 @@ def _hint(problems: Sequence[str]) -> str | None:
 
 
 def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
-    if cfg.types or cfg.ignore or cfg.metres_per_unit != 1.0 or cfg.left_handed:
+    if cfg.types or cfg.ignore or cfg.metres_per_unit != 1.0 or cfg.left_handed or cfg.ground_z_m:
         raise ConfigError(
-            "boxes_3d.json has its own types, metres and axes", where="maps.boxes",
+            "boxes_3d.json has its own types, metres, axes and ground", where="maps.boxes",
             got=", ".join(sorted(cfg.model_fields_set - {"path", "name", "licence", "credits", "tool"})), fix="leave these settings out, or give a .csv",
         )  # fmt: skip
     return read_boxes(path)
