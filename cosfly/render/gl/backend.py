@@ -7,29 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.weather import WeatherParams
-from cosfly.reading.files import read_text
-from cosfly.render.contract import DEBIAN_PACKAGES, FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import Body, make_body
 from cosfly.render.gl.loose import LooseTriangles, attributes
 from cosfly.render.gl.moving import MOST_CAPSULES, capsules_of, draw_others, placed
 from cosfly.render.gl.parts import PART
-from cosfly.render.gl.scene import Scene, build_scene
+from cosfly.render.gl.programs import Programs, open_context, packed, programs_of, set_uniform, sources
+from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import View
-from cosfly.render.gl.weather_pass import FAIR, WEATHER_SCENE, WEATHER_SKY, WeatherPass, defines
+from cosfly.render.gl.weather_pass import WeatherPass, defines
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
@@ -45,42 +43,11 @@ PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin 
 ORIGIN_STEP_M = 2.0 * PATTERN_M  # a flight farther off than half of this has an origin of its own
 
 
-def open_context() -> Any:
-    """Open a GL context without a window.
-
-    Raises:
-        EnvironmentMissing: no moderngl, no EGL or no driver; names the packages.
-    """
-    try:
-        import moderngl
-
-        settings: Any = {"backend": "egl"}  # moderngl's own annotation of this argument is wrong
-
-        return moderngl.create_context(require=330, standalone=True, **settings)
-    except ImportError as error:
-        raise EnvironmentMissing("the package moderngl is missing", got=str(error), fix="pip install cosfly") from None
-    except Exception as error:  # glcontext raises a bare Exception, and OSError where the library is missing
-        raise EnvironmentMissing(
-            "no OpenGL without a window (EGL)",
-            got=str(error),
-            fix=f"apt-get install {DEBIAN_PACKAGES} (these serve the CPU too)",
-        ) from None
-
-
-def _sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
-    """Give the texts of a program of these files."""
-    folder, head = Path(__file__).parent, "#version 330 core\n" + define
-    texts = ["\n".join(read_text(folder / name) for name in names) for names in (vertex, fragment)]
-    return head + texts[0], head + texts[1]
-
-
 @dataclass(frozen=True)
 class _Look:
     """What fair weather, or any other, is drawn with."""
 
-    materials: list[Any]
-    near_movers: list[Any]
-    sky_program: Any
+    programs: Programs
     sky: Any
     weather: WeatherPass | None
 
@@ -96,14 +63,12 @@ class GlRenderer:
         self.scene, self.look, self.num_others = build_scene(box_map, num_others), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
-            self._depth_program = self.context.program(
-                *_sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
-            )
+            self._depth_program = self.context.program(*sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",)))
             self._make_targets()
             self._make_meshes()
             self._looks: dict[str | None, _Look] = {}
             self._use_look(None)
-        self.prepare(*_bounds(self.scene))
+        self.prepare(*self.scene.bounds())
 
     # --- set-up ---
 
@@ -112,29 +77,14 @@ class GlRenderer:
         if define not in self._looks:
             self._looks[define] = self._make_look(define)
         look = self._looks[define]
-        self._materials, self._near_movers = look.materials, look.near_movers
-        self._sky_program, self._sky, self._weather = look.sky_program, look.sky, look.weather
+        self._programs, self._sky, self._weather = look.programs, look.sky, look.weather
 
     def _make_look(self, define: str | None) -> _Look:
-        make = self.context.program
-        of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
-        of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
-        snaps = "" if self._is_software else "#define SNAPS\n"
-        vertex, fragment = _sources(("part.glsl", "scene.vert.glsl"), of_surfaces, snaps + (define or ""))
-        materials, near_movers = (
-            [
-                make(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))
-                for material in range(part_tables.NUM_MATERIALS)
-            ]
-            for near in ("false", "true")
-        )
-        sky_program = make(*_sources(("screen.vert.glsl",), of_sky, define or ""))
-        weather = None
-        if define is not None:
-            rain = make(*_sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl")))
-            weather = WeatherPass(self.context, self._color, self._depth, rain, self.num_others)
-        sky = self.context.vertex_array(sky_program, [])
-        return _Look(materials, near_movers, sky_program, sky, weather)
+        programs = programs_of(self.context, define, snaps=not self._is_software)
+        sky = self.context.vertex_array(programs.sky, [])
+        if define is None:
+            return _Look(programs, sky, None)
+        return _Look(programs, sky, WeatherPass(self.context, self._color, self._depth, programs.rain, self.num_others))
 
     def _make_targets(self) -> None:
         size, context = (self.width_px, self.height_px), self.context
@@ -236,9 +186,9 @@ class GlRenderer:
         self._draw_depth(self._shadow_target, clip_from_world, casting)
         to_texture = np.diag([0.5, 0.5, 0.5, 1.0])
         to_texture[:3, 3] = 0.5
-        for program in (*self._materials, *self._near_movers):
-            _set(program, "shadow_from_world", to_texture @ clip_from_world)
-            _set(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
+        for program in (*self._programs.materials, *self._programs.near_movers):
+            set_uniform(program, "shadow_from_world", to_texture @ clip_from_world)
+            set_uniform(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
 
     def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
         """A height map from above, blurred: what stands higher than a point darkens it. top: no caster is higher."""
@@ -259,8 +209,8 @@ class GlRenderer:
         target.release()
         texture.release()
         low = middle[:2] - half
-        for program in (*self._materials, *self._near_movers):
-            _set(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
+        for program in (*self._programs.materials, *self._programs.near_movers):
+            set_uniform(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
 
     def _ground_z(self, low: np.ndarray, pixel_m: float) -> np.ndarray | float:
         """Height of the ground over the map of openness, relative to the origin: one figure where it is flat."""
@@ -274,7 +224,7 @@ class GlRenderer:
         target.use()
         target.clear(depth=1.0)
         self.context.enable_only(self.context.DEPTH_TEST)
-        _set(self._depth_program, "clip_from_world", clip_from_world)
+        set_uniform(self._depth_program, "clip_from_world", clip_from_world)
         for mesh in range(len(self._meshes)):
             self._draw(self._depth_program, mesh, self._parts.records[rows[self._parts.mesh[rows] == mesh]])
         self._solids.draw_all(self._depth_program)
@@ -300,7 +250,7 @@ class GlRenderer:
         shades = shades_of(bones, capsules, self._sun, view, has_headlights)
         frame_values = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
         with self.context:
-            self._set_camera(self._materials, view, frame_values)
+            self._set_camera(self._programs.materials, view, frame_values)
             rows = view.rows(self._parts)
             self._solids.see(view)
             self._image.use()
@@ -312,9 +262,9 @@ class GlRenderer:
             self._height.use(1)
             if self._weather is not None:
                 self._weather.use()
-            self._draw_scene(self._materials, rows, moving)
+            self._draw_scene(self._programs.materials, rows, moving)
             if shades:
-                self._set_camera(self._near_movers, view, frame_values)
+                self._set_camera(self._programs.near_movers, view, frame_values)
                 self._set_person(body)
             for shade in shades:
                 self._draw_shaded(shade, bones, rows, moving)
@@ -322,7 +272,7 @@ class GlRenderer:
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
             if self._weather is not None:
-                self._weather.draw_rain(_set, self._lens(view) | frame_values)
+                self._weather.draw_rain(self._lens(view) | frame_values)
             return self._read()
 
     def _lens(self, view: View) -> dict[str, Any]:
@@ -350,10 +300,10 @@ class GlRenderer:
             "sky_tag": KINDS["Sky"],
             **frame_values,
         }
-        packed = {name: _packed(value) for name, value in common.items()}
-        for program in (*programs, self._sky_program):
-            for name, value in packed.items():
-                _set(program, name, value)
+        bytes_of = {name: packed(value) for name, value in common.items()}
+        for program in (*programs, self._programs.sky):
+            for name, value in bytes_of.items():
+                set_uniform(program, name, value)
 
     def _bones(self, body: Body | None) -> np.ndarray:
         """Capsules of the person's shadow, relative to the origin, as `moving.capsules_of` gives those of others."""
@@ -364,8 +314,8 @@ class GlRenderer:
 
     def _set_person(self, body: Body | None) -> None:
         center = np.zeros(3) if body is None else body.center_m - self.origin_m
-        for program in self._near_movers:
-            _set(program, "person_center", center)
+        for program in self._programs.near_movers:
+            set_uniform(program, "person_center", center)
 
     def _draw_shaded(
         self, shade: Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
@@ -379,14 +329,14 @@ class GlRenderer:
         ):
             padded = np.zeros((most, 2, 4), np.float32)
             padded[: len(capsules)] = capsules
-            for program in self._near_movers:
-                _set(program, name, padded.tobytes())
-                _set(program, count, len(capsules))
+            for program in self._programs.near_movers:
+                set_uniform(program, name, padded.tobytes())
+                set_uniform(program, count, len(capsules))
         parts = self._parts
         away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
         x0, y0, x1, y1 = shade.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
-        self._draw_scene(self._near_movers, rows[away < radius], moving)
+        self._draw_scene(self._programs.near_movers, rows[away < radius], moving)
         self._image.scissor = None
 
     def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -443,26 +393,3 @@ def smoothed(rgb: np.ndarray) -> np.ndarray:
 def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
     """One number for each material and mesh, (k,)."""
     return ((records["tag"] >> 8) & 0xFF).astype(np.int64) * MESH_STRIDE + mesh
-
-
-def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    centers = scene.parts.object_centers[:-1] if len(scene.parts) > 1 else scene.parts.object_centers
-    centers = np.concatenate([centers, scene.solids.centers])
-    return centers.min(axis=0) + scene.origin_m, centers.max(axis=0) + scene.origin_m
-
-
-def _packed(value: Any) -> Any:
-    """The bytes of an array as a uniform has them: matrices are given row by row and stored column by column; other values as they are."""
-    return np.ascontiguousarray(value.T, dtype=np.float32).tobytes() if isinstance(value, np.ndarray) else value
-
-
-def _set(program: Any, name: str, value: Any) -> None:
-    """Set a uniform that the program uses, to a number, an array or its bytes."""
-    uniform = program.get(name, None)  # `in` would look through all of them
-    if uniform is None:
-        return  # the compiler leaves out what a material does not need
-    value = _packed(value)
-    if isinstance(value, bytes):
-        uniform.write(value)
-    else:
-        uniform.value = value

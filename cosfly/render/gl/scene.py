@@ -41,6 +41,12 @@ class Scene:
     solids: Loose
     lamps: np.ndarray
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest place of what stands on the ground plane, (3,) each, world."""
+        centers = self.parts.object_centers[:-1] if len(self.parts) > 1 else self.parts.object_centers
+        centers = np.concatenate([centers, self.solids.centers])
+        return centers.min(axis=0) + self.origin_m, centers.max(axis=0) + self.origin_m
+
 
 def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     """Turn a map into drawable parts, with a ground plane under everything; the ids of others stay free."""

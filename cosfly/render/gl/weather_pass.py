@@ -1,13 +1,11 @@
 """What weather adds to the default renderer: its uniforms, the map of street lamps, rain over the picture, the glow of lights.
 
-Programs are made for fair weather (look.glsl) and for others (weather.glsl, weather_scene.glsl), these with what the weather needs: who asks
-for no weather pays nothing for it. Nothing here writes depth, kinds or ids.
+Programs of other than fair weather are made with what the weather needs (`programs`): who asks for no weather pays nothing for it. Nothing here writes depth, kinds or ids.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -18,9 +16,8 @@ from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.atmosphere import light_direction, uniforms
 from cosfly.render.gl.parts import Parts
+from cosfly.render.gl.programs import set_uniform
 
-# Files of shaders that follow light.glsl.
-FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")
 SOFT_M, FAINT = 0.25, 0.02  # from such a border on a shadow is drawn soft; a sun of less light throws none
 LAMP_UNIT, DEPTH_UNIT = 2, 3
 WIND = (0.07, 0.03)  # m to the side for each m that a drop falls
@@ -43,7 +40,7 @@ def defines(params: WeatherParams) -> str:
 
 
 class WeatherPass:
-    """The weather of a flight on one GL context. `set_uniform(program, name, value)` passes over what a program does not use."""
+    """The weather of a flight on one GL context."""
 
     def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
         self._context = context
@@ -89,7 +86,7 @@ class WeatherPass:
     def use(self) -> None:
         self._lamp_map.use(LAMP_UNIT)
 
-    def draw_rain(self, set_uniform: Callable[[Any, str, Any], None], frame_values: dict[str, Any]) -> None:
+    def draw_rain(self, frame_values: dict[str, Any]) -> None:
         """Draw the drops over the colours of a finished frame; frame_values: its uniforms, the camera's among them."""
         if self.values["precipitation"] <= 0.0:
             return
