@@ -25,7 +25,8 @@ from cosfly.products.captions import read_captions
 from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
-from cosfly.render.stage import RenderConfig, open_renderer
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]

@@ -18,7 +18,7 @@ from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.reading.limits import Limits
-from cosfly.render.stage import RenderConfig
+from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worker_pool import Watch
 from distill.evaluation.compare import CompareConfig

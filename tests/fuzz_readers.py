@@ -76,7 +76,7 @@ from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render import older_trees
-from cosfly.render.stage import RenderConfig
+from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import read_pools
 from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify

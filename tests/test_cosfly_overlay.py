@@ -21,7 +21,8 @@ from cosfly.products.instance_ids import read_instance_ids
 from cosfly.products.playback import find_flights, read_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import instance_ids
-from cosfly.render.stage import RenderConfig, run
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import run
 from cosfly.store import read_checksums
 
 SETTINGS = {

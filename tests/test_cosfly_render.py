@@ -52,7 +52,8 @@ from cosfly.render.gl.view import View
 from cosfly.render.others import NOBODY, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
-from cosfly.render.stage import RenderConfig, open_renderer, run, script_flight
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, run, script_flight
 from cosfly.store import read_checksums
 
 LARGER = (640, 360)

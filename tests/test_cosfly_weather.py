@@ -27,7 +27,8 @@ from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.atmosphere import fog_extinction, light_direction, lights_on
 from cosfly.render.gl.lamps import APART_M, HIGH_M, lamps_along_streets
 from cosfly.render.person import choose_clothes
-from cosfly.render.stage import RenderConfig, open_renderer, run
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.render.weather_gallery import run as draw_gallery
 

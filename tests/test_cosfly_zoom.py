@@ -28,7 +28,8 @@ from cosfly.products.traces import DroneTrace
 from cosfly.render import weather_gallery
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.sense import check_flight
-from cosfly.render.stage import RenderConfig, run
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import run
 from cosfly.render.zoom.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.stage_folder import read_failures, read_manifest
 from release.columns import INTRINSICS, Placed, matrices_of, scalar_row

@@ -49,7 +49,8 @@ from cosfly.render.contract import (
 )
 from cosfly.render.layers import layers_of
 from cosfly.render.person import choose_clothes
-from cosfly.render.stage import RENDERERS, RenderConfig, open_renderer, run
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import RENDERERS, open_renderer, run
 
 SIZE = (320, 180)
 DEPTH_TOLERANCE_M = 0.001  # within 60 m

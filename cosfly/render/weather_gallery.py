@@ -19,7 +19,8 @@ from cosfly.products.weather import resolved
 from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
-from cosfly.render.stage import RenderConfig, open_renderer
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer
 from cosfly.render.weather import Pools, read_pools
 from cosfly.store import write_bytes
 from cosfly.topview import PAPER, draw_text

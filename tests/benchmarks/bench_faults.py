@@ -20,7 +20,8 @@ import scenes
 
 from cosfly.bench.faults import Faults, planted
 from cosfly.errors import EnvironmentMissing
-from cosfly.render.stage import RenderConfig, run
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import run
 from cosfly.runner import Watch
 from cosfly.stage_events import read_events
 from cosfly.stage_folder import read_manifest

@@ -40,7 +40,8 @@ from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.stage import RenderConfig, open_renderer, script_flight
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, script_flight
 
 SIZE = (1280, 720)
 FOVS_DEG = (60.0, 90.0)
@@ -53,7 +54,7 @@ from pathlib import Path
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import read_traces
 from cosfly.render.flight import Writing, render_flight
-from cosfly.render.stage import RenderConfig, open_renderer, script_flight
+from cosfly.render.stage import RenderConfig, open_renderer, script_flight  # where older checkouts have them all
 boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])
 cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
 trace = read_traces(traces)[number]

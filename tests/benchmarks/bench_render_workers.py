@@ -39,7 +39,8 @@ from cosfly.render import flight as flights
 from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import backend
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.stage import RenderConfig, open_renderer, script_flight
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, script_flight
 from cosfly.worker import keep_freed_memory
 
 NUM_FLIGHTS = 4

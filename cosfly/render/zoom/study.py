@@ -24,7 +24,8 @@ from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, draw_frame
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.sense import check_flight
-from cosfly.render.stage import RenderConfig, open_renderer, script_flight
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, script_flight
 from cosfly.render.zoom.fidelity import KERNELS, compare, digital_zoom, enlarged_camera
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, result_of

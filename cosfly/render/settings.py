@@ -1,0 +1,100 @@
+"""The settings of rendering: camera, tracks, weather and files of the frames."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from cosfly.config import MayDiffer
+from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
+from cosfly.products.places import folder_name
+from cosfly.render.perturbation import PerturbationConfig
+from cosfly.render.weather import WeatherConfig
+from cosfly.render.zoom.lens import ZoomConfig
+
+
+class RenderConfig(WeatherConfig):
+    """Camera, tracks, weather and files of the frames."""
+
+    formerly: ClassVar[dict[str, str]] = {
+        "png_compression": "it went with zlib: pictures are packed by an encoder of cosfly's own, which has no levels; take the line out",
+    }
+
+    backend: Literal["gl", "pyrender"] = Field(
+        "gl",
+        description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow cross-check",
+    )
+    width_px: int = Field(1280, ge=16, le=8192, description="image width, px")
+    height_px: int = Field(720, ge=16, le=8192, description="image height, px")
+    fovs_deg: tuple[float, ...] = Field(
+        (110.0, 90.0, 60.0, 30.0),
+        min_length=1,
+        description="levels of zoom: horizontal fields of view in (0, 180) degrees; one is drawn for each walk, and both its tracks keep it; a list of one fixes it",
+    )
+    zoom: ZoomConfig = Field(ZoomConfig(), description="whether a flight changes its level")
+    town: str | None = Field(
+        None,
+        description="name of the town; null takes the map's. Its folder has `Town_` in front unless it begins with `Town`",
+    )
+    first_timestamp: int | None = Field(
+        None,
+        ge=0,
+        description="flight k of the traces becomes trajectory_<first_timestamp + k>; null makes one of map, flights, seed and "
+        "settings, so that flights of other maps and runs have other ids",
+    )
+    tracks: tuple[Literal["clean", "perturbed"], ...] = Field(
+        ("clean", "perturbed"), min_length=1, description="which tracks to draw: ORI and aug_001"
+    )
+    perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
+    look: Look = Field(Look(), description="sun and air of flights without weather")
+    modalities: tuple[FrameFile, ...] = Field(
+        ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
+    )
+    debug: bool = Field(
+        False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
+    )
+    visible_threshold: float = Field(
+        0.1,
+        ge=0,
+        lt=1,
+        description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
+    )
+    encoder_threads: MayDiffer[int] = Field(
+        2, ge=1, le=64, description="threads that encode and write beside the drawing"
+    )
+
+    @field_validator("fovs_deg")
+    @classmethod
+    def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
+        if wrong := [fov for fov in fovs if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG]:
+            raise ValueError(
+                f"every field of view must lie in (0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}; got {wrong[0]:g}"
+            )
+        return fovs
+
+    @model_validator(mode="after")
+    def _weather_can_be_drawn(self) -> RenderConfig:
+        if self.weather_mode == "off":
+            return self
+        if self.backend != "gl":
+            raise ValueError(f"backend {self.backend} draws no weather: take gl, or weather_mode off")
+        if self.look != Look():
+            raise ValueError(
+                "look is for flights without weather: leave it out (--set 'render.look={}'), or take weather_mode off"
+            )
+        return self
+
+    @field_validator("tracks", "modalities")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) != len(names):
+            raise ValueError("a name occurs twice")
+        return names
+
+    @field_validator("town")
+    @classmethod
+    def _town_is_a_name(cls, town: str | None) -> str | None:
+        if town is not None and folder_name(town) != town:
+            raise ValueError("only letters, digits, dot, hyphen and underscore, and no dot in front")
+        return town
