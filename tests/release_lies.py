@@ -288,6 +288,29 @@ def unperturbed_called_applied(rows):
     row["perturbation"]["rotation"] = "applied"
 
 
+def undrawn_event_called_fallback(rows):
+    row = next(r for r in perturbed(rows) if r["perturbation"]["rotation"] == "none")
+    row["perturbation"]["rotation"] = "fallback: target out of view"
+
+
+def perturbation_taken_off(rows):
+    """A frame is that of the clean flight, pictures too: flag, words, offsets, pose and pixels agree."""
+    row = shifted(rows)
+    twin = next(r for r in clean(rows) if r["frame_index"] == row["frame_index"])
+    kept = ("sample_id", "variant", "track", "pair")
+    row.update({name: copy.deepcopy(value) for name, value in twin.items() if name not in (*kept, *CAPTION)})
+    for file in ("image", "instance"):
+        row[file]["path"] = row[file]["path"].replace(twin["sample_id"], row["sample_id"])
+    row["perturbation"] = {"position": "none", "rotation": "none"}
+
+
+def pace_called_otherwise(rows):
+    """In both flights of a walk."""
+    own = clean(rows)[0]["trajectory"]
+    for row in (row for row in rows if row["trajectory"] == own):
+        row["pace"] = "hurry"
+
+
 def clean_flight_from_another_time(rows):
     for row in perturbed(rows):
         row["time_s"] += 0.5
@@ -782,7 +805,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
             all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
             walk_of_nobody, clock_that_starts_late, weather_that_nobody_drew, night_that_nobody_drew, headings_lost, window_with_a_frame_twice,
-            names_of_pictures_exchanged, question_that_looks_ahead,
+            names_of_pictures_exchanged, question_that_looks_ahead, undrawn_event_called_fallback, perturbation_taken_off, pace_called_otherwise,
             time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
         )),
         (True, (

@@ -42,7 +42,7 @@ from cosfly.products.boxes import read_boxes
 from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
-from cosfly.products.walks import Walk, pace_field, write_paths
+from cosfly.products.walks import Walk, pace_field, walk_id, write_paths
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder, result_of
 from cosfly.store import write_bytes, write_json
@@ -236,7 +236,7 @@ def run(
         box_map = read_boxes(simplified_map)
         region = read_roi(roi) if roi else None
     ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
-    items = [Item(f"path_{k:05d}") for k in range(cfg.num_paths)]
+    items = [Item(walk_id(k)) for k in range(cfg.num_paths)]
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
     lanes = lanes_of(box_map) if cfg.traffic else []

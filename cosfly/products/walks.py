@@ -62,6 +62,11 @@ class Walk:
         return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"], pace)
 
 
+def walk_id(number: int) -> str:
+    """Give the id of the walk that is made as that one of a map, counted from 0."""
+    return f"path_{number:05d}"
+
+
 def pace_field(pace: str) -> dict[str, str]:
     """Give what stands of a pace in the record of a walk or a flight."""
     return {} if pace == PLAIN_PACE else {"pace": pace}

@@ -25,6 +25,7 @@ from cosfly.products.kinds import GROUND_KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.others import NOBODY, Cast
+from cosfly.shift_draws import shift_draws
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"
@@ -157,28 +158,23 @@ def perturb(
     """Perturb every frame of a flight, seen through its camera. The same number of random draws is used for every frame, whatever happens in it."""
     unshifted = Perturbed.nothing(planned)
     result = replace(Perturbed.nothing(planned), unshifted=unshifted)
-    for i in range(len(result.states)):
-        events = rng.random(2)
-        person_offset = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
-        drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)
-        view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
+    draws = shift_draws(
+        rng,
+        person_radius_m=cfg.pedestrian_radius_m,
+        drone_radius_m=cfg.drone_radius_m,
+        view_radius_m=cfg.view_radius_m,
+        is_cubic=cfg.sampling == "cubic",
+    )
+    for i, draw in zip(range(len(result.states)), draws, strict=False):
         position = NONE
-        if events[0] < cfg.position_probability:
-            position = _shift(result, planned, i, person_offset, drone_offset, cameras[i], surroundings, cfg, others)
-        if events[1] < cfg.rotation_probability:
+        if draw.events[0] < cfg.position_probability:
+            position = _shift(result, planned, i, draw.person_m, draw.drone_m, cameras[i], surroundings, cfg, others)
+        if draw.events[1] < cfg.rotation_probability:
             for each in (unshifted, result):
-                _turn(each, i, view_offset, cameras[i], cfg)
+                _turn(each, i, draw.view_m, cameras[i], cfg)
         if position != APPLIED:
             result.drop_shift(i, position)
     return result
-
-
-def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
-    """An offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
-    in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
-    direction, share = rng.normal(size=num_axes), rng.random()
-    in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
-    return np.append(in_cube if cfg.sampling == "cubic" else in_ball, np.zeros(3 - num_axes))
 
 
 def _shift(

@@ -36,13 +36,14 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.render.zoom.lens import cameras_of
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.shift_draws import PERTURBED, rng_of_shifts
 from cosfly.stage_folder import Kept, Resume, StageFolder, Tally, result_of
 from cosfly.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
 
 log = logging.getLogger(__name__)
 
 RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer", "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer"}
-VARIANTS = {"clean": "ORI", "perturbed": "aug_001"}
+VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
 FROM_ONE_RUN = "give the others.json that was written beside the walks' path.json"
@@ -86,7 +87,7 @@ def script_flight(
     cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
     planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     if track == "perturbed":
-        rng = rng_for(seed, "render", f"{trace.path_id}/{VARIANTS[track]}")
+        rng = rng_of_shifts(seed, trace.path_id)
         perturbed = perturb(planned, cameras, surroundings, cfg.perturbation, rng, others)
     else:
         perturbed = Perturbed.nothing(planned)

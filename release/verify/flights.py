@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from cosfly.errors import InputError
 from cosfly.items import Item, Outcome
@@ -13,6 +13,7 @@ from cosfly.products.shown_captions import CaptionReader
 from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
 from release.verify.by_rule import check_drawn, check_inspected
+from release.verify.drawn_again import Drawn, check_draws
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
 from release.verify.identity import check_identity
@@ -23,6 +24,7 @@ from release.verify.scene import NOTHING_SHOWN, check_pictures
 from release.verify.sources import Entry, FlightSource, flight_rows
 
 Level = Literal["structure", "rows", "pixels"]
+Said = TypeVar("Said")
 # What a value of no sense does to a check that takes it for one: each value is judged by itself, so that the cause is named too.
 SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, AttributeError)
 
@@ -36,7 +38,7 @@ LOSSLESS = DepthCoding(
 class Told:
     """What the record says that the checks of flights need. settings: of stages, by run and stage. by_town: splits share no town
     either. both: every flight's twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as.
-    prompts: by run. is_reviewed: people may have accepted what the inspection did not."""
+    prompts, drawn: by run. is_reviewed: people may have accepted what the inspection did not."""
 
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
@@ -46,19 +48,23 @@ class Told:
     rounded_as: DepthCodingName = "float32"
     prompts: dict[str, dict[str, str]] = field(default_factory=dict)
     is_reviewed: bool = False
+    drawn: dict[str, Drawn | None] = field(default_factory=dict)
 
     def of(self, flight: FlightRows, stage: str) -> dict[str, Any]:
-        return _of_run({run: values for (run, name), values in self.settings.items() if name == stage}, flight)
+        return _of_run({run: values for (run, name), values in self.settings.items() if name == stage}, flight) or {}
 
     def prompts_of(self, flight: FlightRows) -> dict[str, str]:
-        return _of_run(self.prompts, flight)
+        return _of_run(self.prompts, flight) or {}
+
+    def drawn_of(self, flight: FlightRows) -> Drawn | None:
+        return _of_run(self.drawn, flight)
 
 
-def _of_run(found: Mapping[str, dict[str, Any]], flight: FlightRows) -> dict[str, Any]:
+def _of_run(found: Mapping[str, Said], flight: FlightRows) -> Said | None:
     """Give what is said of a flight's run, of which folders above a town count as part."""
     name = flight.name.split("/")[0]
     runs = [run for run in found if name == run or name.startswith(f"{run}_")]
-    return found[max(runs, key=len)] if runs else {}
+    return found[max(runs, key=len)] if runs else None
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,7 @@ def check_flight(
         lambda: check_motion(flight, twin, told.of(flight, "render").get("perturbation", {}), findings),
         lambda: check_captions(flight, told.window_frames, findings),
         lambda: check_drawn(flight, told.of(flight, "render"), findings),
+        lambda: check_draws(flight, told.drawn_of(flight), findings),
         lambda: check_inspected(flight, {} if told.is_reviewed else told.of(flight, "inspect"), findings),
     ]
     if reader is not None:

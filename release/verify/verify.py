@@ -31,6 +31,7 @@ from release.export.manifest import ExportRecord, read_export, render_readme
 from release.record import DepthCoding, ReleaseRecord, read_record
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
+from release.verify.drawn_again import Drawn
 from release.verify.episodes import found_episodes
 from release.verify.findings import Findings, Verified
 from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
@@ -176,6 +177,7 @@ def _told(record: ReleaseRecord) -> Told:
         asked.window_frames, coded, settings, by_town=record.splits.by == "town", rounded_as=coded.coding,
         both=asked.pairs == "both" and len(asked.tracks) == 2, prompts=record.prompts,
         is_reviewed=any(source.review_sha256 for source in record.provenance.sources),
+        drawn={source.run: Drawn.of_stages(source.stages) for source in record.provenance.sources},
     )  # fmt: skip
 
 
