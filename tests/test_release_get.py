@@ -346,6 +346,23 @@ def test_within_a_shard_it_goes_on_where_it_broke_off(ranges, dataset, tmp_path,
     assert (0, stage.CHUNK) not in asked_again
 
 
+def test_a_file_that_is_read_in_parts_is_opened_once(dataset, monkeypatch):
+    """Each opening asks another place anew, and unpacks an archive's file from its begin."""
+    remote = FsspecRemote(f"local://{dataset}")
+    system, _ = remote._system()
+    opened, really = [], system.open
+    monkeypatch.setattr(
+        system, "open", lambda path, *words, **names: opened.append(path) or really(path, *words, **names)
+    )
+    data = (dataset / "release.json").read_bytes()
+    assert b"".join(remote.read("release.json", at, 100) for at in range(0, 1000, 100)) == data[:1000]
+    assert remote.read("README.md", 0, 5) == (dataset / "README.md").read_bytes()[:5]
+    assert len(opened) == 2
+    with pytest.raises(InputError, match="number of bytes"):
+        remote.read("README.md", 10**6, 5)
+    assert remote.read("README.md", 0, 5) == (dataset / "README.md").read_bytes()[:5]
+
+
 def test_bytes_of_another_shard_are_not_gone_on_with(dataset, tmp_path):
     shard = read_record(dataset / "release.json").shards[0]
     begun = tmp_path / f"out/parts/{Path(shard.path).name}.begun"

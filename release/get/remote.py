@@ -215,9 +215,12 @@ class FsspecRemote:
     def __init__(self, address: str) -> None:
         self._address, self.shown = address, without_secrets(address)
         self._opened: tuple[Any, str] | None = None
+        self._file: tuple[str, Any] | None = (
+            None  # the one that was read last: opening asks again, and unpacks a zip's from its begin
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_opened": None}
+        return {**vars(self), "_opened": None, "_file": None}
 
     def size(self, name: str) -> int:
         system, root = self._system()
@@ -230,11 +233,19 @@ class FsspecRemote:
         system, root = self._system()
 
         def read() -> bytes:
-            with system.open(f"{root}/{name}", "rb", block_size=CHUNK, cache_type="none") as file:
-                file.seek(start)
-                return file.read(length)
+            if self._file is None or self._file[0] != name:
+                self._close()
+                self._file = name, system.open(f"{root}/{name}", "rb", block_size=CHUNK, cache_type="none")
+            file = self._file[1]
+            file.seek(start)
+            return file.read(length)
 
         return check_length(self._asked(name, read), length, f"{self.shown}/{name}")
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file[1].close()
+            self._file = None
 
     def _asked(self, name: str, ask: Any) -> Any:
         try:
@@ -242,6 +253,7 @@ class FsspecRemote:
         except EnvironmentMissing:
             raise
         except Exception as error:  # every file system has its own; their words may hold the address
+            self._file = None  # opened anew, whatever it was that broke
             raise InputError("cannot read a file", where=f"{self.shown}/{name}", got=type(error).__name__) from None
 
     def _system(self) -> tuple[Any, str]:
