@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -275,13 +278,33 @@ def other_size(root: Path) -> None:
         shutil.copytree(next(other.glob(f"*/*/{variant}")), target)
 
 
+def interlaced(pixels: np.ndarray) -> bytes:
+    """PNG bytes of (h, w, 3) RGB in seven passes (Adam7), which Pillow reads and does not write."""
+    passes = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
+    parts = (pixels[y::down, x::across] for y, x, down, across in passes)
+    rows = b"".join(b"\0" + row.tobytes() for part in parts if part.size for row in part)
+    head = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 8, 2, 0, 0, 1)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    packed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def test_the_interlaced_picture_is_one():
+    pixels = np.random.default_rng(0).integers(0, 256, (13, 21, 3)).astype(np.uint8)
+    picture = Image.open(io.BytesIO(interlaced(pixels)))
+    assert picture.info["interlace"] == 1
+    np.testing.assert_array_equal(np.asarray(picture), pixels)
+
+
 def other_kind(frame_file: str, kind: str):
     """Give what writes a picture anew in another form of PNG, with the same pixels as far as that can be."""
 
     def change(root: Path) -> None:
         path = first_flight(root) / "frames_playback/frame_00005" / frame_file
         picture = Image.fromarray(parse_picture(path.read_bytes(), path)[..., ::-1])
-        if kind == "16 bits":
+        if kind == "interlaced":
+            path.write_bytes(interlaced(np.asarray(picture)))
+        elif kind == "16 bits":
             path.write_bytes(cv2.imencode(".png", np.asarray(picture, np.uint16) * 257)[1].tobytes())
         else:
             (picture.quantize(256) if kind == "a palette" else picture.convert("L")).save(path)
@@ -304,7 +327,11 @@ DAMAGES = {
     "depth cut by 100 bytes": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/depth.npy", 100), "depth.npy"),
     "a picture cut short": (lambda r: cut(first_flight(r) / "frames_playback/frame_00005/rgb.png", 20), "rgb.png"),
     "a picture of 16 bits": (other_kind("rgb.png", "16 bits"), "16 bits, colour type 2"),
+    "a mask of 16 bits": (other_kind("instance.png", "16 bits"), "16 bits, colour type 2"),
     "a picture with a palette": (other_kind("rgb.png", "a palette"), "colour type 3"),
+    "a mask with a palette": (other_kind("instance.png", "a palette"), "colour type 3"),
+    "an interlaced picture": (other_kind("rgb.png", "interlaced"), "colour type 2, interlaced"),
+    "an interlaced mask": (other_kind("instance.png", "interlaced"), "colour type 2, interlaced"),
     "a mask of grey": (other_kind("instance.png", "grey"), "8 bits, colour type 0"),
     "a frame that is missing": (lambda r: shutil.rmtree(first_flight(r) / "frames_playback/frame_00005"), "frames are missing"),
     "a picture that is missing": (lambda r: (first_flight(r) / "frames_playback/frame_00005/instance.png").unlink(), "missing or empty"),
