@@ -617,6 +617,27 @@ def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
     return dict(zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, edges), strict=True))
 
 
+def picture_shifted(rows):
+    pixels = pixels_of(middle(rows), "image")
+    set_colours(middle(rows), np.roll(pixels, 2, axis=1))
+
+
+def person_painted_out_of_the_colours(rows):
+    """Each row of the person is filled between what stands beside it."""
+    row = seen(rows)[len(seen(rows)) // 2]
+    pixels, (_, ids) = pixels_of(row, "image"), ids_in(row)
+    for y, places in enumerate(np.flatnonzero(line) for line in ids == 65535):
+        if len(places):
+            left, right = max(places[0] - 1, 0), min(places[-1] + 1, row["width_px"] - 1)
+            share = np.linspace(0.0, 1.0, right - left + 1)[:, None]
+            pixels[y, left : right + 1] = pixels[y, left] * (1.0 - share) + pixels[y, right] * share
+    set_colours(row, pixels)
+
+
+def visibility_a_little_lower(rows):
+    next(row for row in clean(rows) if row["visibility"] > 0.5)["visibility"] -= 0.05
+
+
 def grey_picture(rows):
     pixels = pixels_of(middle(rows), "image")
     set_colours(middle(rows), np.repeat(pixels.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8))
@@ -818,6 +839,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
             frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
             second_person_far_away, ids_of_things_exchanged, flight_through_a_lossy_coding, depth_in_centimetres_called_lossless, red_and_blue_of_a_flight_exchanged,
+            picture_shifted, person_painted_out_of_the_colours, visibility_a_little_lower,
             thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
         )),
     )

@@ -219,6 +219,13 @@ def test_rejected_flights_without_a_rejected_trajectory_are_told(honest, tmp_pat
     assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "sum")]
 
 
+def test_another_seed_of_the_draws_is_told(honest, tmp_path):
+    """A warning: another version may have drawn."""
+    forged = forge(honest, tmp_path / "forged", change_record=lambda r: _stage(r, "render").update(seed=99))
+    report = verify(forged, level="rows")
+    assert {(kind.severity, kind.code) for kind in report.kinds} == {("warning", "draw")}
+
+
 def test_decisions_of_people_have_a_digest(honest, tmp_path):
     def rejected(record, digest=None):
         _one_less(record, "rejected: review")

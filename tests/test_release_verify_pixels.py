@@ -3,17 +3,24 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from release_tampering import png
 
+from cosfly.png.read import parse_png
+from cosfly.reprojection import grid_rows
+from release.verify.findings import Findings
+from release.verify.person import check_shown, outline_step
 from release.verify.pixels import (
     NUM_IDS,
     PERSON,
     SKY,
     depths_of_person,
+    edges_of,
     look_of,
     new_kinds,
     rays_to_person,
     survey,
 )
+from release.verify.rows import FlightRows
 
 FAR_M = np.float32(1000.0)
 
@@ -141,3 +148,77 @@ def test_rays_that_meet_the_person():
     assert found == (20 * 20, 20 * 15)
     found = rays_to_person(depth, mask, pixels, pixels, intrinsics, np.eye(3), np.array([2.0, 0.0, 10.0]), half_m)
     assert found == (20 * 20, 10 * 10)
+
+
+def _obvious_edges(colours, mask, rows):
+    """Mean steps of colours by (down, right) from edges of the mask."""
+    steps = np.minimum(np.abs(np.diff(colours[..., :3].astype(float), axis=1)).sum(axis=2), 120.0)
+    found = {}
+    for down in (-2, 0, 2):
+        for right in range(-4, 5):
+            values = [
+                steps[j, x + right]
+                for j, row in enumerate(rows)
+                if 0 <= row - down < len(mask)
+                for x in range(4, mask.shape[1] - 5)
+                if (mask[row - down, x] != mask[row - down, x + 1]).any()
+            ]
+            found[down, right] = np.mean(values) if len(values) >= 30 else 0.0
+    return found
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (0, 2), (2, 0), (-2, -3)])
+def test_edges_of_colours_and_mask(shift):
+    rng = np.random.default_rng(5)
+    upright = _frame(4, (72, 128))[1]
+    mask = np.stack(
+        [np.roll(row, y, axis=0) for y, row in enumerate(upright)]
+    )  # aslant, as upright edges do not tell of up and down
+    whole = np.roll((mask.astype(int) * 37 % 251 + rng.integers(0, 3, mask.shape)).astype(np.uint8), shift, axis=(0, 1))
+    rows = grid_rows(72)
+    found, wanted = edges_of(whole[rows], mask), _obvious_edges(whole[rows], mask, rows)
+    rivals = {place: mean for place, mean in wanted.items() if place[0] or abs(place[1]) > 1}
+    best = max(rivals, key=rivals.get)
+    assert_allclose(found.rival, rivals[best] / wanted[0, 0], rtol=1e-12)
+    assert found.shift_px == best[::-1]
+    if shift == (0, 0):
+        assert found.rival < 1.0
+    else:
+        assert best == shift
+        assert found.rival > 1.15
+        assert found.deviations > 4.0
+
+
+def test_edges_that_are_few_say_nothing():
+    assert edges_of(np.zeros((36, 128, 3), np.uint8), np.zeros((72, 128, 3), np.uint8)) is None
+
+
+@pytest.mark.parametrize(
+    ("worst", "usual", "num_frames", "is_found"),
+    [(50.0, 60.0, 20, False), (10.0, 60.0, 20, True), (2.0, 7.0, 20, False), (10.0, 60.0, 4, False), (np.nan, 60.0, 20, False)],
+)  # fmt: skip
+def test_the_person_shows_as_clearly_as_in_the_frames_beside(worst, usual, num_frames, is_found):
+    steps = np.full(num_frames, usual)
+    steps[2] = worst
+    findings = Findings()
+    rows = [{"frame_index": k} for k in range(num_frames)]
+    check_shown(FlightRows("run/Town/trajectory/ORI", rows), steps, findings)
+    assert [code for _, code in findings.kinds] == ["person"] * is_found
+
+
+def test_frames_far_apart_say_nothing_of_the_person():
+    findings = Findings()
+    rows = [{"frame_index": 10 * k} for k in range(20)]
+    check_shown(FlightRows("run/Town/trajectory/ORI", rows), np.array([60.0] * 19 + [3.0]), findings)
+    assert not findings.kinds
+
+
+def test_steps_at_the_outline():
+    """A person of 10 x 6 px, 90 grey levels brighter than the street."""
+    colours, mask = np.full((72, 128, 3), 60, np.uint8), np.zeros((72, 128, 3), np.uint8)
+    colours[30:40, 50:56], mask[30:40, 50:56] = 90, (PERSON, 255, 255)
+    box = np.array([50.0, 30.0, 56.0, 40.0])
+    assert outline_step(parse_png(png(colours), "x"), mask, box) == 90.0
+    assert outline_step(parse_png(png(np.full_like(colours, 60)), "x"), mask, box) == 0.0
+    assert np.isnan(outline_step(parse_png(png(colours), "x"), mask, np.full(4, np.nan)))
+    assert np.isnan(outline_step(parse_png(png(colours), "x"), np.zeros_like(mask), box))

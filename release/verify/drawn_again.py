@@ -1,7 +1,7 @@
 """Draws of a perturbed flight made again from the seeds that `release.json` tells: which events, which offsets, at which pace the person went.
 
 Which walk a flight is of no row says. It is the one whose draws give one of the flight's shifts to a tenth of a millimetre on three axes; where no
-walk's do, another version drew, or nobody here did, and nothing is said.
+walk's do, another version drew, or the seed is another one: a warning.
 """
 
 from __future__ import annotations
@@ -66,8 +66,12 @@ def check_draws(flight: FlightRows, drawn: Drawn | None, findings: Findings) -> 
     """
     if drawn is None or flight.rows[0].get("variant") != PERTURBED:
         return
-    path_id = _walk_of(flight, drawn)
+    shifted = [i for i, words in enumerate(flight.events) if words is not None and words["position"] == "applied"]
+    path_id = _walk_of(flight, shifted[:SHIFTS_TRIED], drawn)
     if path_id is None:
+        if shifted:
+            got = f"shifts that none of {drawn.num_walks} walks draws under seed {drawn.seed}"
+            findings.warn("draw", flight.where(shifted[0], "drone_offset"), got, "the seed that they were drawn from, or another version of cosfly drew them")  # fmt: skip
         return
     draws = list(islice(drawn.draws(path_id), int(flight.index[-1]) + 1))
     for i, words in enumerate(flight.events):
@@ -80,9 +84,8 @@ def check_draws(flight: FlightRows, drawn: Drawn | None, findings: Findings) -> 
             findings.error("draw", flight.where(0, "pace"), flight.rows[0]["pace"], f"{pace}, drawn for {path_id}")
 
 
-def _walk_of(flight: FlightRows, drawn: Drawn) -> str | None:
-    shifted = [i for i, words in enumerate(flight.events) if words is not None and words["position"] == "applied"]
-    for i in shifted[:SHIFTS_TRIED]:
+def _walk_of(flight: FlightRows, shifted: list[int], drawn: Drawn) -> str | None:
+    for i in shifted:
         index, told = int(flight.index[i]), flight.drone_offset[i, :3]
         for number in range(drawn.num_walks):
             draw = next(islice(drawn.draws(walk_id(number)), index, None))

@@ -9,13 +9,18 @@ import numpy as np
 from cosfly.compiled import njit
 from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import KINDS
-from cosfly.reprojection import COLUMNS, ROWS
+from cosfly.reprojection import COLUMNS, ROWS, grid_rows
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
 SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
 NUM_IDS = 65536
 PERSON, SKY = KINDS["Pedestrians"], KINDS["Sky"]
 BLOCK_PX = 8  # of JPEG, WebP and videos
+MOVED_PX = 4  # how far to each side edges of the mask are laid over the colours
+LEAST_EDGES, MOST_STEP = (
+    30,
+    120,
+)  # edges, for their mean to say something; grey levels of three channels, of which more count no more
 LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 NEAR_M = 0.3  # where rays begin: the renderers' near plane
 SURFACE_SLACK_M = 0.05  # how far before a person's box what is drawn may lie and not hide it
@@ -79,6 +84,42 @@ def look_of(colours: np.ndarray) -> np.ndarray:
     over = edges.mean() if len(edges) else np.nan
     tint = (red - green) / num_pixels, (blue - green) / num_pixels
     return np.array([hue / (3.0 * num_hues), steps.mean() if len(steps) else np.nan, over, inside, *tint, spread])
+
+
+class Edges(NamedTuple):
+    """How much colours change where the mask does. num: edges of the mask in the rows of the colours; rival: change at edges that were moved by
+    two pixels and more, where it is greatest, to that at the edges themselves; deviations: how sure the difference of both is; shift_px: of
+    the rival, to the right and down."""
+
+    num: int
+    rival: float
+    deviations: float
+    shift_px: tuple[int, int]
+
+
+def edges_of(colours: np.ndarray, instance: np.ndarray) -> Edges | None:
+    """Lay the edges of a mask over the colours, as they are and moved by up to 4 px to the sides and 2 px up or down.
+
+    Args:
+        colours: (k, w, 3 or 4) uint8, the first k of the grid's rows; instance: (h, w, 3) uint8.
+    Returns:
+        None where there are fewer than LEAST_EDGES of them.
+    """
+    rows = grid_rows(len(instance))[: len(colours)]
+    sums, squares, counts = _edge_steps(colours, instance, rows)
+    here = counts[1]
+    if here < LEAST_EDGES:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means = sums / counts[:, None]
+        errors = (squares / counts[:, None] - means**2) / counts[:, None]
+    own, error = means[1, MOVED_PX], errors[1, MOVED_PX]
+    means[1, MOVED_PX - 1 : MOVED_PX + 2] = 0.0  # a pixel on an edge may be of both sides
+    means[counts < LEAST_EDGES] = 0.0
+    up, side = np.unravel_index(int(means.argmax()), means.shape)
+    deviation = float(np.sqrt(max(error + errors[up, side], 1e-12)))
+    shift_px = int(side) - MOVED_PX, 2 * (1 - int(up))
+    return Edges(int(here), float(means[up, side] / max(own, 1e-9)), float((means[up, side] - own) / deviation), shift_px)  # fmt: skip
 
 
 def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
@@ -152,6 +193,35 @@ def _look(colours):  # type: ignore[no-untyped-def]
             for x in range(width - 1):
                 steps[x] += abs(grey[x + 1] - grey[x])
     return hue, steps, channels, numbers
+
+
+@njit(cache=True, nogil=True)
+def _edge_steps(colours, instance, rows):  # type: ignore[no-untyped-def]
+    """Steps of colours beside edges of the mask 2 rows above, in and 2 rows below each row: sums and sums of squares (3, 2 * MOVED_PX + 1) by how
+    far to the right of the edge they are, and numbers of edges (3,)."""
+    height, width = instance.shape[:2]
+    sums, squares = np.zeros((3, 2 * MOVED_PX + 1)), np.zeros((3, 2 * MOVED_PX + 1))
+    counts, steps = np.zeros(3, np.int64), np.zeros(max(width - 1, 0))
+    for j in range(len(rows)):
+        for x in range(width - 1):
+            step = np.int64(0)
+            for c in range(3):
+                step += abs(np.int64(colours[j, x + 1, c]) - np.int64(colours[j, x, c]))
+            steps[x] = min(step, MOST_STEP)
+        for k in range(3):
+            row = rows[j] + 2 * (k - 1)
+            if row < 0 or row >= height:
+                continue
+            mask = instance[row]
+            for x in range(MOVED_PX, width - 1 - MOVED_PX):
+                if mask[x, 0] == mask[x + 1, 0] and mask[x, 1] == mask[x + 1, 1] and mask[x, 2] == mask[x + 1, 2]:
+                    continue
+                counts[k] += 1
+                for side in range(2 * MOVED_PX + 1):
+                    step_there = steps[x + side - MOVED_PX]
+                    sums[k, side] += step_there
+                    squares[k, side] += step_there * step_there
+    return sums, squares, counts
 
 
 @njit(cache=True, nogil=True)

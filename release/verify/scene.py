@@ -26,6 +26,7 @@ from cosfly.reprojection import (
 )
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
+from release.verify.person import check_shown
 from release.verify.pictures import check_picture, decode, least_step, view_of
 from release.verify.pixels import BLOCK_PX, NUM_IDS, look_of, new_kinds
 from release.verify.rows import FlightRows
@@ -106,6 +107,7 @@ def check_pictures(
     keys: list[tuple[int, int]] = []
     pairs, kinds = _Pairs(), np.full(NUM_IDS, -1, np.int16)
     looks = np.full((len(flight), 7), np.nan)
+    outlines = np.full(len(flight), np.nan)
     steps: list[float] = []  # of some frames' depth
     before: list[tuple[int, View]] = []  # the two frames before
     for i, files in enumerate(pictures):
@@ -119,6 +121,7 @@ def check_pictures(
         if decoded[1].size and not flight.is_foreign:
             _check_kinds(flight, i, decoded[1], kinds, findings)
         looks[i] = look
+        outlines[i] = decoded[3]
         if rounded_as == "float32" and i % max(1, len(flight) // STEPS_LOOKED_AT) == 0:
             steps.append(least_step(decoded[0]))
         view = view_of(flight, i, decoded)
@@ -126,6 +129,7 @@ def check_pictures(
             _compare(flight, i, view, before, pairs)
         before = [*before[-1:], (i, view)]
     _judge(flight, pairs, rounded_as, findings)
+    check_shown(flight, outlines, findings)
     if not flight.is_foreign:
         _judge_looks(flight, looks[:, :2], findings)
         _judge_blocks(flight, looks[:, 2:4], findings)
