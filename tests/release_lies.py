@@ -634,6 +634,12 @@ def person_painted_out_of_the_colours(rows):
     set_colours(row, pixels)
 
 
+def noise_in_one_depth(rows):
+    depth = depth_of(middle(rows))
+    noise = np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
+    set_depth(middle(rows), np.where(depth < 999, np.minimum(depth * noise, 998.0), depth).astype(np.float32))
+
+
 def visibility_a_little_lower(rows):
     next(row for row in clean(rows) if row["visibility"] > 0.5)["visibility"] -= 0.05
 
@@ -839,7 +845,7 @@ LIES: dict[str, tuple[Lie, bool]] = {
             picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
             frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
             second_person_far_away, ids_of_things_exchanged, flight_through_a_lossy_coding, depth_in_centimetres_called_lossless, red_and_blue_of_a_flight_exchanged,
-            picture_shifted, person_painted_out_of_the_colours, visibility_a_little_lower,
+            picture_shifted, noise_in_one_depth, person_painted_out_of_the_colours, visibility_a_little_lower,
             thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
         )),
     )

@@ -13,6 +13,7 @@ from release.verify.pixels import (
     NUM_IDS,
     PERSON,
     SKY,
+    bend_of,
     depths_of_person,
     edges_of,
     look_of,
@@ -222,3 +223,18 @@ def test_steps_at_the_outline():
     assert outline_step(parse_png(png(np.full_like(colours, 60)), "x"), mask, box) == 0.0
     assert np.isnan(outline_step(parse_png(png(colours), "x"), mask, np.full(4, np.nan)))
     assert np.isnan(outline_step(parse_png(png(colours), "x"), np.zeros_like(mask), box))
+
+
+@pytest.mark.parametrize(
+    ("noise", "coding", "is_bent"),
+    [(0.0, "<f4", False), (0.0, "<f2", False), (0.0, "mm", False), (0.003, "<f4", True), (0.003, "<f2", True), (0.01, "mm", True)],
+)  # fmt: skip
+def test_noise_bends_planes(noise, coding, is_bent):
+    """A street that is looked at aslant, 8 to 40 m away, in each coding of depth."""
+    v, u = np.mgrid[:72, :128]
+    depth = 1.0 / (1.0 / 40.0 + v * 0.0012 + u * 0.0001) * np.random.default_rng(1).normal(1.0, noise, v.shape)
+    depth = np.round(depth, 3) if coding == "mm" else depth.astype(coding)
+    mask = np.zeros((72, 128, 3), np.uint8)
+    assert (bend_of(depth.astype(np.float32), mask) > 0.002) == is_bent
+    mask[..., 1] = np.arange(128) // 2  # nothing is three pixels wide
+    assert np.isnan(bend_of(depth.astype(np.float32), mask))

@@ -18,7 +18,7 @@ from release.depth import depth_of
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.person import outline_step
-from release.verify.pixels import Survey, depths_of_person, edges_of, rays_to_person, survey
+from release.verify.pixels import Survey, bend_of, depths_of_person, edges_of, rays_to_person, survey
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -31,6 +31,8 @@ MOST_RAYS, LEAST_RAYS = 900, 30  # through the box of a person: the score is a s
 SCORE, SCORE_OF_FEWER = 0.02, 0.06
 # How much more colours may change beside the mask's edges than at them, and how sure that must be: honest 1.05 in 11,286 frames, 0.3 deviations.
 RIVAL_MOST, RIVAL_DEVIATIONS = 1.15, 4.0
+# Of surfaces that are planes; honest 0.0001 of float16. Noise of 0.3 % makes 0.0047, of 1 % 0.016.
+BEND_MOST = 0.002
 STEP_PIXELS = 20_000  # of a frame
 PERSON, MOST_KIND = KINDS["Pedestrians"], max(KINDS.values())
 PERSON_HALF_M = np.array(PERSON_HALF_EXTENTS_M)
@@ -116,6 +118,8 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, deviation: float
             _check_person_depth(flight, i, instance, depth, findings)
     if depth.size and instance.size and good and not flight.is_foreign:
         _check_visibility(flight, i, instance, depth, findings)
+        if (bend := bend_of(depth, instance)) > BEND_MOST:
+            findings.error("depth", flight.where(i, "depth"), f"surfaces that bend by {bend:.2%} from pixel to pixel", f"at most {BEND_MOST:.1%}: planes, without noise")  # fmt: skip
     if colours is not None and instance.size and not flight.is_foreign:
         _check_edges(flight, i, colours, instance, findings)
     return good

@@ -9,7 +9,7 @@ import numpy as np
 from cosfly.compiled import njit
 from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import KINDS
-from cosfly.reprojection import COLUMNS, ROWS, grid_rows
+from cosfly.reprojection import COLUMNS, ROWS, grid_rows, median_of
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
 SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
@@ -21,6 +21,7 @@ LEAST_EDGES, MOST_STEP = (
     30,
     120,
 )  # edges, for their mean to say something; grey levels of three channels, of which more count no more
+BEND_EVERY, LEAST_BENDS = 4, 200  # pixels of a row; points, for their median to say something
 LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 NEAR_M = 0.3  # where rays begin: the renderers' near plane
 SURFACE_SLACK_M = 0.05  # how far before a person's box what is drawn may lie and not hide it
@@ -122,6 +123,17 @@ def edges_of(colours: np.ndarray, instance: np.ndarray) -> Edges | None:
     return Edges(int(here), float(means[up, side] / max(own, 1e-9)), float((means[up, side] - own) / deviation), shift_px)  # fmt: skip
 
 
+def bend_of(depth: np.ndarray, instance: np.ndarray) -> float:
+    """Tell how far surfaces are from planes: of points whose neighbours to the left and right are of the same thing, the median of how far one over
+    depth, which is linear on a plane, is from the mean of both, as a share of it twice. NaN: fewer than LEAST_BENDS points.
+
+    Args:
+        depth: (h, w) float32; instance: (h, w, 3) uint8.
+    """
+    bends = _bends(depth, instance, grid_rows(len(depth)))
+    return median_of(bends) if len(bends) >= LEAST_BENDS else np.nan
+
+
 def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
     """Give id * 256 + kind of things at the grid's points that have another kind than is known of them, each once.
 
@@ -193,6 +205,24 @@ def _look(colours):  # type: ignore[no-untyped-def]
             for x in range(width - 1):
                 steps[x] += abs(grey[x + 1] - grey[x])
     return hue, steps, channels, numbers
+
+
+@njit(cache=True, nogil=True)
+def _bends(depth, instance, rows):  # type: ignore[no-untyped-def]
+    """Of each BEND_EVERYth pixel of some rows what `bend_of` says, (k,)."""
+    width = depth.shape[1]
+    found, num = np.empty(len(rows) * (width // BEND_EVERY + 1)), 0
+    for row in rows:
+        for x in range(1, width - 1, BEND_EVERY):
+            is_one = True
+            for c in range(3):
+                own = instance[row, x, c]
+                is_one &= instance[row, x - 1, c] == own and instance[row, x + 1, c] == own
+            left, here, right = float(depth[row, x - 1]), float(depth[row, x]), float(depth[row, x + 1])
+            if is_one and min(left, here, right) > 0.0 and here < SKY_DEPTH_M:
+                found[num] = abs(here / left - 2.0 + here / right)
+                num += 1
+    return found[:num]
 
 
 @njit(cache=True, nogil=True)
