@@ -62,7 +62,9 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
     """Compile the programs of fair weather (None), or of one with such defines. snaps: for hardware (`depth_here` in scene.frag.glsl)."""
     of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
     of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
-    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), of_surfaces, "#define SNAPS\n" * snaps + (define or ""))
+    vertex, fragment = sources(
+        ("part.glsl", "scene.vert.glsl"), of_surfaces, "#define SNAPS\n" * snaps + (define or "")
+    )
     materials, near_movers = (
         [
             context.program(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))
