@@ -128,12 +128,14 @@ THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand 
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 FIFTH_SET = Path(__file__).with_name("prose_fifth.jsonl")
 SIXTH_SET = Path(__file__).with_name("prose_sixth.jsonl")  # hard styles, whose wordings are kept from the reader
-# Plain styles and freer ones, six hands on flights of three maps that had seen nothing of the reader. The first two were read while rules
-# were written; the ninth and the tenth (three hands) were looked at by nobody, and their wordings are kept from the reader.
+# Plain styles and freer ones, eight hands on flights of three maps that had seen nothing of the reader. The first two and the eleventh were read
+# while rules were written; the ninth, the tenth (three hands) and the twelfth were looked at by nobody, and their wordings are kept from the reader.
 SEVENTH_SET = Path(__file__).with_name("prose_seventh.jsonl")
 EIGHTH_SET = Path(__file__).with_name("prose_eighth.jsonl")
 NINTH_SET = Path(__file__).with_name("prose_ninth.jsonl")
 TENTH_SET = Path(__file__).with_name("prose_tenth.jsonl")
+ELEVENTH_SET = Path(__file__).with_name("prose_eleventh.jsonl")
+TWELFTH_SET = Path(__file__).with_name("prose_twelfth.jsonl")
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 
@@ -355,4 +357,22 @@ CASES = [
     Case("zh", FOLLOW, R, "行人正走向机头右侧。", ()),
     Case("en", FOLLOW, R, "The drone is 5.4 m further along.", ()),
     Case("en", FOLLOW, R, "The gap is back to 19.7 m after 20.3 m at t3.", (("19.7", "39.7"),)),
+    Case("en", FOLLOW, R, "The drone has accelerated to 3.4 m/s.", (("3.4", "2.0"),)),
+    Case("zh", FOLLOW, R, "无人机提速到 3.4 米/秒。", (("3.4", "2.0"),)),
+    Case("en", FOLLOW, R, "The rise in speed amounts to 1.4 m/s.", ()),
+    Case("zh", FOLLOW, R, "无人机速度从 2.0 米/秒一路增到 3.4 米/秒。", (("2.0 米/秒一路增到 3.4", "3.4 米/秒一路增到 2.0"),)),
+    Case("en", FOLLOW, R, "The altitude is 20.4 m, the highest of the five frames.", (("highest", "lowest"),)),
+    Case("zh", FOLLOW, R, "水平距离 19.7 米，是五帧里最近的一次。", (("最近", "最远"),)),
+    Case("en", FOLLOW, R, "The walker heads about 30° to the right of the drone's heading.", (("right", "left"),)),
+    Case("zh", FOLLOW, R, "行人走向在机头右侧约 30 度。", (("右侧", "左侧"),)),
+    Case("en", FOLLOW, R, "Nothing odd: the pedestrian strolls on without any hurry.", (("strolls on", "is standing still"),)),
+    Case("zh", FOLLOW, R, "行人沿着小巷走着，不紧不慢。", (("沿着小巷走着", "站在原地不动"),)),
+    Case("en", FOLLOW, R, "Had it bent to the left, one might have turned left.", ()),
+    Case("en", FOLLOW, R, "The run takes the person across the view to the left.", ()),
+    Case("en", FOLLOW, R, "What is missing is ground, so we are eating up the gap.", ()),
+    Case("zh", FOLLOW, R, "无人机每小时 12 公里。", (("12", "39"),)),
+    Case("en", FOLLOW, R, "Somewhere between 1.4 and 1.5 m/s is what the walker does.", ()),
+    Case("en", FOLLOW, R, "Therefore continuing the turn to the right is the natural choice.", (("right", "left"),)),
+    Case("en", FOLLOW, R, "Therefore a turn to the right follows.", (("a turn to the right follows", "we should hover"), ("a turn to the right follows", "the right thing is to break off"))),
+    Case("zh", FOLLOW, "track_straight", "因此继续直线跟踪。", (("继续直线跟踪", "应立即返航"), ("继续直线跟踪", "应向左平移"))),
 ]  # fmt: skip

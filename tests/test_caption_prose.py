@@ -18,6 +18,7 @@ from retold import misread
 from specimens_prose import (
     CASES,
     EIGHTH_SET,
+    ELEVENTH_SET,
     FIFTH_SET,
     FOLLOW,
     FOURTH_SET,
@@ -28,6 +29,7 @@ from specimens_prose import (
     SIXTH_SET,
     TENTH_SET,
     THIRD_SET,
+    TWELFTH_SET,
     WINDOWS,
     Case,
 )
@@ -100,19 +102,34 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         (THIRD_SET, 0, 0.67, 0.75, 0.66),
         (FOURTH_SET, 0, 0.8, 0.795, 0.89),
         (FIFTH_SET, 0, 0.66, 0.66, 0.79),
-        (SEVENTH_SET, 1, 0.65, 0.79, 0.79),
-        (EIGHTH_SET, 0, 0.73, 0.83, 0.63),
+        (SEVENTH_SET, 1, 0.71, 0.83, 0.83),
+        (EIGHTH_SET, 0, 0.76, 0.83, 0.63),
+        (ELEVENTH_SET, 0, 0.77, 0.81, 0.69),
         # Not met: hard styles and common ones. Wanted are 3 % flagged, too.
-        (SIXTH_SET, 2, 0.43, 0.54, 0.29),
-        (NINTH_SET, 2, 0.54, 0.67, 0.46),
-        (TENTH_SET, 5, 0.43, 0.61, 0.40),
+        (SIXTH_SET, 0, 0.39, 0.50, 0.24),
+        (NINTH_SET, 1, 0.55, 0.68, 0.46),
+        (TENTH_SET, 6, 0.46, 0.62, 0.46),
+        (TWELFTH_SET, 2, 0.52, 0.62, 0.52),
     ],
-    ids=["gold", "second", "third", "fourth", "fifth", "seventh", "eighth", "sixth", "ninth", "tenth"],
+    ids=[
+        "gold",
+        "second",
+        "third",
+        "fourth",
+        "fifth",
+        "seventh",
+        "eighth",
+        "eleventh",
+        "sixth",
+        "ninth",
+        "tenth",
+        "twelfth",
+    ],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(
     path: Path, flagged_at_most: int, of_all: float, numbers: float, sides: float
 ):
-    """Bounds of what is reached on sets that are read by now, and on three that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
+    """Bounds of what is reached on sets that are read by now, and on four that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
     captions = list(read_gold_prose(path))
     flagged, caught = measure(
         (one.language, one.facts, one.coc, [(error.kind, error.in_text(one.coc)) for error in one.errors])

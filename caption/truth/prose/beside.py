@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Literal
 
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, crossing, gap
@@ -12,6 +13,16 @@ from caption.truth.prose.statements import Hedge
 from caption.truth.prose.timing import Timing
 
 _COMES_TO = re.compile(r" to $|回[^,]{0,2}[到至]")
+_EXTREME = {
+    "en": re.compile(
+        r",? ?(?:which is |that is |it is |and |now )*(?:by far |easily )?(?:the|its|our|his|her|their) "
+        r"(?:(?P<most>longest|largest|biggest|greatest|highest|widest|tallest|farthest|furthest|fastest|quickest)|shortest|smallest|lowest|narrowest|closest|nearest|slowest|least)"
+        r"(?: \w+)?(?: yet| so far| seen| (?:of|in|over) (?:the |all )?(?:window|five|four|frames|series|sequence|steps|whole|clip|lot|run)\b)"
+    ),
+    "zh": re.compile(
+        r",?(?:也|正|恰|又)?(?:是|为|系)(?:这)?(?:整个|全)?(?:窗口|五帧|四步|序列|全程|两秒|期间|段)*(?:里|中|内|以来|的|之)*最(?:(?P<most>[远大宽高快长])|[近小窄低慢短])的?(?:一次|一帧|一步|值|时刻|数)"
+    ),
+}  # fmt: skip
 _ZH_AFTER = 2  # letters between a number and its side: "3 度(左)"
 
 
@@ -89,6 +100,11 @@ class Beside:
             if -1 <= distance <= reach and not crossing(self.sentence, self.clause, token, numeral.start, numeral.end):
                 return token.value  # type: ignore[return-value]
         return ""
+
+    def extreme(self, numeral: Numeral) -> Literal["", "max", "min"]:
+        """Say of which end of its series a number is told to be: "23.0 m, the longest of the five frames"."""
+        found = _EXTREME[self.language].match(self.text, numeral.end)
+        return "" if found is None or numeral.unit not in ("m", "mps", "px") else "max" if found["most"] else "min"
 
     def aggregate(self, numeral: Numeral) -> str:
         near = [t for t in self.clause.of("time", "max", "min", "mean") if gap(t, numeral.start, numeral.end) <= 30]

@@ -17,6 +17,28 @@ ZH_MORE = re.compile(
     r"(?<![接将靠附最])(?:高|低|远|近|宽|窄|快|慢|多|少|大|小|长|短)(?:出|了)?(?:约|大约|近|将近)?\s*$"
 )
 MORE_BY = re.compile(r"[多少]出(?:了)?(?:约|大约|近|将近)?\s*$")  # "最后半秒就多出 3.2 米"
+_UP_TO = {  # a word of change with what leads to its number
+    "en": re.compile(
+        r"(?:(?!amount|equal|com(?:es?|ing) to|add)[a-z]+ ){1,3}?to (?:(?:about|around|roughly|some|almost|nearly|only|just|a mere|now) )*"
+    ),
+    "zh": re.compile(r"[^#,]{1,4}[到至](?:了)?(?:约|大约|近|将近)?\s*"),
+}
+AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
+_AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
+_IN_LAST_STEP = {
+    "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
+    "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
+}  # fmt: skip
+_FROM_TO = {  # what stands before the first number and between the two
+    "en": (
+        re.compile(r"\bfrom (?:(?:about|around|roughly|some|almost|nearly|only|just|over|under|a mere|an initial) )*$"),
+        re.compile(r"\s*(?:(?:up|down|back) )?to (?:(?:about|around|roughly|some|almost|nearly|only|just|over|under|a mere|now) )*"),
+    ),
+    "zh": (
+        re.compile(r"[从由](?:约|大约|近|将近|不到)?\s*$"),
+        re.compile(r"\s*(?:一路|逐步|逐渐|迅速|陡然|缓缓|慢慢|略微?|稍微?|又|再)*[增减升降提加缩涨跌拉扩收落掉冲放变拓猛骤骤陡飙窜回抬压大]{0,3}[到至成为](?:了)?(?:约|大约|近|将近)?\s*"),
+    ),
+}  # fmt: skip
 _DOWN_WORDS = frozenset(
     ["less", "lower", "below", "closer", "nearer", "narrower", "shorter", "smaller", "slower", "down", "fewer"]
 )
@@ -87,6 +109,37 @@ class Changing:
         if self.clause.has("time", "last_step", "last_second") or self._is_done(numeral):
             return "either", 0
         return "value", 0
+
+    def reached(self, numeral: Numeral) -> int:
+        """Say which way a value was reached: "slowed to 1.2 m/s", "提速到 2.4 米/秒"; 0 where that is not told."""
+        if numeral.unit not in ("m", "mps", "px"):
+            return 0
+        trends = [t for t in self.clause.of("trend") if t.value.endswith(("up", "down")) and t.end <= numeral.start]
+        if not trends or self.sentence.is_negated(self.clause, trends[-1]):
+            return 0
+        last = trends[-1]
+        ends = _UP_TO[self.language].fullmatch(self.text, last.start, numeral.start)
+        return 0 if ends is None else 1 if last.value.endswith("up") else -1
+
+    def is_from_to(self, a: Numeral, b: Numeral) -> bool:
+        """Tell whether two numbers stand as the ends of one way, whatever else their clause holds: "从 0.7 米/秒增到 1.1 米/秒"."""
+        return self.goes_from(a) and _FROM_TO[self.language][1].fullmatch(self.text, a.end, b.start) is not None
+
+    def goes_from(self, numeral: Numeral) -> bool:
+        return _FROM_TO[self.language][0].search(self.text, self.clause.start, numeral.start) is not None
+
+    def comes_after(self, now: Numeral, before: Numeral) -> bool:
+        """ "1.1 m/s after the 6.4 m/s burst", but not "21 m after 2 m of climb"."""
+        return _AFTER.fullmatch(self.text, now.end, before.start) is not None and not self.text.startswith(
+            " of", before.end
+        )
+
+    def turned_by(self, numeral: Numeral) -> bool:
+        """Tell whether an angle is how far something turned in the last step: "1.9 degrees in the final step"."""
+        pattern = _IN_LAST_STEP[self.language]
+        if self.language == "en":
+            return pattern.match(self.text, numeral.end) is not None
+        return pattern.search(self.text, self.clause.start, numeral.start) is not None
 
     def _is_per_frame(self, numeral: Numeral) -> bool:
         if self.language == "zh":

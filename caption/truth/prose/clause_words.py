@@ -7,7 +7,7 @@ from dataclasses import replace
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, gap, owner_of, times_of
 from caption.truth.prose.lexicon import Token
-from caption.truth.prose.plainness import is_plain
+from caption.truth.prose.plainness import is_asserted, is_plain
 from caption.truth.prose.statements import NOW, Statement
 
 
@@ -55,4 +55,5 @@ class ClauseWords:
     def _add(self, token: Token, **fields: object) -> None:
         found = Statement(clause=self.span, **fields)  # type: ignore[arg-type]
         sure = is_plain(found, token, self.sentence, self.clause, self.is_reasoning)
-        self.statements.append(replace(found, is_sure=sure))
+        asserted = is_asserted(found, token, self.sentence, self.clause, self.is_reasoning)
+        self.statements.append(replace(found, is_sure=sure, is_asserted=asserted))

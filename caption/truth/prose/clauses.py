@@ -155,7 +155,7 @@ def _may_be_slant(token: Token, text: str) -> Token:
 
 
 _PARTICLE = re.compile(
-    r"\b(?!look|point|pitch|tilt|camera|angl|view|px|pixel|m\b|met|deg|straight|further|slow|pick|catch|caught|keep|end|set|show|upside|sum|line|well|nose|face|facing|bear|gaz|see|head|pan|turn|follow|close|clos|open|back|make|made|take|speed|sped|brought|bring|cover|hold|held|lock|give|gave|brow|slope|high|half|so|and|or|is|are|it|the|#)"
+    r"\b(?!look|eat|ate|use|point|pitch|tilt|camera|angl|view|px|pixel|m\b|met|deg|straight|further|slow|pick|catch|caught|keep|end|set|show|upside|sum|line|well|nose|face|facing|bear|gaz|see|head|pan|turn|follow|close|clos|open|back|make|made|take|speed|sped|brought|bring|cover|hold|held|lock|give|gave|brow|slope|high|half|so|and|or|is|are|it|the|#)"
     r"[a-z]+ (up|down)\b(?! to t\d| with| front)"
     r"|(?:^|[,;(:]|\b(?:is|are|was|now|currently|and)) ?(up|down) (?=(?:by |from |to )?(?:about |roughly |almost |nearly |some |an? )*(?:[#\d]|(?:one|two|three|four|five|six|seven|eight|nine|ten|half)\b))"
 )
@@ -250,6 +250,10 @@ _A_NUMBER = re.compile(
 _LOOKS_AS = re.compile(r"\b(?:looks|seems|appears) as $")
 
 
+# "had their path bent left, ...": a condition.
+_INVERTED = re.compile(r"(?:^|(?<=[;.:]))\s*(?:had|should|were) (?:the|it|he|she|they|their|his|her|its|we|our|this)\b")
+
+
 def _block(clauses: list[Clause], text: str) -> None:
     """Mark where a sentence speaks of what is not observed: conditions up to a semicolon or a reason, goals to the clause's end."""
     conditional = False
@@ -258,6 +262,7 @@ def _block(clauses: list[Clause], text: str) -> None:
         conditional = (
             conditional and text[max(0, clause.start - 1)] != ";" and not given and not clause.has("modality", "thus")
         )
+        conditional = conditional or _INVERTED.match(text, clause.start) is not None
         if conditional:
             clause.blocked.append((clause.start, clause.end, "if"))
         if clauses[0] is not clause and text.startswith("and ", clause.start):

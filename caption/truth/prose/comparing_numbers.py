@@ -13,7 +13,16 @@ from caption.truth.prose.measured import Measured, change
 from caption.truth.prose.numerals import Numeral
 from caption.truth.prose.statements import Form, Statement
 
-SIGNED = {"yaw": 1, "heading": 1, "bearing": 1, "target_turn": 1, "target_heading": 1, "offset_x": -1, "offset_y": -1}
+SIGNED = {
+    "yaw": 1,
+    "heading": 1,
+    "bearing": 1,
+    "relative_course": 1,
+    "target_turn": 1,
+    "target_heading": 1,
+    "offset_x": -1,
+    "offset_y": -1,
+}
 RESOLUTION = {"m": 0.1, "mps": 0.02, "deg": 0.2, "px": 1.0, "dps": 0.4}  # of a difference of two printed values
 ABOUT = 0.07  # share of the value that "about" allows
 
@@ -40,6 +49,8 @@ class NumberComparison:
                 return ratio_holds(s, self.measured, {i: self.read(i)[1:] for i in (*s.numbers, *(s.operands or ()))})
             case "speeds":
                 return self._speeds(s)
+            case "extreme":
+                return self._extreme(s)
         return self._clock(s)
 
     def _falls(self, s: Statement) -> bool:
@@ -300,6 +311,16 @@ class NumberComparison:
         return any(
             abs(v - x) <= slack_v and abs(w - y) <= slack_w for (x, slack_v), (y, slack_w) in orders for v, w in pairs
         )
+
+    def _extreme(self, s: Statement) -> bool | None:
+        """Tell whether a value of a series is its largest or smallest; None of one that it does not hold."""
+        _, value, step = self.read(s.numbers[0])
+        ends = []
+        for name in s.names:
+            known = [abs(v) for v in self.measured.known(name)] if self._is_known(name) else []
+            if any(abs(v - value) <= step for v in known):
+                ends.append(max(known) if s.word == "max" else min(known))
+        return any(abs(end - value) <= 2.0 * step for end in ends) if ends else None
 
     def _clock(self, s: Statement) -> bool | None:
         _, hour, _ = self.read(s.numbers[0])

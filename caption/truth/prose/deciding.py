@@ -24,8 +24,9 @@ _AGREE = {
 _OPPOSITE = {
     "ascend": ("descend",), "descend": ("ascend",), "speed_up": ("slow", "hover", "search"), "slow_down": ("fast", "search"),
     "move_forward": ("backward", "hover", "search"), "move_backward": ("forward", "fast", "search"), "hover": ("fast", "forward", "ascend", "descend"),
-    "yaw_left_to_follow": ("straight", "search"), "yaw_right_to_follow": ("straight", "search"), "track_straight": ("search",),
-    "search_to_reacquire_target": ("straight",),
+    "yaw_left_to_follow": ("straight", "search", "hover"), "yaw_right_to_follow": ("straight", "search", "hover"), "track_straight": ("search",),
+    "search_to_reacquire_target": ("straight", "hover", "fast"), "circle_left": ("straight", "hover"), "circle_right": ("straight", "hover"),
+    "strafe_left": ("hover",), "strafe_right": ("hover",),
 }  # fmt: skip
 # "a search is not warranted": refused after it is named.
 _REFUSED = {
@@ -44,7 +45,10 @@ _INSTEAD = {
     "en": re.compile(r"\b(?:rather than|instead of|without|no need|no reason|no case|no hurry|too small|nothing to)\b"),
     "zh": re.compile(r"而非|而不|无需|不必|不需|没有理由|没有必要|不用|何必|不值得|暂不"),
 }
-_LATER = {"en": re.compile(r"\b(?:before|until|till|after|once|later)\b"), "zh": re.compile(r"再|之后|以后")}
+_LATER = {
+    "en": re.compile(r"\b(?:before|until|till|after|once|later)\b"),
+    "zh": re.compile(r"(?<!那就)(?<!因此)(?<!所以)(?<!不妨)(?<!可以)再|之后|以后"),
+}
 
 
 def actions_of(sentence: Sentence, clause: Clause, *, is_plan: bool) -> list[Said]:
@@ -78,7 +82,8 @@ def _force(sentence: Sentence, clause: Clause, token: Token, *, is_plan: bool) -
 
 def _is_praised(text: str, clause: Clause, token: Token, language: str) -> bool:
     if language == "en":
-        return _PRAISED["en"].match(text, token.end, clause.end) is not None
+        goes_on = _CONTINUING.fullmatch(text, clause.start, token.start)  # "continuing this orbit to the left"
+        return goes_on is not None or _PRAISED["en"].match(text, token.end, clause.end) is not None
     return _PRAISED["zh"].search(text, clause.start, token.start) is not None
 
 
@@ -86,6 +91,9 @@ _SHEDS = re.compile(r"\b(?:bleed|shed|scrub|los|drop|dump|wash|tak)\w* (?:off )?
 _IS_ATTRIBUTE = re.compile(
     r"\s*(?:offset|error|drift|deviation|component|angle|rate|偏移|误差|偏差|分量)"
 )  # "sideways offset"
+_CONTINUING = re.compile(
+    r"\s*(?:and |so )?(?:continuing|carrying on|keeping on|going on)(?: with| to)?(?: (?:the|this|that|our|its|a|an|with|steady|gentle))*\s*"
+)
 _GOES_ON = frozenset(["continue", "keep", "go on", "carry on", "继续"])
 
 
@@ -101,7 +109,10 @@ _TOLD = {
 }
 # "bleeding off speed is wiser than turning": recommended after it is named; in Chinese before.
 _PRAISED = {
-    "en": re.compile(r"[^,;:]{0,20}\b(?:is|would be|seems|looks) (?:the |by far |surely )?(?:wiser?|wisest|better|best|right|safer|safest|prudent|sensible)\b(?! of)"),
+    "en": re.compile(
+        r"[^,;:]{0,30}\b(?:is|would be|seems|looks|remains|stays) (?:the |by far |surely |still |a |an )*(?:wiser?|wisest|better|best|right|safer|safest|prudent|sensible|appropriate|fitting|in order"
+        r"|(?:cheapest|simplest|easiest|natural|obvious|only|logical|cleanest|surest|sound|proper) (?:way|option|choice|move|step|answer|response|thing|course))\b(?! of)"
+    ),
     "zh": re.compile(r"(?:正|最|更|很)适合"),
 }  # fmt: skip
 # "you have already let the nose go right": what was asked for once.
@@ -152,6 +163,10 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Sa
 
 
 def _is_opposite(decision: str, said: Said) -> bool:
+    if said.action in ("leave", "home"):
+        return decision not in ("break_off", "return_to_home")
+    if said.action in _SIDED and decision == "track_straight":
+        return said.side != 0 and said.force == "directive"
     if said.action in _SIDED:
         return said.side != 0 and decision == _SIDED[said.action].format("right" if said.side > 0 else "left")
     return said.action in _OPPOSITE.get(decision, ())

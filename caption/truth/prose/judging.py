@@ -21,7 +21,7 @@ from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
 
-_NUMBERS = ("number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds")
+_NUMBERS = ("number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds", "extreme")
 _PROBLEM = {
     "pair": "box",
     "list": "number",
@@ -32,8 +32,9 @@ _PROBLEM = {
     "changing": "trend",
     "percent": "number",
     "speeds": "number",
+    "extreme": "number",
 }
-_SELDOM_MISREAD = ("comparison", "state")
+_SELDOM_MISREAD = ("comparison", "state", "clock", "list", "range", "extreme")
 _SHOWN = 120  # characters of a sentence in a message
 
 
@@ -85,7 +86,7 @@ def _judge(name: str, text: str, language: Language, form: Form, numbers: Number
         if compares_wrongly(statement, form, numbers) or goes_wrongly(statement, form, numbers):
             holds = False
         elif holds is False and statement.kind not in _NUMBERS and not statement.is_sure:
-            holds = None
+            holds = False if statement.is_asserted and words.is_never(statement) else None
         if holds is False and not _is_worded_as_met(statement, form, numbers, language):
             holds = None
         if holds is None:

@@ -33,11 +33,26 @@ class NumberJudge(NumberComparison):
         found = self.compare(s)
         if s.kind == "number" and not self._is_possible(s, is_meant=found is True):
             return None if self._is_others_turn(s) else False
-        if s.kind == "course" and self._goes_otherwise(s):
+        if (s.kind == "course" and self._goes_otherwise(s)) or self._is_reached_otherwise(s):
             return False
         if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self.is_of_the_window(s):
             return None
         return None if found is False and self._is_others_turn(s) else found
+
+    def _is_reached_otherwise(self, s: Statement) -> bool:
+        """Tell whether a value that a rise or fall ends at is one of its series, but nowhere after a lower or higher one."""
+        if not s.reached or not s.names:
+            return False
+        _, value, step = self.read(s.numbers[0])
+        near = step + _ROUGHLY * value * bool(s.hedge)
+        places = [
+            (known, i)
+            for name in s.names
+            if (known := [abs(v) for v in self.measured.known(name.removeprefix("rate:"))]) and name[:4] != "rate"
+            for i, v in enumerate(known)
+            if abs(v - value) <= near
+        ]
+        return bool(places) and not any(s.reached * (known[i] - v) > 0 for known, i in places for v in known[:i])
 
     def _is_others_turn(self, s: Statement) -> bool:
         """Tell whether an angle is exactly the other's turn or where the other stands, now: whose it is is often told sentences before."""
@@ -51,7 +66,7 @@ class NumberJudge(NumberComparison):
 
     def _is_plain(self, s: Statement) -> bool:
         """Tell whether the words leave no doubt whose value a number is, and of which frame."""
-        if s.kind in ("pair", "clock", "speeds", "ratio", "percent"):
+        if s.kind in ("pair", "clock", "speeds", "ratio", "percent", "extreme"):
             return True
         if s.kind == "course":
             return bool(s.sure_names) and (s.sure_mode == "value" or self._is_turned_round(s))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 from caption.truth.facts import PARTLY_BELOW, STANDING_MPS
@@ -62,6 +63,20 @@ class WordJudge:
         if not answers or all(a is None for a in answers):
             return None
         return True if True in answers else False if None not in answers else None
+
+    def is_never(self, s: Statement) -> bool:
+        """Tell whether a state or visibility is that of no frame of the window, and the drone does not what the target is said to do."""
+        if s.kind == "visibility":
+            return self._visibility(replace(s, frames=None)) is False
+        if s.kind != "state" or s.word in ("hovering", "flying", "straight"):
+            return False
+        facts, free = self.facts, replace(s, frames=None)
+        drone = [v for v in facts.speed_mps if v is not None]
+        ours = {
+            "standing": min(drone, default=0.0) <= _RESTING_MPS,
+            "turning": abs(facts.yaw_deg[-1] - facts.yaw_deg[0]) >= 3.0,
+        }
+        return not ours.get(s.word, max(drone, default=1.0) >= STANDING_MPS) and self._state(free) is False
 
     # --- trends ------------------------------------------------------------------------------------------------------
 

@@ -79,6 +79,12 @@ def _difference_mean(f: Facts) -> Values:
     return () if mean is None else tuple([None if v is None else v - mean for v in f.speed_mps])
 
 
+def _relative_course(f: Facts) -> Values:
+    """Where the target goes against the drone's heading, positive = left."""
+    pairs = zip(f.target_headings_deg, f.heading_deg, strict=False)
+    return tuple([None if a is None or b is None else change("heading", b, a) for a, b in pairs])
+
+
 def _picture(f: Facts) -> Values:
     return (f.width_px, f.height_px, f.width_px / 2, f.height_px / 2)
 
@@ -92,6 +98,7 @@ _DERIVED: dict[str, Callable[[Facts], Values]] = {
         if not f.travelled_m or not f.target_travelled_m
         else tuple([None if w is None else v - w for v, w in zip(f.travelled_m, f.target_travelled_m, strict=True)])
     ),
+    "relative_course": _relative_course,
     "box_area": _area,
     "picture": _picture,
 }

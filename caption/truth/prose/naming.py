@@ -32,6 +32,20 @@ _CHANGED: dict[str, dict[str, tuple[str, ...]]] = {
     "px": {"taller shorter higher 高": ("box_height",), "wider narrower 宽 窄": ("box_width",)},
 }
 
+_FROM_ORIGIN = re.compile(r"[离距](?:起点|出发点)的?(?:直线|水平)?距离[^#]{0,6}$")
+_OF_NOSE = {  # before a number with a side, and after it: where somebody is or goes, against the drone's heading
+    "en": (
+        None,
+        re.compile(
+            r"\s*(?:off )?(?:to the |on the )?(?:left|right) of (?:where the drone|(?:the |our |its |my |that )?(?:drone's |camera's |aircraft's |own )*(?:-?#(?:\.#)?(?:°| degrees)? )?(?:heading|nose|camera axis|axis|optical axis|camera heading|course|boresight)\b)"
+        ),
+    ),
+    "zh": (
+        re.compile(r"比(?:机头|本机航向|航向)[^,;]{0,14}偏?[左右][^,;#]{0,4}$|(?<![始原初])(?:机头|航向)(?:方向)?的?[左右](?:侧|边|前方|后方|方)[^,;#]{0,4}$"),
+        None,
+    ),
+}  # fmt: skip
+
 
 class Naming:
     """The names of one clause's numbers."""
@@ -124,3 +138,13 @@ class Naming:
         """ "快于目标 3 米/秒"."""
         before = self.text[: numeral.start]
         return re.search(r"(?:快|慢|高|低)(?:于|出|过)?[^#]{0,12}$", before) is not None or "相差" in before[-6:]
+
+    def is_from_origin(self, numeral: Numeral) -> bool:
+        return _FROM_ORIGIN.search(self.text, self.clause.start, numeral.start) is not None
+
+    def is_of_nose(self, numeral: Numeral) -> bool:
+        """Tell whether an angle is where somebody is or goes, against the drone's heading."""
+        before, after = _OF_NOSE[self.language]
+        if before is not None:
+            return before.search(self.text, self.clause.start, numeral.start) is not None
+        return after is not None and after.match(self.text, numeral.end) is not None

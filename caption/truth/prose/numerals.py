@@ -176,6 +176,7 @@ def _side_of(match: re.Match[str], text: str, language: Language) -> int:
 EVERY_SECOND = re.compile(
     r"\s*(?:of \w+ |in (?!half)\w+ |in )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
 )
+_PER_HOUR = re.compile(r"(?:每小时|时速)(?:约|大约|近|将近|可达)?\s*$")
 _PER_SECOND = re.compile(r"(?:每秒|一秒钟?(?=[能可]?[走飞跑移挪]))[^,#;。]*$")
 
 
@@ -186,6 +187,8 @@ def _said_apart(numeral: Numeral, text: str) -> Numeral:
     rate = {"m": "mps", "deg": "dps"}.get(numeral.unit)
     if rate and EVERY_SECOND.match(text, numeral.end):
         numeral = replace(numeral, unit=rate)
+    if numeral.unit == "m" and _PER_HOUR.search(text, 0, numeral.start):
+        numeral = replace(numeral, unit="mps", factor=numeral.factor / 3600.0)
     if rate and _PER_SECOND.search(text[max(0, numeral.start - 14) : numeral.start]):
         numeral = replace(numeral, unit=rate)
     return numeral

@@ -36,6 +36,7 @@ _TURNS = re.compile(
 )
 
 
+_CROSSES = re.compile(r"\bacross the (?:view|picture|frame|image|screen)|横穿|穿过|横过")
 _UNSEEN = re.compile(r"occlu|\bhidden|out of (?:view|sight|frame)|outside|遮挡|视野外|看不[见到]")  # whenever that was
 _ORDINALS = re.compile(  # several frames that are told one by one: "in the second and third frames"
     r"\b(?:first|second|third|fourth|#) (?:and|to|through|or) (?:the )?(?:second|third|fourth|fifth|last|final|#)\b"
@@ -68,7 +69,7 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
                     or (found.frames is None and _UNSEEN.search(text, token.start, token.end) is not None)
                 )
                 and found.word != "visible"  # "to keep him in the picture", "last seen": never of what is hidden now
-                and not any(sentence.numerals[i].unit in ("m", "percent", "px") for i in clause.numerals)
+                and not _is_measured(sentence, clause)
                 and not _ORDINALS.search(text, clause.start, clause.end)
             )
         case "trend":
@@ -85,6 +86,27 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
         case "side":
             return _is_side(found, token, part, sentence, clause)
     return True
+
+
+def is_asserted(found: Statement, token: Token, sentence: Sentence, clause: Clause, is_reasoning: bool) -> bool:
+    """Tell whether a word is said of some moment: nothing before it denies or supposes it, and it is nothing to do."""
+    text, language = sentence.text, sentence.language
+    if found.kind == "visibility":
+        has_subject = text[token.start : token.end] != "lost" and not _is_measured(sentence, clause)
+    else:
+        people = [t.start - token.end for t in clause.of("who", "target")]
+        has_subject = any(gap < 0 or gap == 1 for gap in people)  # "the motionless walker"
+        has_subject = has_subject or (language == "zh" and not clause.has("quantity"))
+        has_subject = has_subject and not _STANDS_AT.match(text, token.start)
+    blocked = _BLOCKED[language].search(text, clause.start, token.start) or "?" in text
+    part = text[clause.start : clause.end]
+    is_to_do = is_reasoning and clause.has("action") and not _is_told(part, clause, language)
+    return has_subject and not (found.negated or blocked or is_to_do or clause.has("who", "scene"))
+
+
+def _is_measured(sentence: Sentence, clause: Clause) -> bool:
+    """Tell whether a clause gives a number that is not told of being seen."""
+    return any(sentence.numerals[i].unit in ("m", "percent", "px") for i in clause.numerals)
 
 
 def _is_blocked(found: Statement, token: Token, sentence: Sentence, clause: Clause) -> bool:
@@ -148,6 +170,8 @@ def _is_side(found: Statement, token: Token, part: str, sentence: Sentence, clau
         t.end == token.start and text[: t.start].endswith("在") for t in clause.of("who", "target")
     ):
         return False  # "中心在他右边"
+    if found.names[0] == "offset_x" and _CROSSES.search(part):
+        return False  # which way it goes, not where it is
     if found.names[0] == "offset_x":
         return (
             clause.has("quantity", "centre") or clause.has("position", "frame") or (language == "en" and "edge" in part)

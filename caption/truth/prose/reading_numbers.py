@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 
 from caption.truth.prose.beside import Beside
-from caption.truth.prose.changing import MORE_THAN, Changing
+from caption.truth.prose.changing import AFTERWARDS, MORE_THAN, Changing
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     OVERALL,
@@ -38,12 +38,6 @@ _OF_PICTURE = {
         r"[^#]*(?:图像|画面|图片|画幅)(?:的)?(?:宽度|高度|宽|高)的?约?[^#]{0,5}$|[^#]*(?:图像|画面)(?:宽度|高度)"
     ),
 }
-_IN_LAST_STEP = {
-    "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
-    "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
-}  # fmt: skip
-_AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
-_AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 
 
@@ -86,7 +80,7 @@ class NumberReader:
         """Read two speeds that are set against each other: one is the drone's, the other the target's."""
         for a, b in self.sureness.pairs:
             i, j = self.sentence.numerals.index(a), self.sentence.numerals.index(b)
-            if i not in self.clause.numerals or self.clause.is_blocked(a.start):
+            if i not in self.clause.numerals or self.clause.is_blocked(a.start) or self.clause.has("link", "between"):
                 continue
             if any(t.value[0] == "t" and t.value[1:].isdigit() for t in self.clause.of("time")):
                 continue
@@ -197,7 +191,10 @@ class NumberReader:
             sure_names=sure_names,
             sure_frames=sure_frames,
             sure_mode=self.sureness.mode(numeral),
+            reached=self.changing.reached(numeral),
         )
+        if self.naming.is_from_origin(numeral):
+            found = replace(found, names=("displacement", "target_travelled"), sure_names=())
         if found.sure_names and not set(found.names) & set(found.sure_names):
             found = replace(found, names=found.sure_names)
         if names == ("way_difference",):
@@ -212,10 +209,14 @@ class NumberReader:
                 sure_mode="change",
             )
         found = self._angle(found) if numeral.unit == "deg" else found
+        if self.changing.goes_from(numeral):
+            found = replace(found, frames=None, sure_frames=None)
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
             found = replace(found, names=names or found.names)
         self.statements.append(self._surely(found, numeral))
+        if (end := self.beside.extreme(numeral)) and names:
+            self.statements.append(replace(found, kind="extreme", names=found.sure_names or names, word=end))
 
     def _change(self, numeral: Numeral, names: tuple[str, ...]) -> tuple[tuple[str, ...], Mode, int]:
         """Say of what a number is, whether it is a change, and which way."""
@@ -228,6 +229,10 @@ class NumberReader:
 
     def _angle(self, s: Statement) -> Statement:
         """Read an angle with a side as a turn: the target's, or the drone's from the window's start."""
+        numeral = self.sentence.numerals[s.numbers[0]]
+        if s.side and self.naming.is_of_nose(numeral):
+            s = replace(s, names=("bearing", "relative_course"), mode="value", sure_mode="value")
+            return replace(s, sure_names=s.names, frames=s.sure_frames or s.frames)
         if s.side and s.names and set(s.names) <= {"target_turn", "target_heading"}:
             s = replace(s, mode="change", frames=None)  # "has bent left by 45 degrees"
         if set(s.names) == {"target_turn", "target_heading"} and OVERALL.search(self.text, self.clause.start):
@@ -260,19 +265,12 @@ class NumberReader:
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
             return s
-        if s.names == ("yaw",) and s.frames == (-2, NOW) and self._turned_by(numeral):
+        if s.names == ("yaw",) and s.frames == (-2, NOW) and self.changing.turned_by(numeral):
             return replace(s, sure_names=("yaw", "heading"), sure_frames=s.frames, sure_mode="change")
         if not s.sure_names and s.names == ("yaw",) and s.side:
             s = replace(s, sure_names=s.names)  # "has swung 3 degrees to the left in the last step"
         is_speed = numeral.unit == "mps" and s.mode == "either" and s.sure_names and s.frames == (-2, NOW)
         return replace(s, sure_frames=(NOW,) if is_speed else s.frames)  # a speed is that of the step before it
-
-    def _turned_by(self, numeral: Numeral) -> bool:
-        """Tell whether an angle is how far something turned in the last step: "1.9 degrees in the final step"."""
-        pattern = _IN_LAST_STEP[self.language]
-        if self.language == "en":
-            return pattern.match(self.text, numeral.end) is not None
-        return pattern.search(self.text, self.clause.start, numeral.start) is not None
 
     def _frames(self, numeral: Numeral, mode: Mode) -> tuple[int, ...] | None:
         return self.timing.frames(numeral, mode, is_extreme=bool(self.beside.aggregate(numeral)))
@@ -281,14 +279,20 @@ class NumberReader:
 
     def _join_courses(self) -> None:
         """Make one statement of "from A to B": two values of one series, the later one after the earlier."""
-        singles = [s for s in self.statements if s.kind == "number" and s.mode == "value"]
+        singles = [s for s in self.statements if s.kind == "number"]
         for early, late in itertools.pairwise(singles):
             a, b = self.sentence.numerals[early.numbers[0]], self.sentence.numerals[late.numbers[0]]
-            if a.unit == b.unit and self._comes_after(a, b):
+            if a.unit == b.unit and self.changing.is_from_to(a, b):
+                self.statements = [s for s in self.statements if s is not early and s is not late]
+                self._course(early.numbers[0], late.numbers[0])
+                continue
+            if early.mode != "value" or late.mode != "value":
+                continue
+            if a.unit == b.unit and self.changing.comes_after(a, b):
                 self.statements = [s for s in self.statements if s is not early and s is not late]
                 self._course(late.numbers[0], early.numbers[0])
                 return
-            if a.unit != b.unit or not self.timing.goes_to(b) or _AFTERWARDS.search(self.text, a.end, b.start):
+            if a.unit != b.unit or not self.timing.goes_to(b) or AFTERWARDS.search(self.text, a.end, b.start):
                 continue
             if self.timing.comes_from(a) or (
                 late.clause == early.clause
@@ -298,12 +302,6 @@ class NumberReader:
                 self._course(early.numbers[0], late.numbers[0])
                 return
 
-    def _comes_after(self, now: Numeral, before: Numeral) -> bool:
-        """ "1.1 m/s after the 6.4 m/s burst", but not "21 m after 2 m of climb"."""
-        return _AFTER.fullmatch(self.text, now.end, before.start) is not None and not self.text.startswith(
-            " of", before.end
-        )
-
     def _course(self, early: int, late: int) -> None:
         numeral = self.sentence.numerals[late]
         names, is_cued = self.naming.names(self.sentence.numerals[early])
@@ -312,7 +310,9 @@ class NumberReader:
         if not is_cued and self.in_scene:
             self.left_out = True
             return
+        others = ("dist", "alt") if numeral.unit == "mps" else ()  # "the speed has dropped back to 3.5 m/s"
         trends = [t for t in self.clause.of("trend") if t.value.endswith(("up", "down"))]
+        trends = [t for t in trends if not t.value.startswith(others)] if others else trends
         signs = {1 if t.value.endswith("up") else -1 for t in trends if not self.sentence.is_negated(self.clause, t)}
         start = self.timing.adjacent_frames(self.sentence.numerals[early])
         frames = self.timing.adjacent_frames(numeral)

@@ -89,7 +89,7 @@ class StateReader(ClauseWords):
             return
         if word == "hidden" and (self.clause.has("visibility", "partly") or self._hides_nothing(token)):
             return
-        if text == "covered" and not self.clause.has("who", "target"):
+        if text in ("covered", "missing") and not self.clause.has("who", "target"):
             return
         negated = self.sentence.is_negated(self.clause, token)
         if negated and word == "partly":

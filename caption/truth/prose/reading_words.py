@@ -26,6 +26,8 @@ _APART = {"dist_up": 1, "dist_down": -1}
 _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between a word of change and its number
 
 
+_AS_HIGH = re.compile(r"\s*(?:as )?(?:high|far|long|wide|tall|deep)\b")  # of two lengths
+_FURTHER = re.compile(r"(?:further|farther) (?:under|below|beneath|above|down|up|left|right|along|into|to the)\b")
 _BESIDE = re.compile(r"[侧方]")
 _GOES = re.compile(r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行")
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
@@ -129,7 +131,12 @@ class WordReader(ClauseWords):
         if len(same) > 1 and any(t.value in _VERTICAL for t in same) and self._is_of_flier():
             return ()  # of nothing that its clause names: also a climb
         if value in _APART:
-            if self.clause.has("quantity", "centre") or self.clause.has("who", "scene") or self._nears_something(token):
+            if (
+                _FURTHER.match(self.text, token.start)
+                or self.clause.has("quantity", "centre")
+                or self.clause.has("who", "scene")
+                or self._nears_something(token)
+            ):
                 return ()
             return ("distance", "slant")
         if nearest == "speed":
@@ -317,8 +324,6 @@ class WordReader(ClauseWords):
                 return "offset" if owner == "target" else ""
         return ""
 
-    # --- visibility, states, places ----------------------------------------------------------------------------------
-
     # --- two speeds --------------------------------------------------------------------------------------------------
 
     def _comparisons(self) -> None:
@@ -376,7 +381,11 @@ class WordReader(ClauseWords):
 
     def _ratio(self, token: Token) -> None:
         text = self.text[token.end : token.end + 12]
-        if self.text[: token.start].endswith("and a ") or re.match(r"\s*(?:at|in|during|within|over)\b", text):
+        if (
+            _AS_HIGH.match(self.text, token.end)
+            or self.text[: token.start].endswith("and a ")
+            or re.match(r"\s*(?:at|in|during|within|over)\b", text)
+        ):
             return  # "a second and a half", "twice at 5 m/s"
         if (
             re.match(

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 from caption.truth.prose.numerals import Numeral
 
 Kind = Literal[
-    "number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds",
+    "number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds", "extreme",
     "trend", "steady", "mixed", "changing", "side", "centre", "visibility", "state", "comparison",
 ]  # fmt: skip
 Mode = Literal["value", "change", "either"]
@@ -36,9 +36,9 @@ class Statement:
     names: the series that it may speak of, () where that is open: any of the number's unit. frames: the values that it may mean, None
     for any frame. numbers: indices of the sentence's numerals. mode: whether a number is a value of the series or a change of it.
     side: +1 left (or above), -1 right (or below). trend: +1 up, -1 down. word: of a visibility, state, comparison or an aggregate.
-    is_sure: False for a word that may not contradict, because it is not plain.
+    is_sure: False for a word that may not contradict, because it is not plain. is_asserted: that it is said of some moment, whichever, is plain.
     sure_names, sure_frames, sure_mode: of a number, what the words leave no doubt of (sureness.py); empty where they leave it open.
-    operands: the numbers whose ratio is told; is_ordered: that of the first to the second, else either way. span: frames between which a change is told. negated: the opposite is stated. clause: for the message.
+    operands: the numbers whose ratio is told; is_ordered: that of the first to the second, else either way. span: frames between which a change is told. reached: +1 of a value that a rise ends at, -1 a fall. negated: the opposite is stated. clause: for the message.
     """
 
     kind: Kind
@@ -55,11 +55,13 @@ class Statement:
     span: tuple[int, int] | None = None
     negated: bool = False
     is_sure: bool = True
+    is_asserted: bool = False
     sure_names: tuple[str, ...] = ()
     sure_frames: tuple[int, ...] | None = None
     sure_mode: Mode = "either"
     operands: tuple[int, int] | None = None
     is_ordered: bool = False
+    reached: int = 0
 
 
 @dataclass(frozen=True, slots=True)
