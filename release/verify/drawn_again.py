@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -22,6 +23,9 @@ from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
 EXACT_M, EXACT_DEG = 1e-4, 1e-3  # files keep all digits; those of older ones four
+# Of each walk, and walks of a run: to draw them takes a second or so, once a process. Nothing is said of a flight whose shifts all come later,
+# or of a later walk.
+FRAMES_TRIED, MOST_WALKS, MOST_FRAMES = 64, 512, 100_000
 SHIFTS_TRIED = 3  # of a flight: the first one may be a lie
 
 
@@ -47,6 +51,12 @@ class Drawn:
             return None
         return cls(render.seed, perturbation, walks.seed, num_walks, walks.config.get("pace"))
 
+    @cached_property
+    def first_shifts(self) -> np.ndarray:
+        """Where the drone is drawn to in the first frames of each walk, (walks, FRAMES_TRIED, 3) m."""
+        walks = (self.draws(walk_id(k)) for k in range(min(self.num_walks, MOST_WALKS)))
+        return np.array([[draw.drone_m for draw in islice(draws, FRAMES_TRIED)] for draws in walks])
+
     def draws(self, path_id: str) -> Iterator[ShiftDraw]:
         told = self.perturbation
         return shift_draws(
@@ -64,12 +74,13 @@ def check_draws(flight: FlightRows, drawn: Drawn | None, findings: Findings) -> 
     Args:
         drawn: of its run; None where nobody tells.
     """
-    if drawn is None or flight.rows[0].get("variant") != PERTURBED:
+    if drawn is None or flight.rows[0].get("variant") != PERTURBED or flight.index.max() > MOST_FRAMES:
         return
     shifted = [i for i, words in enumerate(flight.events) if words is not None and words["position"] == "applied"]
-    path_id = _walk_of(flight, shifted[:SHIFTS_TRIED], drawn)
+    shifted = [i for i in shifted if flight.index[i] < FRAMES_TRIED][:SHIFTS_TRIED]
+    path_id = _walk_of(flight, shifted, drawn)
     if path_id is None:
-        if shifted:
+        if shifted and drawn.num_walks <= MOST_WALKS:
             got = f"shifts that none of {drawn.num_walks} walks draws under seed {drawn.seed}"
             findings.warn("draw", flight.where(shifted[0], "drone_offset"), got, "the seed that they were drawn from, or another version of cosfly drew them")  # fmt: skip
         return
@@ -86,11 +97,10 @@ def check_draws(flight: FlightRows, drawn: Drawn | None, findings: Findings) -> 
 
 def _walk_of(flight: FlightRows, shifted: list[int], drawn: Drawn) -> str | None:
     for i in shifted:
-        index, told = int(flight.index[i]), flight.drone_offset[i, :3]
-        for number in range(drawn.num_walks):
-            draw = next(islice(drawn.draws(walk_id(number)), index, None))
-            if np.abs(draw.drone_m - told).max() <= EXACT_M:
-                return walk_id(number)
+        if len(drawn.first_shifts):
+            off_m = np.abs(drawn.first_shifts[:, flight.index[i]] - flight.drone_offset[i, :3]).max(axis=1)
+            if off_m.min() <= EXACT_M:
+                return walk_id(int(off_m.argmin()))
     return None
 
 
