@@ -60,7 +60,9 @@ def _disk(folder: Path) -> Check:
     free = shutil.disk_usage(folder).free / 2**30
     # A 1280x720 frame takes about 5 MB, nearly all of it float32 depth.
     detail = f"{free:.1f} GiB free at {folder.resolve()}, room for about {int(free * 200):,} frames of 1280x720"
-    return Check("disk", "ok" if free > 5 else "missing", detail)
+    if free > 5:
+        return Check("disk", "ok", detail)
+    return Check("disk", "missing", f"{detail}; free some space, or name another disk with --out")
 
 
 def _gl() -> Check:

@@ -36,7 +36,16 @@ from cosfly.provenance import (
 from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
 from cosfly.reading.files import sha256_file
 from cosfly.stage_events import EVENTS, lost_steps
-from cosfly.store import dump_json, inside, refuse_links, remove_partials, sha256_bytes, write_bytes, write_model
+from cosfly.store import (
+    dump_json,
+    inside,
+    is_partial_of,
+    refuse_links,
+    remove_partials,
+    sha256_bytes,
+    write_bytes,
+    write_model,
+)
 
 log = logging.getLogger(__name__)
 
@@ -320,7 +329,8 @@ def _taken_up(
 ) -> StageRecord:
     """Make what stands in a folder ready to be gone on with; gives the record with what was forced, and what has grown, noted."""
     if not (out / "stage.json").exists():
-        if any(entry.name != LOCK for entry in out.iterdir()):
+        # A kill may have come while the record was being written.
+        if any(entry.name != LOCK and not is_partial_of("stage.json", entry) for entry in out.iterdir()):
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )

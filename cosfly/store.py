@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import IO, Any
 
@@ -69,6 +70,11 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 def _partial(path: Path) -> Path:
     """Give the temporary name of a file or folder; `remove_partials` knows it."""
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def is_partial_of(name: str, path: Path) -> bool:
+    """Tell whether a path is the temporary name of a file or folder, of any process."""
+    return fnmatch(path.name, f".{name}.*.partial")
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -199,6 +200,16 @@ def test_the_doctor_asks_for_the_models_where_captions_do(tmp_path, monkeypatch,
     assert urls == [asked]
     assert found.state == "ok"
     assert found.detail.endswith(": one, two")
+
+
+@pytest.mark.parametrize(("free_gib", "state"), [(3, "missing"), (30, "ok")])
+def test_the_doctor_tells_how_many_frames_the_disk_takes(tmp_path, monkeypatch, free_gib, state):
+    usage = shutil.disk_usage(tmp_path)._replace(free=free_gib * 2**30)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    disk = {check.name: check for check in doctor.examine(tmp_path / "not" / "there")}["disk"]
+    assert disk.state == state
+    assert f"about {free_gib * 200:,} frames" in disk.detail
+    assert ("free some space" in disk.detail) == (state == "missing")
 
 
 @pytest.mark.parametrize("teacher", ["http://me:pw@h/v1", "http://h?key=pw", "http://[::1", "http://127.0.0.1:1"])

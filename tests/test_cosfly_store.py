@@ -252,8 +252,9 @@ def test_a_number_that_is_not_finite_is_placed(tmp_path, text, place):
     assert place in str(caught.value)
 
 
-def test_foreign_files_are_not_touched(tmp_path):
-    (tmp_path / "thesis.txt").write_text("x")
+@pytest.mark.parametrize("name", ["thesis.txt", ".thesis.txt.1.partial"])
+def test_foreign_files_are_not_touched(tmp_path, name):
+    (tmp_path / name).write_text("x")
     with pytest.raises(ResumeError, match="not cosfly's"):
         _open(tmp_path)
 
@@ -272,6 +273,14 @@ def test_partials_of_a_kill_are_swept(tmp_path):
     (stage.path / ".x.json.1.partial").write_text("half")
     (stage.path / ".flight.1.partial").mkdir()
     _open(tmp_path / "out")
+    assert sorted(p.name for p in stage.path.iterdir()) == [".lock", "stage.json"]
+
+
+def test_a_kill_in_the_middle_of_the_first_record_leaves_a_folder_to_go_on_with(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".stage.json.1.partial").write_text('{"schema": "cos')
+    stage = _open(out)
     assert sorted(p.name for p in stage.path.iterdir()) == [".lock", "stage.json"]
 
 
