@@ -32,20 +32,20 @@ def for_terminal(text: str, longest: int = LONGEST) -> str:
     return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], cut(text, longest))
 
 
-def for_html(text: str, longest: int = LONGEST) -> str:
+def for_html(text: str) -> str:
     """Give text that HTML shows as it is, in an element or in a quoted attribute."""
-    return html.escape(for_terminal(text, longest))
+    return html.escape(for_terminal(text))
 
 
-def for_markdown(text: str, longest: int = LONGEST) -> str:
+def for_markdown(text: str) -> str:
     """Give text that Markdown shows as it is, on one line, also in a cell of a table: no tag, link, emphasis or bar works."""
-    line = " ".join(for_terminal(text, longest).split())
+    line = " ".join(for_terminal(text).split())
     return _MARKDOWN.sub(r"\\\1", html.escape(line, quote=False))
 
 
-def markdown_code(text: str, longest: int = LONGEST) -> str:
+def markdown_code(text: str) -> str:
     """Give text as a code span of Markdown, on one line: the fence is longer than any run of backticks in it."""
-    line = " ".join(for_terminal(text, longest).split()).replace("|", "\\|")
+    line = " ".join(for_terminal(text).split()).replace("|", "\\|")
     runs = re.findall("`+", line)
     fence = "`" * (max(map(len, runs), default=0) + 1)
     space = " " if runs or not line else ""

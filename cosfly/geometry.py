@@ -16,6 +16,7 @@ DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another, and
 
 # Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+STANDS_MPS = 0.05  # who is slower goes nowhere
 CORNER_SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
 
 
@@ -149,16 +150,16 @@ def step_s(time_s: np.ndarray) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else DT_S
 
 
-def headings_of(positions_m: np.ndarray, time_s: np.ndarray, slowest_mps: float = 0.05) -> np.ndarray:
+def headings_of(positions_m: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     """Which way somebody goes at each time, (n,) rad counter-clockwise from +x.
 
     Args:
         positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.
     Returns:
-        By central differences. Who is slower than `slowest_mps` keeps the last direction, at the start the first one to come; who never moves faces east.
+        By central differences. Who is slower than STANDS_MPS keeps the last direction, at the start the first one to come; who never moves faces east.
     """
     velocity = np.gradient(positions_m[:, :2], time_s, axis=0)
-    moves = np.linalg.norm(velocity, axis=1) > slowest_mps
+    moves = np.linalg.norm(velocity, axis=1) > STANDS_MPS
     if not moves.any():
         return np.zeros(len(time_s))
     last = np.maximum.accumulate(np.where(moves, np.arange(len(time_s)), -1))

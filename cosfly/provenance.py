@@ -286,13 +286,6 @@ def _role(name: str) -> str:
     return ROLES.get(role, role)
 
 
-def warn_unbound(paths: Iterable[Path]) -> None:
-    """Tell of products that no record binds to the tree they were made of."""
-    for path in paths:
-        if _stage_folder(path) is None:
-            log.warning("%s: no record says of which tree this was made", path)
-
-
 def is_bound(product: Path) -> bool:
     """Tell whether a record binds a product to what it was made of."""
     return _record_of(product) is not None

@@ -262,8 +262,8 @@ async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:
     return pending
 
 
-def common_causes(failures: list[Failed], most: int = 3) -> str:
-    """Give the most common causes with their counts."""
+def common_causes(failures: list[Failed]) -> str:
+    """Give the three most common causes with their counts."""
     counts = Counter(failure.code for failure in failures)
     ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
-    return ", ".join(f"{cause} {count}" for cause, count in ordered[:most])
+    return ", ".join(f"{cause} {count}" for cause, count in ordered[:3])

@@ -187,11 +187,6 @@ def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], langu
 
 
 @in_place.kept()
-def load_glossary(path: Path | None = None) -> Glossary:
-    """Read a glossary, by default the one that ships, and put the actions in use into it.
-
-    Raises:
-        ConfigError: malformed.
-    """
-    path = path or GLOSSARY_FILE
-    return Glossary(build(_GlossaryFile, read_yaml(path), path), actions_in_use())
+def load_glossary() -> Glossary:
+    """Read the glossary, and put the actions in use into it."""
+    return Glossary(build(_GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE), actions_in_use())

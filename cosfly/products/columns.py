@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,11 @@ LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum 
 def is_in_range(numbers: np.ndarray) -> bool:
     """Tell whether all numbers are finite and no larger than a length or a time can be."""
     return bool((np.abs(numbers) <= LARGEST).all())  # NaN is not
+
+
+def is_number(value: Any) -> bool:
+    """Tell whether a JSON value is a number no larger than a length or a time can be; true and false are none."""
+    return type(value) in (int, float) and abs(value) <= LARGEST
 
 
 def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:

@@ -20,7 +20,6 @@ from cosfly.products.inspection import FlightInspection, Inspection, count_traje
 from cosfly.reading.files import sha256_file
 
 REVIEW = "review.jsonl"
-BY_A_PERSON = "review"  # the code of what a person rejected
 Verdict = Literal["accepted", "rejected"]
 
 

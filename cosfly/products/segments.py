@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cosfly.errors import InputError
-from cosfly.products.columns import LARGEST
+from cosfly.products.columns import is_number
 
 FOLLOW = "follow"  # the style where nothing else is said
 MISSION_KINDS = ("geofence", "battery", "time_over")
@@ -91,7 +91,7 @@ def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
     if value is None:
         return None
     home = value.get("home") if isinstance(value, dict) else None
-    if not isinstance(home, dict) or not all(_is_number(home.get(axis)) for axis in "xyz"):
+    if not isinstance(home, dict) or not all(is_number(home.get(axis)) for axis in "xyz"):
         raise InputError("not a mission", where=f"{where}.home", got=repr(home)[:60], expected="numbers x, y, z")
     if value.get("kind") not in MISSION_KINDS:
         raise InputError(
@@ -99,10 +99,6 @@ def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
         )
     at, home_frame = (_frame(value, name, num_frames, where) for name in ("at_frame", "home_frame"))
     return Mission(value["kind"], at, home_frame, (float(home["x"]), float(home["y"]), float(home["z"])))
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= LARGEST
 
 
 def _frame(group: dict, name: str, num_frames: int, where: str) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
-from cosfly.products.columns import LARGEST, is_in_range
+from cosfly.products.columns import is_in_range, is_number
 from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
@@ -82,7 +82,7 @@ class FieldReader:
         value = group.get(name) if isinstance(group, dict) else None
         if value is None and name in ("pitch", "roll") and not self.strict:
             return 0.0
-        if value is None or not _is_number(value):
+        if value is None or not is_number(value):
             raise self.error("not a number", f"{where}.{name}", repr(value)[:60], "a finite number")
         return float(value)
 
@@ -170,13 +170,9 @@ def vector_of(value: Any, names: tuple[str, ...]) -> np.ndarray:
 
 def _parts_of(value: Any, names: tuple[str, ...]) -> list:
     parts = [value.get(n) for n in names] if isinstance(value, dict) else value
-    if isinstance(parts, list) and len(parts) == len(names) and all(map(_is_number, parts)):
+    if isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts)):
         return parts
     return [np.nan] * len(names)
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= LARGEST
 
 
 def vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:

@@ -48,14 +48,14 @@ class ArrayHeader(NamedTuple):
         return f"{self.dtype} {self.shape}"
 
 
-def array_header(path: Path, *, what: str = "array", tree: Path | None = None) -> ArrayHeader:
+def array_header(path: Path, *, tree: Path | None = None) -> ArrayHeader:
     """Read the header of a `.npy` file, and see that the numbers are all there.
 
     Raises:
         InputError: it cannot be read, or is no complete array.
     """
-    with open_file(path, what=what, tree=tree) as file:
-        return _header(file, path, what)
+    with open_file(path, what="array", tree=tree) as file:
+        return _header(file, path, "array")
 
 
 def parse_array_header(data: memoryview, where: str | Path, *, what: str = "array") -> ArrayHeader:
@@ -154,9 +154,9 @@ def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | N
         return png_size(file.read(PNG_HEADER_BYTES))
 
 
-def read_picture(path: Path, *, flags: int = cv2.IMREAD_COLOR, tree: Path | None = None) -> np.ndarray:
+def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:
     """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours; raises as `parse_picture`, and where it cannot be read."""
-    return parse_picture(read_bytes(path, what="image", tree=tree), path, flags=flags)
+    return parse_picture(read_bytes(path, what="image", tree=tree), path)
 
 
 def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:

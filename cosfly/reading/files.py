@@ -156,9 +156,9 @@ def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: P
             yield line
 
 
-def read_unpacked(path: Path, *, what: str = "file", fix: str = CHECK_PATH, limit: str = "file_mb") -> bytes:
+def read_unpacked(path: Path, *, what: str = "file", limit: str = "file_mb") -> bytes:
     """Read a whole file, and unpack it where it is gzipped; raises as `read_bytes`, and for damaged gzip data."""
-    data = read_bytes(path, what=what, fix=fix, limit=limit)
+    data = read_bytes(path, what=what, limit=limit)
     if not data.startswith(GZIP_MAGIC):
         return data
     by_factor = max(SMALL_UNPACKED_MB * MB, limits().unpack_factor * len(data))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -252,3 +252,9 @@ def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
         f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; {coding.sky:g} sky, {coding.invalid:g} invalid), "
         f"whose greatest error, measured over all pixels, is {coding.max_error_m:g} m"
     )
+
+
+def vectors(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:
+    """Give a column of structures as numbers, (n, members) float64; NaN where a row has none."""
+    nothing = dict.fromkeys(members, np.nan)
+    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)

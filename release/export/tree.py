@@ -31,7 +31,7 @@ from cosfly.runner import advance
 from cosfly.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, matrices_of
 from release.export.contract import ExportConfig, Facts, Files, Unit, Written
-from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
+from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, vectors
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 Row = dict[str, Any]
@@ -154,9 +154,9 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
             "a flight has pictures of one size, and every frame a pose and intrinsics", where=placed.name,
             got=f"{len(sizes)} sizes, {without} of {len(rows)} frames without a pose or intrinsics",
         )  # fmt: skip
-    intrinsics = matrices_of(_vectors(rows, "intrinsics", INTRINSICS))
-    poses = _vectors(rows, "pose", POSE)
-    offsets = _vectors(rows, "drone_offset", POSE)
+    intrinsics = matrices_of(vectors(rows, "intrinsics", INTRINSICS))
+    poses = vectors(rows, "pose", POSE)
+    offsets = vectors(rows, "drone_offset", POSE)
     has_mask_box = any(row["target_mask_bbox"] is not None for row in rows)
     is_original = rows[0]["track"] == "clean"
     return Flight(
@@ -168,18 +168,18 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
         time_s=placed.time_s,
         positions_m=poses[:, :3],
         rotations_deg=poses[:, 3:],
-        targets_m=_vectors(rows, "target", POINT),
+        targets_m=vectors(rows, "target", POINT),
         target_in_view=_flags(rows, "target_in_view"),
         target_visible=_flags(rows, "target_visible"),
         target_depth_m=_numbers(rows, "target_depth_m"),
-        target_uv=_vectors(rows, "target_uv", ("u_px", "v_px")),
-        target_bbox=_vectors(rows, "target_bbox", BOX),
-        target_mask_bbox=_vectors(rows, "target_mask_bbox", BOX) if has_mask_box else None,
+        target_uv=vectors(rows, "target_uv", ("u_px", "v_px")),
+        target_bbox=vectors(rows, "target_bbox", BOX),
+        target_mask_bbox=vectors(rows, "target_mask_bbox", BOX) if has_mask_box else None,
         visibility=_numbers(rows, "visibility"),
         is_perturbed=_flags(rows, "is_perturbed"),
         drone_offsets_m=offsets[:, :3],
         rotation_offsets_deg=offsets[:, 3:],
-        target_offsets_m=_vectors(rows, "target_offset", POINT),
+        target_offsets_m=vectors(rows, "target_offset", POINT),
         is_original=is_original,
         segments=_segments([row["style"] for row in rows]),
         source={
@@ -219,11 +219,6 @@ def _segments(styles: list[str]) -> tuple[Segment, ...]:
         parts.append(Segment(style, begin, end))
         begin = end
     return tuple(parts)
-
-
-def _vectors(rows: list[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
-    nothing = dict.fromkeys(members, np.nan)
-    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
 
 
 def _numbers(rows: list[Row], name: str) -> np.ndarray:

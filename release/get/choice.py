@@ -43,10 +43,6 @@ class Choice(Config):
         description="the content digest that the release must have, 12 characters of it or more",
     )
 
-    @property
-    def is_everything(self) -> bool:
-        return not (self.towns or self.splits or self.flights) and self.modalities is None
-
 
 def fetch_record(remote: Remote, expected: str | None) -> tuple[ReleaseRecord, bytes]:
     """Read `release.json` of a release that lies somewhere else, and see that it can be one.

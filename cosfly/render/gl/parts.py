@@ -96,8 +96,9 @@ class Boxes:
         """A further fixed number in [0, 1) per box."""
         return chance(self.seeds, number)
 
-    def pick(self, palette: np.ndarray, number: int = 0) -> np.ndarray:
-        return palette[(self.chance(number) * len(palette)).astype(int)]
+    def pick(self, palette: np.ndarray) -> np.ndarray:
+        """A colour of a palette, (k, 3), per box; gives (n, 3)."""
+        return palette[(self.chance(0) * len(palette)).astype(int)]
 
 
 @dataclass

@@ -18,6 +18,7 @@ from cosfly.geometry import wrap_deg
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_array
 from release.columns import BOX, CAPTION_FIELDS, POINT, POSE
+from release.export.source import vectors
 
 STATE, ACTION = "observation.state", "action"
 MOVE = ("forward_m", "left_m", "up_m", "yaw_deg")
@@ -108,9 +109,9 @@ def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
     What a frame does not have is NaN, or the empty text.
     """
-    pose = _vectors(rows, "pose", POSE)
+    pose = vectors(rows, "pose", POSE)
     found: dict[str, Any] = {STATE: pose.astype(np.float32), ACTION: moves(pose).astype(np.float32)}
-    found |= {name: _vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()}
+    found |= {name: vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()}
     for name in ("visibility", "target_depth_m"):
         found[name] = np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float32)
     found |= {name: np.array([bool(row[name]) for row in rows]) for name in FLAGS}
@@ -145,8 +146,3 @@ def tiff_of_depth(data: bytes, where: str) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(parse_array(data, where, dtype=np.float32, ndim=2, what="depth image")).save(buffer, "TIFF")
     return buffer.getvalue()
-
-
-def _vectors(rows: list[dict[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:
-    nothing = dict.fromkeys(members, np.nan)
-    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
