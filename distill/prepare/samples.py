@@ -93,20 +93,8 @@ def make_sample(
     Raises:
         InputError: the prompt cannot say which pictures the student gets.
     """
-    if caption.status != "accepted":
-        return f"dropped_{caption.drop_reason or 'unknown'}"
-    if caption.repair is not None and cfg.repaired == "exclude":
-        return "repaired"
-    if caption.repair is not None and caption.repair.rung not in (None, *cfg.rungs):
-        return f"repaired_by_{caption.repair.rung}"
-    if caption.verdict not in cfg.verdicts:
-        return f"verdict_{str(caption.verdict).lower()}"
-    states = (caption.checks.sentences or {}).get(language, [])
-    if "contradicted" in states and cfg.contradicted == "exclude":
-        return "contradicted"
-    proved = caption.coverage(language)
-    if (proved or 0.0) < cfg.min_proved:
-        return "too_little_proved"
+    if reason := _reason_to_leave_out(caption, language, cfg):
+        return reason
     coc = caption.en if language == "en" else caption.zh
     if coc is None or language not in caption.prompt:
         return f"no_{language}"
@@ -142,9 +130,26 @@ def make_sample(
         label=None if is_noisy else caption.label,
         contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
         repair=None if caption.repair is None else caption.repair.strategy,
-        proved=proved,
-        weight=_weight(caption, proved, cfg),
+        proved=caption.coverage(language),
+        weight=_weight(caption, caption.coverage(language), cfg),
     )
+
+
+def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfig) -> str | None:
+    """Give the word for why the settings leave a caption out, by its record alone; None: they take it."""
+    if caption.status != "accepted":
+        return f"dropped_{caption.drop_reason or 'unknown'}"
+    if caption.repair is not None and cfg.repaired == "exclude":
+        return "repaired"
+    if caption.repair is not None and caption.repair.rung not in (None, *cfg.rungs):
+        return f"repaired_by_{caption.repair.rung}"
+    if caption.verdict not in cfg.verdicts:
+        return f"verdict_{str(caption.verdict).lower()}"
+    if cfg.contradicted == "exclude" and "contradicted" in (caption.checks.sentences or {}).get(language, []):
+        return "contradicted"
+    if (caption.coverage(language) or 0.0) < cfg.min_proved:
+        return "too_little_proved"
+    return None
 
 
 def _weight(caption: Caption, proved: float | None, cfg: PrepareConfig) -> float:

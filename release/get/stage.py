@@ -15,7 +15,7 @@ import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -53,6 +53,7 @@ from release.record import (
     SplitNumbers,
     content_digest,
 )
+from release.verify.findings import Verified
 from release.verify.verify import verify
 
 log = logging.getLogger(__name__)
@@ -265,27 +266,22 @@ def run(
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)  # a kill came before they were gone
         return dataset
-    modalities = [name for name in record.settings.modalities if choice.modalities is None or name in choice.modalities]
-    plan = _Plan(
-        address=address, shown=remote.shown, columns=schema(record.settings.modalities).names, modalities=modalities,
-        flights={flight.flight: flight.frames for flight in flights},
-    )  # fmt: skip
+    plan = _plan_of(record, choice, flights, address, remote.shown)
     splits = {flight.split for flight in flights}
     shards = [shard for shard in record.shards if shard.split in splits]
     items = [Item(shard.path, shard, shard.rows) for shard in shards]
-    in_process = address.startswith("memory:")  # of this process alone
-    finished = run_items(
-        stage, items, make_worker, (plan, parts), workers=0 if in_process else workers, watch=watch, label="get"
-    )
+    if address.startswith("memory:"):  # of this process alone
+        workers = 0
+    finished = run_items(stage, items, make_worker, (plan, parts), workers=workers, watch=watch, label="get")
     if finished.tally.failed:
         raise InputError(
             "parts of the release could not be fetched", where=out / "failures.jsonl", got=str(finished.tally),
             fix="mend what that file names and run the same command again: only those are fetched again",
         )  # fmt: skip
-    got = {kept.id: result_of(kept, _Got) for kept in finished.kept}
-    taken = [(shard, got[shard.path]) for shard in shards if shard.path in got]
-    _check_all_there(flights, taken)
-    done = _finished(taken, parts)
+    taken = _taken(shards, {kept.id: result_of(kept, _Got) for kept in finished.kept}, flights)
+    done = [
+        Finished(shard.split, parts / Path(shard.path).name, one.rows, one.bytes, one.sha256) for shard, one in taken
+    ]
     check_parts(done, out)
     is_whole = len(taken) == len(record.shards) and all(shard.sha256 == one.sha256 for shard, one in taken)
     with atomic_folder(dataset) as folder:
@@ -293,17 +289,11 @@ def run(
         if is_whole:
             _copy_records(remote, folder, data)
         else:
-            part = PartOf(
-                name=record.name, content_digest=record.content_digest, source=published_address(remote.shown),
-                choice=choice.model_dump(mode="json", exclude={"expected"}),
-            )  # fmt: skip
-            write_records(folder, part_record(record, part, flights, modalities, named, taken, folder))
-        report = verify(folder, level="rows", workers=0 if in_process else workers)
+            part = _part_of(record, choice, published_address(remote.shown))
+            write_records(folder, part_record(record, part, flights, plan.modalities, named, taken, folder))
+        report = verify(folder, level="rows", workers=workers)
         if not report.is_ok and findings == "refuse":
-            raise VerifyError(
-                "what was fetched does not verify, so it is not kept", where=remote.shown, got=str(report),
-                fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept (nothing is fetched again)",
-            )  # fmt: skip
+            raise _not_kept(report, remote.shown)
     outputs = [dataset / name for name in ("README.md", RECORD, CHECKSUMS)]
     if not report.is_ok:
         log.warning("%s is kept, and does not verify: %s", dataset, report)
@@ -314,21 +304,42 @@ def run(
     return dataset
 
 
-def _check_all_there(flights: list[ReleasedFlight], taken: Sequence[tuple[Shard, _Got]]) -> None:
+def _plan_of(record: ReleaseRecord, choice: Choice, flights: list[ReleasedFlight], address: str, shown: str) -> _Plan:
+    there = record.settings.modalities
+    return _Plan(
+        address=address,
+        shown=shown,
+        columns=schema(there).names,
+        modalities=[name for name in there if choice.modalities is None or name in choice.modalities],
+        flights={flight.flight: flight.frames for flight in flights},
+    )
+
+
+def _taken(shards: Sequence[Shard], got: Mapping[str, _Got], flights: list[ReleasedFlight]) -> list[tuple[Shard, _Got]]:
+    """Put shards beside what is here of them, and see that all flights are."""
+    taken = [(shard, got[shard.path]) for shard in shards if shard.path in got]
     found = {name for _, one in taken for name in one.flights}
     if missing := [flight.flight for flight in flights if flight.flight not in found]:
         raise InputError("flights of the record that no shard holds", got=", ".join(missing[:10]))
+    return taken
 
 
-def _finished(taken: Sequence[tuple[Shard, _Got]], parts: Path) -> list[Finished]:
-    return [
-        Finished(shard.split, parts / Path(shard.path).name, got.rows, got.bytes, got.sha256) for shard, got in taken
-    ]
+def _not_kept(report: Verified, where: str) -> VerifyError:
+    return VerifyError(
+        "what was fetched does not verify, so it is not kept", where=where, got=str(report),
+        fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept (nothing is fetched again)",
+    )  # fmt: skip
 
 
 def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:
     for name in ONE_FILE_EACH:
         write_bytes(folder / name, record if name == RECORD else remote.read(name, 0, remote.size(name)))
+
+
+def _part_of(record: ReleaseRecord, choice: Choice, source: str) -> PartOf:
+    """Say of which release something is a part. The digest that was asked for is of that release, and no part of the choice."""
+    chosen = choice.model_dump(mode="json", exclude={"expected"})
+    return PartOf(name=record.name, content_digest=record.content_digest, source=source, choice=chosen)
 
 
 def part_record(
