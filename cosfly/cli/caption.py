@@ -13,55 +13,62 @@ from cosfly.cli import options
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
     from cosfly.products.captions import Writing
+    from cosfly.settings import RunConfig
 
 app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
+
+
+Teacher = Annotated[
+    str | None,
+    typer.Option(
+        help="rules, the URL of an OpenAI-compatible endpoint, vllm:MODEL_DIR, file:PATH or "
+        "student:PATH (what `distill infer` wrote). [default: rules]"
+    ),
+]
+AsStudent = Annotated[
+    Path | None,
+    typer.Option(
+        help="What `distill train` or `distill merge` wrote: the teacher is that student behind a server, and is asked as it was taught."
+    ),
+]
+Model = Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")]
+JudgeUrl = Annotated[str | None, typer.Option(help="URL of an endpoint that judges conflicts.")]
+Keyframes = Annotated[
+    bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
+]
+CaptionOut = Annotated[Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")]
+Limit = Annotated[int | None, typer.Option(help="Caption at most this many windows; a later run goes on.")]
+MaxCost = Annotated[float | None, typer.Option(help="Stop before this cost is passed; prices: caption.budget.price_*.")]
+MaxTokens = Annotated[int | None, typer.Option(help="Stop before this many tokens are passed, all runs.")]
+PlanOnly = Annotated[
+    bool, typer.Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
+]
+RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Ask only about the windows in quarantine.jsonl.")]
+Check = Annotated[bool, typer.Option(help="Before the first request of a folder, try what the endpoint can do.")]
 
 
 @app.callback()
 def caption(
     context: typer.Context,
-    teacher: Annotated[
-        str | None,
-        typer.Option(
-            help="rules, the URL of an OpenAI-compatible endpoint, vllm:MODEL_DIR, file:PATH or "
-            "student:PATH (what `distill infer` wrote). [default: rules]"
-        ),
-    ] = None,
-    as_student: Annotated[
-        Path | None,
-        typer.Option(
-            help="What `distill train` or `distill merge` wrote: the teacher is that student behind a server, and is asked as it was taught."
-        ),
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
-    judge: Annotated[str | None, typer.Option(help="URL of an endpoint that judges conflicts.")] = None,
-    keyframes: Annotated[
-        bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
-    ] = None,
+    teacher: Teacher = None,
+    as_student: AsStudent = None,
+    model: Model = None,
+    judge: JudgeUrl = None,
+    keyframes: Keyframes = None,
     data: options.Data = None,
     flights: options.Flights = None,
     tracks: options.Tracks = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")
-    ] = None,
+    out: CaptionOut = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
     workers: options.Workers = None,
-    limit: Annotated[int | None, typer.Option(help="Caption at most this many windows; a later run goes on.")] = None,
-    max_cost: Annotated[
-        float | None, typer.Option(help="Stop before this cost is passed; prices: caption.budget.price_*.")
-    ] = None,
-    max_tokens: Annotated[int | None, typer.Option(help="Stop before this many tokens are passed, all runs.")] = None,
-    plan_only: Annotated[
-        bool, typer.Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
-    ] = False,
-    retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Ask only about the windows in quarantine.jsonl.")
-    ] = False,
-    check: Annotated[
-        bool, typer.Option(help="Before the first request of a folder, try what the endpoint can do.")
-    ] = True,
+    limit: Limit = None,
+    max_cost: MaxCost = None,
+    max_tokens: MaxTokens = None,
+    plan_only: PlanOnly = False,
+    retry_failed: RetryFailed = False,
+    check: Check = True,
     verify: options.Verify = False,
     resume: options.Resume = "if-same",
     repair: options.Repair = False,
@@ -71,40 +78,45 @@ def caption(
         return
     from caption.run import stage
 
-    chosen: dict[str, Any] = {"caption.teacher": teacher, "caption.endpoint.model": model}
-    chosen |= {
+    chosen: dict[str, Any] = {
+        "caption.teacher": teacher,
+        "caption.endpoint.model": model,
         "caption.student.folder": as_student,
         "caption.judge.url": judge,
         "caption.window.keyframes": keyframes,
         "caption.limit": limit,
-    }
-    chosen |= {"caption.budget.max_cost": max_cost, "caption.budget.max_tokens": max_tokens}
-    chosen |= {"seed": seed, "workers": workers} | options.chosen_flights("caption.flights", flights, tracks)
+        "caption.budget.max_cost": max_cost,
+        "caption.budget.max_tokens": max_tokens,
+        "seed": seed,
+        "workers": workers,
+    } | options.chosen_flights("caption.flights", flights, tracks)
     cfg = options.resolve(config, overrides, chosen)
     tree = options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
     options.set_aside(target, repair)
     options.verify_first(verify, tree, target)
-    is_teacher = (
-        cfg.caption.teacher_kind == "endpoint" and cfg.caption.student.folder is None
-    )  # a student knows one question
-    if check and is_teacher and not (target / "answers").exists():
+    is_student = cfg.caption.student.folder is not None  # it knows one question, and no other is tried
+    if check and cfg.caption.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.caption.teacher, cfg.caption, [cfg.caption.writing])
     if plan_only:
-        from caption.run.forecast import make_forecast
-        from cosfly.console import console
-
-        forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume)
-        console.print(options.plain_table("What this run will take", forecast.rows()))
+        _show_forecast(cfg, tree, target, resume)
         return
     given = options.manner(cfg, resume) | {"seed": cfg.seed, "retry_failed": retry_failed}
     options.tell_product(stage.run(cfg.caption, tree, target, **given), target, cfg)
 
 
+def _show_forecast(cfg: RunConfig, tree: Path, target: Path, resume: options.Resume) -> None:
+    from caption.run.forecast import make_forecast
+    from cosfly.console import console
+
+    forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume)
+    console.print(options.plain_table("What this run will take", forecast.rows()))
+
+
 @app.command("doctor")
 def caption_doctor(
     url: Annotated[str, typer.Argument(help="URL of an OpenAI-compatible endpoint.")],
-    model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
+    model: Model = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
 ) -> None:
@@ -177,7 +189,7 @@ def caption_actions(
 @app.command("judge-check")
 def caption_judge_check(
     url: Annotated[str, typer.Argument(help="OpenAI-compatible endpoint of the judge.")],
-    model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
+    model: Model = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
 ) -> None:
@@ -200,7 +212,7 @@ def caption_compare_strategies(
     flights: options.Flights = None,
     tracks: options.Tracks = None,
     teacher: Annotated[str | None, typer.Option(help="rules, or the URL of an endpoint. [default: rules]")] = None,
-    model: Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")] = None,
+    model: Model = None,
     conflicts: Annotated[int, typer.Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
