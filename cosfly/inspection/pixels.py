@@ -135,6 +135,17 @@ def _differs(colours, instance, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _pack(row, tones, codes, shades):  # type: ignore[no-untyped-def]
+    """Write each pixel of a row as one number, kind lowest and red lowest.
+
+    Its places are unsigned, here and in `_look`: of others numba looks whether they count from the end.
+    """
+    for x in range(np.uint64(len(row))):
+        codes[x] = np.int32(row[x, 0]) | np.int32(row[x, 1]) << 8 | np.int32(row[x, 2]) << 16
+        shades[x] = np.uint32(tones[x, 0]) | np.uint32(tones[x, 1]) << 8 | np.uint32(tones[x, 2]) << 16
+
+
+@njit(cache=True, nogil=True)
 def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
     """Of each id: pairs of neighbours in a row, those of one colour, sum of their green, its kind. Counts: magenta, fighting. Box of people."""
     height, width = instance.shape[:2]
@@ -144,14 +155,10 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
     # Of the run of a column that goes on, and of the two before it: id and first row.
     ids, firsts = np.full((3, width), -1, np.int32), np.zeros((3, width), np.int32)
-    # Each pixel of a row as one number, kind lowest and red lowest. Unsigned places: of others numba looks whether they count from the end.
     codes, shades = np.full(width + 1, -1, np.int32), np.empty(width, np.uint32)
     one, size, byte = np.uint64(1), np.uint64(width), np.uint32(255)
     for y in range(height):
-        row, tones = instance[y], colours[y]
-        for x in range(size):
-            codes[x] = np.int32(row[x, 0]) | np.int32(row[x, 1]) << 8 | np.int32(row[x, 2]) << 16
-            shades[x] = np.uint32(tones[x, 0]) | np.uint32(tones[x, 1]) << 8 | np.uint32(tones[x, 2]) << 16
+        _pack(instance[y], colours[y], codes, shades)
         first = np.uint64(0)
         id1, id2, id3 = np.int64(-1), np.int64(-1), np.int64(-1)  # of the three runs before this one
         first1, first2 = np.int64(0), np.int64(0)

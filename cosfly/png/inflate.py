@@ -258,12 +258,7 @@ def _symbols(source, words, lanes, flow, first, num, tables, symbols, limits, ru
                 hold, held = hold >> length, held - length
                 if entry >= 0 and s < END:
                     out_words[at] = np.uint64(s)
-                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = (
-                        position,
-                        hold,
-                        held,
-                        at + ONE,
-                    )
+                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = position, hold, held, at + ONE  # fmt: skip
                     continue
                 if s > END and s < MOST_LITERALS:
                     n, hold, length = _more(hold, BASE_LENGTH[s - 257], MORE_LENGTH[s - 257])
@@ -279,12 +274,7 @@ def _symbols(source, words, lanes, flow, first, num, tables, symbols, limits, ru
                     if back > np.int64(at) - lanes[lane, FIRST]:
                         return False
                     _repeat(out_words, np.int64(at), back, n)
-                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = (
-                        position,
-                        hold,
-                        held,
-                        at + np.uint64(n),
-                    )
+                    flow[lane, POSITION], flow[lane, HOLD], flow[lane, HELD], flow[lane, AT] = position, hold, held, at + np.uint64(n)  # fmt: skip
                     continue
             if not _symbol(source, words, lanes, flow, lane, tables, symbols, limits, out):
                 return False
