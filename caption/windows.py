@@ -22,7 +22,8 @@ from caption.schema import (
 )
 from caption.truth.actions import label_of, measure
 from cosfly.products.captions import KeyframeRecord
-from cosfly.products.playback import Flight, sample_id
+from cosfly.products.places import sample_id
+from cosfly.products.playback import Flight
 from cosfly.products.segments import Mission
 
 DEFAULT_LABEL = LabelConfig()

@@ -18,7 +18,8 @@ import pyarrow as pa
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS, Language, SentenceState
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, Look
-from cosfly.products.playback import EVENTS, Flight, sample_id
+from cosfly.products.places import sample_id
+from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.weather import WeatherParams
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")

@@ -60,13 +60,14 @@ from cosfly.products import review
 from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
+from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection
 from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import write_meshes
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
-from cosfly.products.playback import find_flights, read_flight, read_twin
+from cosfly.products.playback import read_flight
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
 from cosfly.products.town import read_town_map, write_town_map

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
-from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.flights import find_flights
+from cosfly.products.places import sample_id
+from cosfly.products.playback import read_flight
 from cosfly.provenance import fingerprint
 from cosfly.splits import Split
 from cosfly.store import write_json

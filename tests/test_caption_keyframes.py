@@ -12,7 +12,8 @@ from caption.schema import CaptionConfig
 from caption.truth.actions import label_of, measure
 from caption.windows import choose_keyframes, cut_windows, missed_changes
 from cosfly.products.captions import read_captions
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
 from specimens import make_playback_tree
 
 LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)

@@ -11,7 +11,8 @@ from caption.teachers.prompts import make_question
 from caption.truth.actions import label_of, measure
 from caption.windows import cut_windows
 from cosfly.products.captions import read_captions
-from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Mission
 from specimens import make_playback_tree
 

@@ -15,7 +15,8 @@ from caption.truth.actions import label_of, measure
 from caption.windows import cut_windows
 from cosfly.errors import InputError, NothingKept, ResumeError
 from cosfly.products.captions import read_captions
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
 from specimens import make_playback_tree
 
 

@@ -32,7 +32,8 @@ from caption.windows import current_frames, cut_future, cut_windows
 from cosfly.products.actions import action_tokens
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.captions import answer_schema, read_captions
-from cosfly.products.playback import Flight, find_flights, read_flight, read_twin, write_flight
+from cosfly.products.flights import find_flights, read_twin
+from cosfly.products.playback import Flight, read_flight, write_flight
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
 

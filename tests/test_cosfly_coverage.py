@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from cosfly.coverage_page import coverage_html, ranges, shares
 from cosfly.products.actions import action_tokens
 from cosfly.products.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
 from specimens import make_playback_tree
 
 

@@ -13,8 +13,8 @@ from cosfly.cli import app
 from cosfly.depth_study.picture import PROFILE_STEPS, steady_stretch
 from cosfly.depth_study.study import BITS, ENTROPY_BINS, Study, edge_correlation, entropy_bits, quantised, run
 from cosfly.errors import InputError
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name
-from cosfly.products.playback import find_flights
 from cosfly.reading.documents import read_json
 from specimens import make_playback_tree
 

@@ -17,9 +17,10 @@ from cosfly.cli import app
 from cosfly.config import build
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import read_captions
+from cosfly.products.flights import find_flights, read_twin, track_of
 from cosfly.products.inspection import read_inspection
 from cosfly.products.places import FlightChoice, place_of
-from cosfly.products.playback import find_flights, read_flight, read_twin, track_of
+from cosfly.products.playback import read_flight
 from cosfly.provenance import fingerprint
 from cosfly.settings import RunConfig
 from distill.prepare import stage as prepare

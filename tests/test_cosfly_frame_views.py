@@ -20,8 +20,9 @@ from caption.windows import cut_windows
 from cosfly.errors import InputError
 from cosfly.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
 from cosfly.products.captions import PICTURES_MARK, Language
+from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from distill.inference.asking import make_request
 from distill.inference.stage import InferConfig
 from distill.prepare.samples import PrepareConfig, make_sample

@@ -29,10 +29,11 @@ from cosfly.inspection.stage import run
 from cosfly.issues import Issue, Report
 from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, read_meta, tree_position
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file

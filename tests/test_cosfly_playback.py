@@ -10,8 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.playback import find_flights, read_flight, sample_id, write_flight
+from cosfly.products.places import sample_id
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from specimens import PERSON_ID, make_playback_tree
 

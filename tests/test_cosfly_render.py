@@ -21,8 +21,8 @@ from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKe
 from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matrices, world_from_camera
 from cosfly.journal import Journal
 from cosfly.kernels import obstacle_index, signed_distances
-from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, make_box_map
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import Company, Other, write_others
@@ -573,7 +573,7 @@ def files_of(tree: Path) -> dict[str, str]:
 @needs_gl
 def test_the_tree_is_complete_and_readable(finished):
     tree, _ = finished
-    folders = playback.find_flights(tree)
+    folders = find_flights(tree)
     names = [str(f.relative_to(tree)) for f in folders]
     assert names == [f"Town_Street/trajectory_{1776000000 + k}/{v}" for k in (0, 2) for v in ("ORI", "aug_001")]
     for folder in folders:
@@ -605,7 +605,7 @@ def test_other_runs_have_other_ids_and_a_tree_that_was_begun_keeps_its_own(finis
 
     def rendered(name: str, seed: int, **settings) -> list[str]:
         tree = run(build(RenderConfig, few | settings, "test"), *inputs, tmp_path / name, seed=seed)
-        return [folder.relative_to(tree).parts[1] for folder in playback.find_flights(tree)]
+        return [folder.relative_to(tree).parts[1] for folder in find_flights(tree)]
 
     first = rendered("a", 5)
     assert rendered("b", 5) == first
@@ -626,7 +626,7 @@ def test_other_runs_have_other_ids_and_a_tree_that_was_begun_keeps_its_own(finis
 @needs_gl
 def test_frames_hold_what_their_annotation_says(finished):
     tree, _ = finished
-    for folder in playback.find_flights(tree):
+    for folder in find_flights(tree):
         flight = read_flight(folder)
         for i in range(len(flight)):
             frame = flight.frame_folder(i)

@@ -19,8 +19,9 @@ from cosfly.inspection import review
 from cosfly.inspection.report import cards, report_html
 from cosfly.inspection.stage import run
 from cosfly.inspection.view import PLOTS, draw_plan
+from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled, undecided
 from cosfly.products.traces import write_traces
 from cosfly.reading.files import sha256_file

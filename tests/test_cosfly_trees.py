@@ -26,10 +26,11 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import read_captions
+from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import read_meta
 from cosfly.products.inspection import read_inspection
 from cosfly.products.places import Place, flight_ids, stand, town_folder
-from cosfly.products.playback import find_flights, read_flight, read_twin, write_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees

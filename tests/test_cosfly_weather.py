@@ -18,9 +18,10 @@ from cosfly.errors import ConfigError, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, rotation_matrices
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.coverage import Coverage, coverage_of
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson

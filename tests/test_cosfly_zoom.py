@@ -20,9 +20,10 @@ from cosfly.inspection.flight import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import run as make_map
 from cosfly.products.boxes import MapHeader, check_ground, write_boxes
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import level_name, read_meta
 from cosfly.products.inspection import read_inspection
-from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Segment
 from cosfly.products.traces import DroneTrace
 from cosfly.render import weather_gallery

@@ -10,9 +10,10 @@ from test_release_package import CFG, build, make_caption, make_inspection
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name, read_rgb
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from distill.windows import FACTS, Windows
 from specimens import make_playback_tree
 

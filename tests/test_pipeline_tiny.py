@@ -23,8 +23,9 @@ from cosfly.estimate import estimate, other_settings, rates_near, time_left
 from cosfly.folder_lock import hold_folder
 from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.products.walks import read_paths as read_walks
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file

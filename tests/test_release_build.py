@@ -29,9 +29,10 @@ from caption.schema import CaptionConfig
 from cosfly.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.products import review
 from cosfly.products.captions import read_captions, write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import Flight, find_flights, read_flight, write_flight
+from cosfly.products.playback import Flight, read_flight, write_flight
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from release.package.config import ReleaseConfig

@@ -28,9 +28,11 @@ from cosfly.cli import app
 from cosfly.config import build as build_config
 from cosfly.errors import InputError, ResumeError
 from cosfly.products.captions import write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.places import sample_id
+from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file

@@ -29,8 +29,9 @@ from cosfly.cli import app
 from cosfly.config import build as build_config
 from cosfly.errors import CosflyError, InputError, ResumeError, VerifyError
 from cosfly.products.captions import write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
 from release.columns import PICTURES
 from release.export.contract import ExportConfig

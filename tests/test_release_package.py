@@ -23,6 +23,7 @@ from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.issues import Issue
 from cosfly.products.boxes import MapHeader
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, read_captions, write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
     RESULTS,
@@ -33,7 +34,8 @@ from cosfly.products.inspection import (
     TrajectoryFunnel,
     write_inspection,
 )
-from cosfly.products.playback import find_flights, read_flight, sample_id
+from cosfly.products.places import sample_id
+from cosfly.products.playback import read_flight
 from cosfly.products.review import Choice, add_decisions
 from cosfly.products.town import write_town_map
 from cosfly.reading.documents import read_json

@@ -23,8 +23,8 @@ from cosfly import pipeline
 from cosfly.cli import app
 from cosfly.config import load
 from cosfly.errors import InputError
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
-from cosfly.products.playback import find_flights
 from cosfly.reading.documents import read_json
 from cosfly.settings import RunConfig
 from release.columns import POSE

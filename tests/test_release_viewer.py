@@ -25,8 +25,9 @@ from cosfly.errors import InputError
 from cosfly.frame_views import read_view
 from cosfly.products.boxes import make_box_map, write_boxes
 from cosfly.products.captions import write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.reading.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record

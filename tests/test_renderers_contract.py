@@ -26,6 +26,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
 from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
@@ -449,7 +450,7 @@ def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_nam
     found = sorted(str(path.relative_to(tree)) for path in (tree / "Town_Street").rglob("*"))
     assert found == sorted(str(path.relative_to(reference)) for path in (reference / "Town_Street").rglob("*"))
     visibilities = []
-    for folder in playback.find_flights(tree):
+    for folder in find_flights(tree):
         flight = playback.read_flight(folder)
         for i in range(len(flight)):
             there = reference / folder.relative_to(tree) / playback.frame_name(i)
@@ -587,7 +588,7 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
     inputs, others = write_inputs(tmp_path / "in", [trace]), with_others(tmp_path / "in", 6, trace)
     cfg = build(RenderConfig, {**FEW, "backend": renderer_name}, "test")
     tree = run(cfg, *inputs, tmp_path / "tree", seed=5, others=others)
-    for folder in playback.find_flights(tree):
+    for folder in find_flights(tree):
         flight = playback.read_flight(folder)
         for i in range(len(flight)):
             meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]

@@ -27,7 +27,7 @@ from cosfly.chat.contract import NoAnswer, Troubles, Usage
 from cosfly.console import SECONDS_BETWEEN_LINES
 from cosfly.errors import CosflyError, InputError, TeacherError
 from cosfly.products.captions import Caption, write_captions
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,9 @@ from caption.schema import CaptionConfig, Window, WindowConfig
 from caption.windows import current_frames, cut_windows
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import caption_lines, write_caption_lines
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice, flight_ids, place_of
-from cosfly.products.playback import Flight, find_flights, flight_of, read_flight, read_twin
+from cosfly.products.flights import find_flights, read_twin
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice, flight_ids, flight_of, place_of
+from cosfly.products.playback import Flight, read_flight
 
 log = logging.getLogger(__name__)
 

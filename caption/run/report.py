@@ -12,7 +12,7 @@ from cosfly.frame_views import thumbnail
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.products.sentences import sentences_of
 from cosfly.reading.files import read_text
 from cosfly.store import write_bytes

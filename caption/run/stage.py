@@ -27,7 +27,7 @@ from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.reading.files import read_lines
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest

@@ -37,7 +37,7 @@ from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
 from cosfly.products.captions import TeacherRecord, TeacherSettings, answer_schema
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 
 ENCODING_THREADS = 4
 NUM_TRIALS = 2

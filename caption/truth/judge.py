@@ -25,7 +25,7 @@ from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.chat.objects import find_object
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.store import dump_json
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)

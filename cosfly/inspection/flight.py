@@ -30,9 +30,10 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView, draw_flight
 from cosfly.issues import Report
 from cosfly.products.coverage import Coverage, coverage_of
+from cosfly.products.flights import read_twin
 from cosfly.products.inspection import FlightInspection
 from cosfly.products.inspection import Result as FlightResult
-from cosfly.products.playback import STATES, Flight, read_flight, read_twin
+from cosfly.products.playback import STATES, Flight, read_flight
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.provenance import digest_of, folder_digests

@@ -18,6 +18,7 @@ from cosfly.inspection.view import FlightView
 from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import FRAMES_DIR
 from cosfly.products.inspection import (
     FlightFunnel,
@@ -28,7 +29,7 @@ from cosfly.products.inspection import (
     count_trajectories,
     write_inspection,
 )
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.provenance import recorded_digests

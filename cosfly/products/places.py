@@ -133,3 +133,13 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
             )
         ids |= {place: f"{front(place)}{name}_{place.variant}" for place in group}
     return ids
+
+
+def sample_id(flight_id: str, frame_index: int) -> str:
+    """`trajectory_1776047127_ORI_frame_00004`."""
+    return f"{flight_id}_frame_{frame_index:05d}"
+
+
+def flight_of(sample_id: str) -> str:
+    """Give the flight id of a sample id."""
+    return sample_id.rpartition("_frame_")[0]

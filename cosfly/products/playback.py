@@ -12,9 +12,6 @@ project sees the right-handed frame. Keys that we do not know are kept in `Fligh
 from __future__ import annotations
 
 import copy
-import os
-import re
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from cosfly.errors import InputError, VerifyError
+from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
-from cosfly.products.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track, place_of, tree_of_flight
+from cosfly.products.places import place_of, tree_of_flight
 from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
     BBOX,
@@ -42,7 +39,6 @@ from cosfly.products.trajectory import (
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import read_json
-from cosfly.reading.files import files_named
 from cosfly.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
@@ -55,7 +51,6 @@ WEATHER_KEYS = {
     "weather": ("weather_name", "weather", "preset", "name"),
     "time_of_day": ("tod_name", "time_of_day", "tod"),
 }
-TWIN_TOLERANCE_S = 1e-3
 # Whither a person walks: the way from so many frames before to so many after; who goes less than so far stands.
 HEADING_FRAMES, STANDS_M = 2, 0.1
 
@@ -219,69 +214,6 @@ def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
     return False
 
 
-def sample_id(flight_id: str, frame_index: int) -> str:
-    """`trajectory_1776047127_ORI_frame_00004`."""
-    return f"{flight_id}_frame_{frame_index:05d}"
-
-
-def flight_of(sample_id: str) -> str:
-    """Give the flight id of a sample id."""
-    return sample_id.rpartition("_frame_")[0]
-
-
-def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
-    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen.
-
-    Raises:
-        InputError: the folder is missing or holds no flight, or none is chosen.
-    """
-    if not root.is_dir():
-        raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check --data")
-    folders = [path.parent for path in files_named(root, "trajectory.json")]
-    if not folders:
-        raise InputError(
-            "not a playback tree",
-            where=root,
-            got="no trajectory.json below it",
-            expected="Town*/trajectory_*/ORI/trajectory.json",
-            fix="check --data",
-        )
-    return chosen_flights(folders, root, choice)
-
-
-def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
-    """Give the flights of a tree that are chosen.
-
-    Raises:
-        InputError: none is.
-    """
-    chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
-    if folders and not chosen:
-        raise InputError(
-            "no flight of the tree has such a name", where=root, got=", ".join(choice.match),
-            expected=f"a pattern for {folders[0].relative_to(root).as_posix()} and its like", fix="check --flights",
-        )  # fmt: skip
-    if len(choice.tracks) < len(TRACKS):
-        chosen = [folder for folder in chosen if track_of(folder) in choice.tracks]
-        if not chosen:
-            raise InputError(
-                "no flight of the tree is of this track", where=root, got=", ".join(choice.tracks), fix="check --tracks"
-            )
-    return chosen
-
-
-def track_of(folder: Path) -> Track:
-    """Tell a flight's track: by its folder's name, and where that is another, by what its file says; one that cannot be read is perturbed."""
-    if folder.name == ORIGINAL:
-        return "clean"
-    if re.fullmatch(r"aug_\d+", folder.name):
-        return "perturbed"
-    try:
-        return "clean" if read_flight(folder, strict=False).is_original else "perturbed"
-    except InputError:
-        return "perturbed"
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -343,37 +275,6 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         segments=segments,
         mission=mirrored(mission),
     )
-
-
-def read_twin(flight: Flight) -> Flight | None:
-    """Read the clean flight beside a perturbed one, the same walk frame by frame; None for a clean flight or without one.
-
-    Raises:
-        InputError: what stands there cannot be read.
-        VerifyError: it is not the same frames.
-    """
-    if flight.is_original or flight.folder is None:
-        return None
-    own = Path(os.path.abspath(flight.folder))
-    named = own.parent / ORIGINAL
-    has_named = named != own and (named / "trajectory.json").exists()
-    for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):
-        twin = read_flight(folder, strict=False) if folder != own else flight
-        if twin.is_original:
-            break
-        if has_named:
-            raise _no_twin(flight, twin)
-    else:
-        return None
-    if len(twin) != len(flight) or np.abs(twin.time_s - flight.time_s).max() >= TWIN_TOLERANCE_S:
-        raise _no_twin(flight, twin)
-    return twin
-
-
-def _no_twin(flight: Flight, other: Flight) -> VerifyError:
-    got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (other, flight))
-    got = f"{got}, is_original {other.is_original}"
-    return VerifyError("not the clean twin of the flight beside it", where=other.folder, got=got, expected=expected)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from cosfly.config import Config
 from cosfly.errors import InputError
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import FRAMES_DIR, XYZ, read_meta
 from cosfly.products.places import place_of, town_folder
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.reading.files import check_stays_below, sha256_file
 from cosfly.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.stage_folder import Resume, StageFolder

@@ -18,7 +18,7 @@ from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.console import Advance
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.stage_folder import Failed
 from cosfly.store import dump_json, sha256_bytes
 from distill.inference.outcome import Answered, OpenFlights

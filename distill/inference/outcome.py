@@ -12,7 +12,7 @@ from typing import IO
 from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.chat.contract import CONTEXT_FULL
 from cosfly.products.captions import parse_answer
-from cosfly.products.playback import flight_of
+from cosfly.products.places import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.stage_folder import Failed, Tally, write_failures
 from cosfly.store import atomic_file, dump_json

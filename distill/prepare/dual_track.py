@@ -17,8 +17,9 @@ from pydantic import Field
 from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import step_s
-from cosfly.products.places import Place, flight_ids, folder_name, place_of
-from cosfly.products.playback import ORIGINAL, Flight, find_flights, read_flight, read_twin, sample_id
+from cosfly.products.flights import find_flights, read_twin
+from cosfly.products.places import Place, flight_ids, folder_name, place_of, sample_id
+from cosfly.products.playback import ORIGINAL, Flight, read_flight
 from cosfly.provenance import fingerprint
 from cosfly.splits import SPLITS, Course, Split, assign_splits, town_family, walks_of
 from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, write_failures

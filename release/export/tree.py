@@ -116,7 +116,8 @@ def finish(
         },
         coordinates=COORDINATES,
         notes=list(_notes(units, written)),
-        how_to_open="from cosfly.products.playback import find_flights, read_flight\n"
+        how_to_open="from cosfly.products.flights import find_flights\n"
+        "from cosfly.products.playback import read_flight\n"
         "flights = [read_flight(folder, strict=False) for folder in find_flights(Path('.'))]",
         files=files,
     )

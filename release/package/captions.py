@@ -10,8 +10,7 @@ from pathlib import Path
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens, not_in_set
 from cosfly.products.captions import FIELDS, Caption, caption_lines
-from cosfly.products.places import town_folder
-from cosfly.products.playback import sample_id
+from cosfly.products.places import sample_id, town_folder
 from cosfly.reading.documents import parse_document, parse_json, validation_errors
 from cosfly.reading.files import read_span
 from cosfly.store import dump_json

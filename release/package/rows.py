@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from cosfly.products.frames import FILE_NAMES, FrameFile
-from cosfly.products.playback import Flight, sample_id
+from cosfly.products.places import sample_id
+from cosfly.products.playback import Flight
 from cosfly.reading.files import read_into
 from release import columns
 from release.columns import PICTURES

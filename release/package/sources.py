@@ -10,9 +10,9 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
+from cosfly.products.flights import find_flights
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, stand, town_folder
-from cosfly.products.playback import find_flights
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
 from cosfly.provenance import fingerprint, is_bound, was_made_of

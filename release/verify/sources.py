@@ -18,9 +18,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.errors import InputError
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Place, flight_ids
-from cosfly.products.playback import find_flights, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table, read_row_group, row_batches
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed, flight_name, flight_spans

@@ -27,8 +27,9 @@ from cosfly.inspection.frames import SMALL_PX, SMALL_ROWS
 from cosfly.inspection.pixels import NUM_IDS, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
+from cosfly.products.flights import find_flights
 from cosfly.products.frames import FILE_NAMES, read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.playback import Flight, find_flights, read_flight
+from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.reprojection import View, compare_views, grid_rows
 from cosfly.stage_events import read_events

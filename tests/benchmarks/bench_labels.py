@@ -19,7 +19,8 @@ from caption.teachers.rules import decide
 from caption.truth.actions import Motion, label_of, measure, verdict_of
 from caption.truth.facts import measure_facts
 from caption.windows import current_frames, cut_future, cut_windows
-from cosfly.products.playback import Flight, find_flights, read_flight, read_twin
+from cosfly.products.flights import find_flights, read_twin
+from cosfly.products.playback import Flight, read_flight
 
 WINDOW, LABEL = WindowConfig(require_images=False), LabelConfig()
 COLUMNS = ("differ", "differ, same visible", "hard", "hard, label not the clean one's")

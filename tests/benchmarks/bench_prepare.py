@@ -24,7 +24,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from specimens_distill import make_caption
 
 from cosfly.products.captions import write_caption_lines
-from cosfly.products.playback import find_flights, read_flight, write_flight
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.limits import Limits, use_limits
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig

@@ -1,0 +1,101 @@
+"""The flights of a playback tree: which there are, which are chosen, and which two are of one walk."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import InputError, VerifyError
+from cosfly.products.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track
+from cosfly.products.playback import ORIGINAL, Flight, read_flight
+from cosfly.reading.files import files_named
+
+TWIN_TOLERANCE_S = 1e-3
+
+
+def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
+    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen.
+
+    Raises:
+        InputError: the folder is missing or holds no flight, or none is chosen.
+    """
+    if not root.is_dir():
+        raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check --data")
+    folders = [path.parent for path in files_named(root, "trajectory.json")]
+    if not folders:
+        raise InputError(
+            "not a playback tree",
+            where=root,
+            got="no trajectory.json below it",
+            expected="Town*/trajectory_*/ORI/trajectory.json",
+            fix="check --data",
+        )
+    return chosen_flights(folders, root, choice)
+
+
+def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
+    """Give the flights of a tree that are chosen.
+
+    Raises:
+        InputError: none is.
+    """
+    chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
+    if folders and not chosen:
+        raise InputError(
+            "no flight of the tree has such a name", where=root, got=", ".join(choice.match),
+            expected=f"a pattern for {folders[0].relative_to(root).as_posix()} and its like", fix="check --flights",
+        )  # fmt: skip
+    if len(choice.tracks) < len(TRACKS):
+        chosen = [folder for folder in chosen if track_of(folder) in choice.tracks]
+        if not chosen:
+            raise InputError(
+                "no flight of the tree is of this track", where=root, got=", ".join(choice.tracks), fix="check --tracks"
+            )
+    return chosen
+
+
+def track_of(folder: Path) -> Track:
+    """Tell a flight's track: by its folder's name, and where that is another, by what its file says; one that cannot be read is perturbed."""
+    if folder.name == ORIGINAL:
+        return "clean"
+    if re.fullmatch(r"aug_\d+", folder.name):
+        return "perturbed"
+    try:
+        return "clean" if read_flight(folder, strict=False).is_original else "perturbed"
+    except InputError:
+        return "perturbed"
+
+
+def read_twin(flight: Flight) -> Flight | None:
+    """Read the clean flight beside a perturbed one, the same walk frame by frame; None for a clean flight or without one.
+
+    Raises:
+        InputError: what stands there cannot be read.
+        VerifyError: it is not the same frames.
+    """
+    if flight.is_original or flight.folder is None:
+        return None
+    own = Path(os.path.abspath(flight.folder))
+    named = own.parent / ORIGINAL
+    has_named = named != own and (named / "trajectory.json").exists()
+    for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):
+        twin = read_flight(folder, strict=False) if folder != own else flight
+        if twin.is_original:
+            break
+        if has_named:
+            raise _no_twin(flight, twin)
+    else:
+        return None
+    if len(twin) != len(flight) or np.abs(twin.time_s - flight.time_s).max() >= TWIN_TOLERANCE_S:
+        raise _no_twin(flight, twin)
+    return twin
+
+
+def _no_twin(flight: Flight, other: Flight) -> VerifyError:
+    got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (other, flight))
+    got = f"{got}, is_original {other.is_original}"
+    return VerifyError("not the clean twin of the flight beside it", where=other.folder, got=got, expected=expected)
