@@ -7,20 +7,19 @@ the flight contradicts is asked for again, by default anchored to the true one; 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 from caption.schema import CaptionConfig, Strategy, Window
-from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
+from caption.teachers.foreign import Terms
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.teacher import AskingTeacher, Teacher
+from caption.teachers.teacher import Teacher, terms_of
 from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.judge import Case, Judge
 from caption.truth.mirror import check_translation
 from caption.truth.sentences import Judged
-from caption.writing.contract import Draft, Refused, more_fields, refuse_decision, way_of
+from caption.writing.contract import Draft, Refused, refuse_decision, way_of
 from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Usage
 from cosfly.errors import InputError, RenderError
 from cosfly.products.captions import (
@@ -32,7 +31,6 @@ from cosfly.products.captions import (
     Parsed,
     RepairRecord,
     Verdict,
-    Writing,
     parse_answer,
 )
 
@@ -48,7 +46,7 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
     """
     observed = window.observed
     motion = measure(window.future)
-    terms = _terms(teacher, observed.sample_id, cfg)
+    terms = terms_of(teacher, observed.sample_id, cfg)
     question = make_question(observed, cfg.image, terms.writing)
     loop = _Loop(teacher, cfg, terms, motion, label_of(motion, cfg.label), judge)
     loop.checks["keyframe"] = window.keyframe
@@ -99,19 +97,6 @@ def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, r
     )
 
 
-def _terms(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
-    if isinstance(teacher, FileTeacher | StudentTeacher):
-        return teacher.terms(sample_id)
-    if isinstance(teacher, AskingTeacher) and teacher.student is not None:
-        return teacher.student.terms
-    return _asked_terms(cfg.writing)
-
-
-@cache
-def _asked_terms(writing: Writing) -> Terms:
-    return Terms(writing, tuple(more_fields(way_of(writing))))
-
-
 @dataclass(frozen=True)
 class Trial:
     """One conflict and what a strategy made of it; `last` is None where it did not repair it. Mirror not included."""
@@ -131,7 +116,7 @@ async def try_strategy(window: Window, teacher: Teacher, cfg: CaptionConfig, str
     """
     motion = measure(window.future)
     repair = cfg.repair.model_copy(update={"strategy": strategy})
-    terms = _terms(teacher, window.observed.sample_id, cfg)
+    terms = terms_of(teacher, window.observed.sample_id, cfg)
     loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), terms, motion, label_of(motion, cfg.label))
     question = make_question(window.observed, cfg.image, terms.writing)
     if await loop.ask_freely(question) is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +21,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from caption.schema import CaptionConfig, ImageConfig
-from caption.teachers.foreign import FileTeacher, StudentTeacher
+from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
 from caption.teachers.images import EncodedImage, FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
@@ -36,7 +37,7 @@ from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
-from cosfly.products.captions import TeacherRecord, TeacherSettings, answer_schema
+from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing, answer_schema
 from cosfly.products.places import flight_of
 
 ENCODING_THREADS = 4
@@ -299,3 +300,17 @@ def open_teacher(
     if cfg.teacher_kind in EMBEDDED:
         return nullcontext(embedded_teacher(cfg, seed))
     return AskingTeacher(cfg, book, seed, budget, only, troubles)
+
+
+def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
+    """Give the terms under which a teacher answers for a window."""
+    if isinstance(teacher, FileTeacher | StudentTeacher):
+        return teacher.terms(sample_id)
+    if isinstance(teacher, AskingTeacher) and teacher.student is not None:
+        return teacher.student.terms
+    return _asked_terms(cfg.writing)
+
+
+@cache
+def _asked_terms(writing: Writing) -> Terms:
+    return Terms(writing, tuple(more_fields(way_of(writing))))

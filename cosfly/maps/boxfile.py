@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +25,9 @@ from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
+from cosfly.maps.row_values import TYPES, WrongRow, read_values, size_of, span_of, wrong_in
 from cosfly.maps.units import check_units
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
-from cosfly.products.columns import LARGEST
-from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.reading.files import read_text
 from cosfly.reading.geojson import read_features
 
@@ -55,8 +53,6 @@ NAMES: dict[str, tuple[str, ...]] = {
     "name": ("name",),  # tells a person which one is meant
 }
 FIELDS = {name: field for field, names in NAMES.items() for name in names}
-TYPES = [kind for kind in KINDS if kind != "NONE"]
-SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
 FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
 DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
@@ -122,10 +118,6 @@ class _Row(NamedTuple):
     wrong: str = ""
 
 
-class _Wrong(Exception):
-    """What is wrong with one row, in words."""
-
-
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     """Read boxes; the seed changes nothing.
 
@@ -150,7 +142,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     for row in rows:
         try:
             _add(boxes, row, cfg)
-        except _Wrong as wrong:
+        except WrongRow as wrong:
             places.setdefault(str(wrong), []).append(row.where)
         ids.append(row.values.get("id"))
     if places:
@@ -238,7 +230,7 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 continue
             cells = ((field, cell.strip()) for field, cell in zip(fields, line, strict=True) if field)
             values = {field: cell for field, cell in cells if cell}
-            if problems and not (wrong := _wrong_in(lost | values, cfg)):
+            if problems and not (wrong := wrong_in(lost | values, cfg.types)):
                 continue  # what a lost column leaves out is told once
             yield _Row(f"line {lines.line_num}", values, wrong=wrong if problems else "")
     except csv.Error as error:
@@ -316,106 +308,24 @@ def _ids(given: list[Any], path: Path) -> np.ndarray:
 
 def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
     if row.wrong:
-        raise _Wrong(row.wrong)
-    kind, numbers = _read(row.values, cfg)
+        raise WrongRow(row.wrong)
+    kind, numbers = read_values(row.values, cfg.types)
     if "yaw_deg" in numbers and "yaw_rad" in numbers:
-        raise _Wrong("yaw twice, in degrees and in radians")
+        raise WrongRow("yaw twice, in degrees and in radians")
     yaw_deg = numbers.pop("yaw_deg", math.degrees(numbers.pop("yaw_rad", 0.0)))
     metres = {name: value * cfg.metres_per_unit for name, value in numbers.items()}
-    low_m, high_m = _span(metres, kind, cfg.ground_z_m)
+    low_m, high_m = span_of(metres, kind, cfg.ground_z_m)
     turn = -1.0 if cfg.left_handed else 1.0
     if row.outline is None:
         missing = [name for name in ("x", "y") if name not in metres]
         if missing:
-            raise _Wrong(f"no {' and no '.join(missing)}")
-        size = (_size(metres, "length"), _size(metres, "width"))
+            raise WrongRow(f"no {' and no '.join(missing)}")
+        size = (size_of(metres, "length"), size_of(metres, "width"))
         boxes.add(kind, (metres["x"], turn * metres["y"]), size, low_m, high_m, turn * yaw_deg)
         return
     outline = shapely.transform(row.outline, lambda places: places * [cfg.metres_per_unit, turn * cfg.metres_per_unit])
     check_outline(outline, row.where)
     if not outline.is_valid:
-        raise _Wrong(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
+        raise WrongRow(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
     for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):
         boxes.add(kind, rectangle.center, rectangle.size, low_m, high_m, rectangle.yaw_deg)
-
-
-def _wrong_in(values: Mapping[str, Any], cfg: BoxesConfig) -> str:
-    try:
-        _read(values, cfg)
-    except _Wrong as error:
-        return str(error)
-    return ""
-
-
-def _read(values: Mapping[str, Any], cfg: BoxesConfig) -> tuple[str, dict[str, float]]:
-    """Give the type and the numbers of a row; says all that is wrong with them."""
-    wrong, kind, numbers = list[str](), "", dict[str, float]()
-    try:
-        kind = _kind(values, cfg)
-    except _Wrong as error:
-        wrong.append(str(error))
-    for name, value in values.items():
-        if name not in ("type", "id", "name"):
-            try:
-                numbers[name] = _number(name, value)
-            except _Wrong as error:
-                wrong.append(str(error))
-    if wrong:
-        raise _Wrong(", ".join(wrong))
-    return kind, numbers
-
-
-def _kind(values: Mapping[str, Any], cfg: BoxesConfig) -> str:
-    name = str(values.get("type", ""))
-    kind = cfg.types.get(name, name)
-    if kind not in TYPES:
-        alike = {known.lower(): known for known in [*KINDS, *cfg.types]}
-        close = get_close_matches(name.lower(), alike, n=1)
-        raise _Wrong(
-            f"unknown type {name[:40]!r}" + (f" (did you mean {alike[close[0]]!r}?)" if close else "")
-            if name
-            else "no type"
-        )
-    return kind
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, bool) or not abs(number) <= LARGEST:
-        raise _Wrong(f"{name} is not a finite number: {str(value)[:40]!r}")
-    return number
-
-
-def _size(metres: Mapping[str, float], name: str) -> float:
-    """Give a full size, which may be told as its half."""
-    half = metres.get(f"half_{name}")
-    if (name in metres) == (half is not None):
-        raise _Wrong(f"{name} twice, whole and half" if half is not None else f"neither {name} nor half_{name}")
-    size = metres[name] if half is None else 2 * half
-    if not size > 0:
-        raise _Wrong(f"{name} is not more than 0: {size:g} m")
-    return size
-
-
-def _span(metres: Mapping[str, float], kind: str, ground_m: float) -> tuple[float, float]:
-    """Give the lowest and highest point: of low and high, of the middle and a height, or of a height over the ground."""
-    has_height = "height" in metres or "half_height" in metres
-    if "high" in metres:
-        if has_height or "z" in metres:
-            raise _Wrong("its heights are told twice: high beside height or z")
-        low, high = metres.get("low", ground_m), metres["high"]
-    elif not has_height and KINDS[kind] in GROUND_KINDS:
-        top = metres.get("z", metres.get("low", ground_m))
-        low, high = top - SLAB_M, top
-    else:
-        height = _size(metres, "height")
-        if "z" in metres and "low" in metres:
-            raise _Wrong("its heights are told twice: low beside z")
-        low = metres["z"] - height / 2 if "z" in metres else metres.get("low", ground_m)
-        high = low + height
-    if not high > low:
-        raise _Wrong(f"its top, {high:g} m, is not above its foot, {low:g} m")
-    return low, high

@@ -17,66 +17,18 @@ The move before a state is that of its cheapest predecessor: the smoothness term
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from cosfly.compiled import njit
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
-from cosfly.kernels import BoxIndex, collect_hits, nearest_box
+from cosfly.kernels import BoxIndex
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.sight import look, make_horizon
+from cosfly.planners.track_astar.search import MOVES, WEIGHTS, Costs, Voxels, search_layers
 from cosfly.planners.track_astar.smooth import smooth_flight
 
-ROUNDING_M = 1e-6  # of altitudes
 MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
-
-# The 26 neighbours of a voxel and itself.
-MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
-STAY = 13
-UNKNOWN, FREE, BLOCKED = range(3)  # edges between voxels
-
-WEIGHTS = ("tracking", "visibility", "path", "safety", "smoothness")
-TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
-
-
-class Voxels(NamedTuple):
-    """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m.
-
-    columns: (nx, ny) bool, inside the corridor. Caches, filled when first asked: clearances (cells,) m, NaN is unknown;
-    edges (cells, 27): UNKNOWN, FREE or BLOCKED.
-    """
-
-    low: np.ndarray
-    shape: np.ndarray
-    size: np.ndarray
-    columns: np.ndarray
-    clearances: np.ndarray
-    edges: np.ndarray
-
-
-class Costs(NamedTuple):
-    """Weights and lengths of the search; weights: (5,), places below.
-
-    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at each layer, NaN
-    where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
-    """
-
-    weights: np.ndarray
-    ring_m: np.ndarray
-    wished: np.ndarray
-    sight: np.ndarray
-    least_z: np.ndarray
-    preferred_z: np.ndarray
-    greatest_z: np.ndarray
-    influence_m: float
-    safety_m: float
-    start: np.ndarray
-
-
-# --- the planner ------------------------------------------------------------------------------------------------------
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
@@ -130,7 +82,7 @@ def search_flight(
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
     reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
-    cells, cost, num_seen = _search(
+    cells, cost, num_seen = search_layers(
         targets[frames], reaches_m, voxels, costs, obstacles, settings.beam, settings.corridor_m
     )
     if cells[0] < 0:
@@ -187,214 +139,3 @@ def _corridor(low, shape, size, flat, margin_m):
                     inside[ix, iy] = True
                     break
     return inside
-
-
-# --- search -----------------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def _search(targets, reaches_m, voxels, costs, index, beam, corridor_m):
-    """Give the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked from.
-
-    targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
-    """
-    num_layers, num_cells = len(targets), len(voxels.clearances)
-    cells, parents = np.empty((num_layers, beam), dtype=np.int64), np.empty((num_layers, beam), dtype=np.int64)
-    best = np.full(num_cells, np.inf)
-    came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
-    touched, num_seen = np.empty(num_cells, dtype=np.int64), 0
-    lengths, bends = _move_tables(voxels.size)
-    cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)
-    size = 0
-    for layer in range(num_layers):
-        if layer == 0:
-            num = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
-        else:
-            num = _expand(
-                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], lengths, bends, voxels, costs, index,
-                best, came_from, came_by, touched,
-            )  # fmt: skip
-        chosen, total, seen = _choose(touched[:num], best, targets[layer], layer, voxels, costs, index, beam)
-        num_seen += seen
-        size = len(chosen)
-        if size == 0:
-            return np.full(num_layers, -1, dtype=np.int64), np.inf, num_seen
-        for b in range(size):
-            cells[layer, b], parents[layer, b] = chosen[b], came_from[chosen[b]]
-            cost_before[b], move_before[b] = total[b], came_by[chosen[b]]
-        for place in range(num):
-            best[touched[place]] = np.inf
-    way, b = np.empty(num_layers, dtype=np.int64), int(np.argmin(cost_before[:size]))
-    cost = cost_before[b]
-    for layer in range(num_layers - 1, -1, -1):
-        way[layer] = cells[layer, b]
-        b = parents[layer, b]
-    return way, cost, num_seen
-
-
-@njit(cache=True)
-def _move_tables(size):
-    """Give the length of each move, m, and the squared change between each two, in voxels."""
-    lengths, bends = np.empty(len(MOVES)), np.empty((len(MOVES), len(MOVES)))
-    for m in range(len(MOVES)):
-        lengths[m] = np.sqrt(((MOVES[m] * size) ** 2).sum())
-        for k in range(len(MOVES)):
-            bends[m, k] = ((MOVES[m] - MOVES[k]) ** 2).sum()
-    return lengths, bends
-
-
-@njit(cache=True)
-def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came_by, touched):
-    """Put the free cells within the corridor of the first target into `touched`; they cost the way from the plain start."""
-    num_y, num_z, num = voxels.shape[1], voxels.shape[2], 0
-    for ix in range(voxels.shape[0]):
-        for iy in range(num_y):
-            x, y = voxels.low[0] + ix * voxels.size[0], voxels.low[1] + iy * voxels.size[1]
-            if (x - target[0]) ** 2 + (y - target[1]) ** 2 > corridor_m * corridor_m or not voxels.columns[ix, iy]:
-                continue
-            for iz in range(num_z):
-                cell, z = (ix * num_y + iy) * num_z + iz, voxels.low[2] + iz * voxels.size[2]
-                if not _is_in_bounds(z, costs, 0) or _clearance(cell, voxels, costs, index) < costs.safety_m:
-                    continue
-                away = np.sqrt((x - costs.start[0]) ** 2 + (y - costs.start[1]) ** 2 + (z - costs.start[2]) ** 2)
-                best[cell] = costs.weights[PATH] * away / voxels.size[0]
-                came_from[cell], came_by[cell], touched[num] = -1, STAY, cell
-                num += 1
-    return num
-
-
-@njit(cache=True)
-def _expand(
-    sources,
-    cost_before,
-    move_before,
-    layer,
-    reach_m,
-    lengths,
-    bends,
-    voxels,
-    costs,
-    index,
-    best,
-    came_from,
-    came_by,
-    touched,
-):
-    """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from` and `came_by`."""
-    num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
-    for b in range(len(sources)):
-        cell = sources[b]
-        ix, iy, iz = cell // (num_y * num_z), (cell // num_z) % num_y, cell % num_z
-        for move in range(len(MOVES)):
-            jx, jy, jz = ix + MOVES[move, 0], iy + MOVES[move, 1], iz + MOVES[move, 2]
-            if lengths[move] > reach_m + 1e-9 or not (0 <= jx < num_x and 0 <= jy < num_y and 0 <= jz < num_z):
-                continue
-            there = (jx * num_y + jy) * num_z + jz
-            cost = (
-                cost_before[b]
-                + costs.weights[PATH] * lengths[move] / voxels.size[0]
-                + costs.weights[SMOOTHNESS] * bends[move_before[b], move]
-            )
-            if cost >= best[there] or not voxels.columns[jx, jy]:
-                continue
-            if not _is_in_bounds(voxels.low[2] + jz * voxels.size[2], costs, layer):
-                continue
-            if voxels.edges[cell, move] == UNKNOWN:
-                voxels.edges[cell, move] = FREE if _edge_is_free(cell, there, voxels, costs, index) else BLOCKED
-            if voxels.edges[cell, move] == BLOCKED:
-                continue
-            if best[there] == np.inf:
-                touched[num] = there
-                num += 1
-            best[there], came_from[there], came_by[there] = cost, b, move
-    return num
-
-
-@njit(cache=True)
-def _choose(touched, best, target, layer, voxels, costs, index, beam):
-    """Add the cost of being there and give the `beam` cheapest cells, their costs, and how many were looked from.
-
-    Visibility is asked only where the cost without it is within the beam.
-    """
-    bounds, reach_m = np.empty(len(touched)), 0.0
-    for k in range(len(touched)):
-        cell = touched[k]
-        x, y, z = _place(cell, voxels)
-        away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-        reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
-        wished_x, wished_y = costs.wished[layer, 0], costs.wished[layer, 1]
-        if not np.isnan(wished_x):
-            aside = np.sqrt((x - wished_x) ** 2 + (y - wished_y) ** 2)
-        climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known: the way here has asked for it
-        near = max(0.0, 1.0 - gap / costs.influence_m)
-        off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
-        bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
-    horizon = make_horizon(index, target, reach_m, 0.0)
-    total, num = np.full(len(touched), np.inf), 0
-    limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
-    for k in range(len(touched)):  # those that would stay if all saw everything
-        if bounds[k] <= limit:
-            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
-            num += 1
-    if num < len(touched):
-        limit = np.partition(total, beam - 1)[beam - 1]
-    for k in range(len(touched)):  # and those that are cheaper than what has turned out to be hidden
-        if total[k] == np.inf and bounds[k] < limit:
-            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
-            num += 1
-            if num % 256 == 0:
-                limit = np.partition(total, beam - 1)[beam - 1]
-    limit = np.partition(total, beam - 1)[beam - 1] if num > beam else np.inf
-    chosen, kept, size = np.empty(min(num, beam), dtype=np.int64), np.empty(min(num, beam)), 0
-    for k in range(len(touched)):
-        if total[k] <= limit and total[k] < np.inf and size < beam:
-            chosen[size], kept[size] = touched[k], total[k]
-            size += 1
-    return chosen[:size], kept[:size], num
-
-
-@njit(cache=True, inline="always")
-def _is_in_bounds(z, costs, layer):
-    """Tell whether a height keeps the altitudes of a layer."""
-    return costs.least_z[layer] - ROUNDING_M <= z <= costs.greatest_z[layer] + ROUNDING_M
-
-
-@njit(cache=True, inline="always")
-def _look(cell, voxels, index, horizon, target):
-    x, y, z = _place(cell, voxels)
-    return look(index, horizon, target, x, y, z)
-
-
-@njit(cache=True, inline="always")
-def _place(cell, voxels):
-    num_y, num_z = voxels.shape[1], voxels.shape[2]
-    return (
-        voxels.low[0] + (cell // (num_y * num_z)) * voxels.size[0],
-        voxels.low[1] + ((cell // num_z) % num_y) * voxels.size[1],
-        voxels.low[2] + (cell % num_z) * voxels.size[2],
-    )
-
-
-@njit(cache=True)
-def _clearance(cell, voxels, costs, index):
-    """Signed distance of a cell's centre to the nearest box, m, at most what the costs ask for."""
-    if np.isnan(voxels.clearances[cell]):
-        x, y, z = _place(cell, voxels)
-        # Farther than the influence matters to the edges alone: beyond this no edge needs a closer look.
-        reach_m = max(costs.influence_m, costs.safety_m + np.sqrt((voxels.size**2).sum()) / 2.0)
-        voxels.clearances[cell], _ = nearest_box(index, x, y, z, reach_m)
-    return voxels.clearances[cell]
-
-
-@njit(cache=True)
-def _edge_is_free(cell, there, voxels, costs, index):
-    """Tell whether the line between two cells keeps the safety distance."""
-    a, b = _clearance(cell, voxels, costs, index), _clearance(there, voxels, costs, index)
-    if a < costs.safety_m or b < costs.safety_m:
-        return False
-    ax, ay, az = _place(cell, voxels)
-    bx, by, bz = _place(there, voxels)
-    length = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
-    if a + b - length >= 2.0 * costs.safety_m:  # distance changes by at most a metre per metre
-        return True
-    return collect_hits(index, ax, ay, az, bx, by, bz, costs.safety_m, np.empty(1, dtype=np.int64)) == 0
