@@ -34,6 +34,7 @@ class LabelMotion:
 
 
 def as_flown(flight: Flight, label_from: LabelFrom) -> LabelMotion:
+    """Give the motion of a flight as it was flown, perturbation and all."""
     return LabelMotion(label_from, flight.positions_m, flight.rotations_deg[:, 1], flight.targets_m)
 
 

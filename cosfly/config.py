@@ -66,7 +66,11 @@ def read_yaml(path: Path) -> dict:
 
 
 def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
-    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
+    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML.
+
+    Raises:
+        ConfigError: one is no assignment, is no YAML, or goes below a setting that is no group.
+    """
     data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")

@@ -34,12 +34,12 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
 
 
 def accel_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """RMS acceleration of waypoints, m/s^2."""
+    """RMS acceleration of waypoints, (n, 3) m, in m/s^2."""
     return derivative_rms(positions_m, 2, dt_s)
 
 
 def jerk_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """RMS jerk of waypoints, m/s^3."""
+    """RMS jerk of waypoints, (n, 3) m, in m/s^3."""
     return derivative_rms(positions_m, 3, dt_s)
 
 
@@ -54,7 +54,7 @@ def length_m(positions_m: np.ndarray) -> float:
 
 
 def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """Largest mean speed between neighbours; 0 for one point."""
+    """Largest mean speed between neighbours of waypoints, (n, 3) m, in m/s; 0 for one point."""
     return float(_steps_m(positions_m).max(initial=0.0)) / dt_s
 
 

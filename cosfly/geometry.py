@@ -120,7 +120,7 @@ def mask_box(mask: np.ndarray) -> np.ndarray:
 
 
 def box_iou(one: np.ndarray, two: np.ndarray) -> float:
-    """Intersection over union of two boxes xmin, ymin, xmax, ymax; 0 when both are empty."""
+    """Intersection over union of two boxes, (4,) xmin, ymin, xmax, ymax; 0 when both are empty."""
     sides = np.minimum(one[2:], two[2:]) - np.maximum(one[:2], two[:2])
     shared = float(np.prod(np.clip(sides, 0, None)))
     union = float(np.prod(one[2:] - one[:2]) + np.prod(two[2:] - two[:2])) - shared
@@ -128,7 +128,7 @@ def box_iou(one: np.ndarray, two: np.ndarray) -> float:
 
 
 def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
-    """Bring angles to [-180, 180)."""
+    """Bring angles of any shape, degrees, to [-180, 180)."""
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
 
 

@@ -78,6 +78,7 @@ def is_partial_of(name: str, path: Path) -> bool:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name, then rename it."""
     with atomic_file(path) as file:
         file.write(data)
 
@@ -92,6 +93,7 @@ def dump_json(value: Any, *, indent: int | None = None) -> str:
 
 
 def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
+    """Write JSON as `write_bytes` writes; indent None: on one line."""
     write_bytes(path, (dump_json(value, indent=indent) + "\n").encode())
 
 
@@ -184,7 +186,11 @@ def checksum_lines(digests: Mapping[str, str]) -> str:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Read `checksums.sha256`: relative name -> hex digest."""
+    """Read `checksums.sha256`: relative name -> hex digest.
+
+    Raises:
+        InputError: it is missing or broken, or a name leads out of the folder.
+    """
     path = folder / CHECKSUMS
     digests: dict[str, str] = {}
     plain_folders, root = {""}, f"{folder}{os.sep}"

@@ -200,6 +200,7 @@ COLUMNS = pa.schema([
 
 
 def split_path(dataset: Path, split: str) -> Path:
+    """Give the file of a split: `train`, `validation` or `test`."""
     return dataset / f"{split}.parquet"
 
 

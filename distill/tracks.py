@@ -132,5 +132,6 @@ def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
 
 
 def add_sample(files: SplitFiles, split: Split, sample: TrackSample) -> None:
+    """Write a sample into its split's file."""
     row: dict[str, Any] = sample.model_dump(mode="json")
     files.add(split, row)

@@ -81,6 +81,7 @@ class FrameEncoder:
 
 
 def encode_image(rgb: np.ndarray, cfg: ImageConfig) -> EncodedImage:
+    """Encode a picture, (h, w, 3) uint8 RGB, as the data URL of a request, with the sha256 of its bytes."""
     data = encode_picture(rgb, cfg.encoding, cfg.jpeg_quality)
     url = f"data:image/{cfg.encoding};base64,{base64.b64encode(data).decode('ascii')}"
     return EncodedImage(url, hashlib.sha256(data).hexdigest())

@@ -35,6 +35,7 @@ class Cues:
 
 
 def find_cues(facts: Facts) -> Cues:
+    """Measure what the rules decide by, on the observed frames alone."""
     dx = facts.offset_x_px[-1] if facts.is_visible_now else None
     first, last = facts.distance_m[0], facts.distance_m[-1]
     # The camera follows the line of sight, which is the heading less the target's place in the picture: one shaky frame

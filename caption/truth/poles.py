@@ -90,10 +90,12 @@ def _side_poles(value: str) -> set[Pair]:
 
 
 def side_word(name: str, value: float) -> str:
+    """Name the side of a value of a quantity that has sides."""
     return "centred" if not value else "left" if value * _SIDED[name] > 0 else "right"
 
 
 def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
+    """Give the opposites that a number of a quantity stands for; of 0 those of rest."""
     found: set[Pair] = set()
     sign = (value > 0) - (value < 0)
     if not sign:

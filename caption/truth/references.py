@@ -274,6 +274,7 @@ def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
 
 
 def dead_band_of(reference: Reference, facts: Facts) -> float:
+    """Give how far a quantity may be off and still be steady or centred, in its unit."""
     if reference.quantity in ("offset_x", "offset_y"):
         return max(2.0, CENTRED_SHARE * facts.width_px)
     return QUANTITIES[reference.quantity].steady

@@ -23,6 +23,7 @@ SPEEDS = {"speed", "target_speed"}
 
 
 def frames_of(claim: Claim) -> Iterator[int]:
+    """Give the observed frames that a claim is of, 0 the first; none where it names no frame."""
     reference = parse_reference(f"speed@{claim.at}") or parse_reference(f"change:speed@{claim.at}")
     if reference is not None and reference.first is not None:
         yield from range(reference.first, (reference.last or reference.first) + 1)

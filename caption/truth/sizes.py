@@ -49,6 +49,7 @@ def about_share(value: float) -> float:
 
 
 def may_mean(written: str, unit: str) -> bool:
+    """Tell whether a number written in one unit may be meant in another: people drop "per second"."""
     return (written, unit) in (("deg", "dps"), ("m", "mps"), ("times", "percent"))
 
 

@@ -63,6 +63,7 @@ def base_url(url: str) -> str:
 
 
 def response_format(schema: dict) -> dict:
+    """Give the field of a request that asks for an answer of a JSON schema."""
     return {"type": "json_schema", "json_schema": {"name": "chain_of_cause", "strict": True, "schema": schema}}
 
 

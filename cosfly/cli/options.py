@@ -143,7 +143,7 @@ def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
 
 
 def check_failures(counts_by_stage: dict[str, Tally], where: Path, cfg: RunConfig) -> None:
-    """Exit 1, after everything was done, where more items failed than the settings accept."""
+    """Raise InputError, after everything was done, where more items failed than the settings accept."""
     failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
     if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
         raise InputError(
@@ -166,7 +166,7 @@ def chosen_flights(section: str, flights: list[str] | None, tracks: str | None) 
 
 
 def data_folder(data: list[Path] | None) -> Path:
-    """The playback tree: given, or that of the run folder one stands in."""
+    """The playback tree: given, or that of the run folder one stands in; raises InputError where there is none, or several are given."""
     if data is not None and len(data) > 1:
         raise InputError(
             "this command takes one playback tree", where="--data", got=f"{len(data)}: {', '.join(map(str, data))}",

@@ -24,6 +24,7 @@ def ring(
 
 
 def bench(boxes: BoxList, axis: int, along: float, across: float, rng: np.random.Generator) -> None:
+    """A bench of 1.8 m along a street, and a bin beside it."""
     boxes.add("Static", point(axis, along, across), point(axis, 1.8, 0.55), 0.0, 0.48)
     boxes.add("Static", point(axis, along + 1.5, across), (0.5, 0.5), 0.0, 0.95)
     if rng.random() < 0.5:  # the bin's liner: a box inside a box of the same kind

@@ -264,6 +264,7 @@ def _styles_flown(traces: list[DroneTrace]) -> dict:
 
 
 def check_ids(walks: list[Walk], paths: Path) -> None:
+    """Raise InputError where there is no walk, or two of one id."""
     if not walks:
         raise InputError("there are no paths", where=f"{paths}: paths", fix="run the pedestrians stage again")
     (path_id, count), *_ = Counter(walk.path_id for walk in walks).most_common(1)

@@ -24,11 +24,12 @@ def is_number(value: Any) -> bool:
 
 
 def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
-    """Micrometres are enough for a map, and short numbers keep files small."""
+    """Give a vector, (n,) m, for a file: micrometres are enough for a map, and short numbers keep files small."""
     return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
 
 
 def records(value: dict, name: str, path: Path | str) -> list[dict]:
+    """Read a list of objects, the first level of a product; raises InputError for anything else."""
     records = value.get(name)
     if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
         raise InputError("not a list of objects", where=f"{path}: {name}")
@@ -36,6 +37,7 @@ def records(value: dict, name: str, path: Path | str) -> list[dict]:
 
 
 def text_id(record: dict, where: str) -> str:
+    """Read the `id` of a record; raises InputError where it is missing or no text."""
     if record.get("id") is None:
         raise InputError(MISSING, where=f"{where}.id", expected="text")
     if not isinstance(record["id"], str):
@@ -44,7 +46,7 @@ def text_id(record: dict, where: str) -> str:
 
 
 def column(record: dict, name: str, where: str, length: int | None = None) -> np.ndarray:
-    """Read a list of finite numbers, (n,) float64."""
+    """Read a list of finite numbers, (n,) float64, n = `length` where it is given; raises InputError for anything else."""
     try:
         column = np.array(record[name], dtype=np.float64)
     except KeyError:
@@ -58,7 +60,7 @@ def column(record: dict, name: str, where: str, length: int | None = None) -> np
 
 
 def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
-    """Read a list of vectors of finite numbers, (n, width) float64."""
+    """Read a list of vectors of finite numbers, (n, width) float64; raises InputError for anything else."""
     if record.get(name) is None:
         raise InputError(MISSING, where=f"{where}.{name}", expected=f"a list of {width} finite numbers each")
     try:

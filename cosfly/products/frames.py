@@ -129,19 +129,23 @@ class TreePose(TreeAngles, TreePosition):
 
 
 def tree_position(position_m: np.ndarray) -> TreePosition:
+    """Give a position, (3,) m, in the tree's axes."""
     x, y, z = (mirror_positions(position_m) + 0.0).tolist()  # + 0.0: no minus zero
     return TreePosition(x=x, y=y, z=z)
 
 
 def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:
+    """Give pitch, yaw, roll, (3,) degrees, in the tree's axes."""
     return TreeAngles(**dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True)))
 
 
 def tree_yaw(yaw_deg: float) -> float:
+    """Give a yaw, degrees, in the tree's axes."""
     return float(mirror_rotations(np.array([0.0, yaw_deg, 0.0]))[1]) + 0.0
 
 
 def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
+    """Give a pose, (3,) m and (3,) degrees, in the tree's axes."""
     return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
 
 
@@ -159,6 +163,7 @@ class CameraMeta(_Group):
 
 
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
+    """Give what a frame says of its camera; clip planes in m."""
     return CameraMeta(
         width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
         focal_length_px=camera.focal_px, focal_length_35mm_mm=round(camera.focal_35mm_mm, 6), intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
@@ -265,6 +270,7 @@ def read_meta(frame: Path) -> FrameMeta:
 
 
 def frame_name(index: int) -> str:
+    """Give a frame's folder below its flight's: `frames_playback/frame_00000`."""
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 

@@ -24,6 +24,7 @@ class TownMap(BaseModel):
 
 
 def write_town_map(town: Path, header: MapHeader) -> Path:
+    """Write what `read_town_map` reads; give the file."""
     shown = TownMap(name=header.name, licence=header.licence, credits=header.credits)
     write_model(town / TOWN_FILE, shown, schema=TOWN_SCHEMA, version=TOWN_VERSION)
     return town / TOWN_FILE

@@ -159,6 +159,7 @@ class FieldReader:
 
 
 def object_of(group: dict, key: str) -> dict:
+    """Give the object under a key; an empty one where there is none, or something else."""
     value = group.get(key)
     return value if isinstance(value, dict) else {}
 
@@ -176,13 +177,14 @@ def _parts_of(value: Any, names: tuple[str, ...]) -> list:
 
 
 def vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
-    parts = [
-        _parts_of(group.get(key), names) for group in groups
-    ]  # one array of all: of each alone it takes twice as long
+    """Read a vector of each group, as `vector_of` does, (n, len(names))."""
+    # One array of all: of each alone it takes twice as long.
+    parts = [_parts_of(group.get(key), names) for group in groups]
     return np.array(parts, dtype=np.float64).reshape(-1, len(names))
 
 
 def mask_boxes(targets: list[dict]) -> np.ndarray | None:
+    """Read the boxes of the person's pixels, (n, 4) px; None where the file has no such field."""
     return vectors_of(targets, "mask_bbox_2d", BBOX) if any("mask_bbox_2d" in target for target in targets) else None
 
 
@@ -204,4 +206,5 @@ def numbers_of(groups: list[dict], key: str) -> np.ndarray:
 
 
 def flags_of(groups: list[dict], key: str, default_key: str = "") -> np.ndarray:
+    """Read one flag of each group, (n,) bool, under either key; False where there is none."""
     return np.array([bool(group.get(key, group.get(default_key, False))) for group in groups])

@@ -215,7 +215,11 @@ MISSING = "the field is missing or null"
 
 
 def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dict:
-    """Check that a JSON value is an object of the wanted schema and major version."""
+    """Give a JSON value that is an object of the wanted schema and major version.
+
+    Raises:
+        InputError: it is not; names the file and the field.
+    """
     if not isinstance(value, dict):
         raise InputError(
             "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"

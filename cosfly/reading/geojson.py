@@ -44,7 +44,7 @@ def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
 
 
 def features_of(value: Any, path: Path) -> list[Feature]:
-    """Give the features of a document; `path` is for messages."""
+    """Give the features of a document; `path` is for messages. Raises InputError where it is no GeoJSON."""
     if not is_geojson(value):
         raise InputError(
             "not GeoJSON", where=f"{path}: type", expected="FeatureCollection, Feature, Polygon or MultiPolygon"

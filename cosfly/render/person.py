@@ -25,6 +25,7 @@ SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
 
 def choose_clothes(rng: np.random.Generator) -> Clothes:
+    """Draw the colours of a person."""
     return Clothes(*(palette[rng.integers(len(palette))] for palette in (SHIRTS, TROUSERS, HAIR, SKIN, SHOES)))
 
 

@@ -167,6 +167,7 @@ def drop_old_checkpoints(folder: Path, keep: int, best_step: int) -> None:
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
+    """Give the folder of a checkpoint, named so that they sort by step."""
     return folder / f"step_{step:08d}"
 
 

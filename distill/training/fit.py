@@ -93,6 +93,7 @@ def seeded(student: Student, seed: int, item_id: str) -> Iterator[None]:
 
 
 def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
+    """Make AdamW of the weights that learn."""
     import torch
 
     parameters = list(learning_weights(student).values())

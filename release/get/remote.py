@@ -90,6 +90,7 @@ def published_address(shown: str) -> str:
 
 
 def check_length(data: bytes, length: int, where: str) -> bytes:
+    """Give the data; raise InputError where the other side sent more or less of it than was asked for."""
     if len(data) != length:
         raise InputError(
             "the other side sent another number of bytes", where=where, got=len(data), expected=f"{length}"

@@ -30,6 +30,7 @@ from release.verify.verify import verify
 
 
 def part_path(parts: Path, name: str) -> Path:
+    """Give the file of a shard while its release is being built."""
     return parts / f"{name}.parquet"
 
 

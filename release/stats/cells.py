@@ -19,6 +19,7 @@ def pairs(front: str, counted: Iterable[tuple[str, int]]) -> list[list[Cell]]:
 
 
 def spread_row(title: str, spread: Spread) -> list[Cell]:
+    """Give a row under the head SPREAD."""
     return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
 
 
@@ -28,11 +29,13 @@ def mean_over(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) ->
 
 
 def spread_over(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) -> Spread:
+    """Spread over flights of a flight's mean, of those that have one."""
     means = (of(flight).spread().mean for flight in flights)
     return spread_of(mean for mean in means if mean is not None)
 
 
 def mean_cell(values: Iterable[float]) -> float | None:
+    """Mean, rounded; None of nothing."""
     known = list(values)
     return round(fmean(known), 4) if known else None
 
@@ -42,6 +45,7 @@ def rounded(*values: float | None) -> list[Cell]:
 
 
 def percent(count: int, total: int) -> float | None:
+    """Share of a total in percent, rounded; None of nothing."""
     return round(100.0 * count / total, 2) if total else None
 
 

@@ -101,6 +101,7 @@ def summary_of(flight: FlightRows, shown: Shown, rows: RowFiles, rows_file: str)
 
 
 def frames_digest(indices: np.ndarray) -> str:
+    """Give a digest of a flight's frame indices, (n,)."""
     return hashlib.sha256(indices.astype(np.int64).tobytes()).hexdigest()
 
 

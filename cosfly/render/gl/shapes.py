@@ -81,6 +81,7 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
 
 
 def plain(builder: PartBuilder, boxes: Boxes) -> None:
+    """Draw a box as it is, in one colour."""
     builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))
 
 

@@ -81,6 +81,7 @@ class Studied(BaseModel):
 
 
 def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
+    """Give the camera of the settings with another field of view, degrees, horizontal."""
     return Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
 
 

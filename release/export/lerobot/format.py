@@ -65,6 +65,7 @@ def runs_of(flight: ReleasedRows) -> list[tuple[int, int]]:
 
 
 def task_of(decision: str) -> str:
+    """Say in words what a frame is an example of."""
     return f"{FOLLOW_TASK} Now: {decision.replace('_', ' ')}." if decision else FOLLOW_TASK
 
 
