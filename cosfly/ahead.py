@@ -24,9 +24,8 @@ from cosfly.store import sha256_bytes
 log = logging.getLogger(__name__)
 
 STAGES = ("plan", "render", "inspect")  # in the order of their need
-WAIT_MAX_S = (
-    120.0  # several times what it takes on a machine with nothing else to do; then the stage compiles for itself
-)
+# Several times what it takes on a machine with nothing else to do; then the stage compiles for itself.
+WAIT_MAX_S = 120.0
 LOOK_AGAIN_S = 0.05
 
 

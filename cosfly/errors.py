@@ -63,9 +63,8 @@ class CosflyError(Exception):
             parts.append(f"expected {self.expected}")
         if self.fix is not None:
             parts.append(self.fix)
-        return " ".join(
-            "; ".join(map(for_terminal, parts)).split()
-        )  # one line that a terminal prints, whatever the parts held
+        # One line that a terminal prints, whatever the parts held.
+        return " ".join("; ".join(map(for_terminal, parts)).split())
 
     @classmethod
     def of_all(cls, problems: Sequence[str], *, where: str | Path, expected: str | None = None) -> Self:

@@ -377,9 +377,8 @@ def _recorded_files(folder: Path) -> tuple[dict[Path, str], list[str]]:
         root = lists.parent.resolve()
         found |= {root / name: digest for name, digest in read_checksums(root).items()}
         for path in sorted(root.rglob("*")):
-            is_ours = not any(
-                part.startswith(".") for part in path.relative_to(root).parts
-            )  # what a hub puts there is not
+            # What a hub puts there is not.
+            is_ours = not any(part.startswith(".") for part in path.relative_to(root).parts)
             if is_ours and path.is_file() and path.name != CHECKSUMS and path not in found:
                 strangers.append(f"{path} is in no record")
     return found, strangers

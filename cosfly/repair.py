@@ -33,9 +33,8 @@ def repair(folder: Path) -> int:
     """
     if not folder.is_dir():
         return 0
-    below = sorted(
-        path for depth in ("*", "*/*") for path in folder.glob(depth) if path.is_dir()
-    )  # stages; those of towns
+    # Stages; those of towns.
+    below = sorted(path for depth in ("*", "*/*") for path in folder.glob(depth) if path.is_dir())
     return sum(_repair_stage(stage, folder) for stage in (folder, *below))
 
 

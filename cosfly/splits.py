@@ -48,9 +48,8 @@ class Course:
         known = ~np.isnan(self.target_m[:, :2]).any(axis=1)
         time_s, places_m = self.time_s[known], self.target_m[known]
         begun = np.floor(time_s + ON_TIME_S)
-        seconds = np.unique(
-            begun[:, None] + np.arange(MOST_GAP_S + 1)
-        )  # those of the points and of the gaps behind them
+        # Those of the points and of the gaps behind them.
+        seconds = np.unique(begun[:, None] + np.arange(MOST_GAP_S + 1))
         before = np.searchsorted(time_s, seconds + ON_TIME_S, side="right") - 1
         after = np.searchsorted(time_s, seconds - ON_TIME_S)
         inside = (before >= 0) & (after < len(time_s))

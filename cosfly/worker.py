@@ -117,9 +117,8 @@ def work_through(connection: Connection, manner: Manner) -> None:
             with counted_steps(voice.count):
                 record = attempt(work, item)
             voice.finish(record)
-    except (
-        Exception
-    ) as error:  # the border of the process: what ends the work is told, or the pool would take it for a death
+    # The border of the process: what ends the work is told, or the pool would take it for a death.
+    except Exception as error:
         if not isinstance(error, CosflyError):
             if type(error).__module__ != "builtins":  # many of those do not cross the pipe; their words do
                 error = RuntimeError(f"a bug in a worker: {type(error).__name__}: {error}")

@@ -36,9 +36,8 @@ MEMORY_MB = 1_000
 SILENT_S = 30.0  # of the clock, asleep without any CPU time: blocked. A child that waits for its turn is not asleep
 LONGEST_LINE = 5_000  # characters of a message
 BREAKING = ("Cc", "Zl", "Zp", "Cs")  # Unicode's controls, line breaks, half pairs
-TURNING = (
-    "\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # what changes the direction of writing
-)
+# What changes the direction of writing.
+TURNING = "\u200e\u200f\u061c\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 MOST_TRIALS = 150  # to make an input smaller
 SHOWN_BYTES = 300
 SHOW_EVERY_S = 10.0

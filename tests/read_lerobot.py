@@ -10,9 +10,8 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 import torch
 from torch import library as operators
 
-if (
-    torch.version.cuda is None
-):  # the registry's torchvision is built for CUDA and misses these two beside a torch without
+# The registry's torchvision is built for CUDA and misses these two beside a torch without.
+if torch.version.cuda is None:
     library = operators.Library("torchvision", "DEF")
     for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")

@@ -120,9 +120,8 @@ ORBIT = dataclasses.replace(
     bearing_deg=(0.1, -0.1, 0.0, 0.1, 0.0),
     depression_deg=(31.7, 31.5, 31.9, 31.8, 31.7),
 )
-SECOND_SET = Path(__file__).with_name(
-    "prose_second.jsonl"
-)  # captions in the form of the gold set, by two further hands
+# Captions in the form of the gold set, by two further hands.
+SECOND_SET = Path(__file__).with_name("prose_second.jsonl")
 THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand that had seen no rule of the reader's
 # 40 in forty styles on flights of three maps, written before the rules were looked at: `q...` was read while rules were written, then `r...`.
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")

@@ -174,9 +174,8 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
     fields = {"therefore": therefore} if "therefore" in json.dumps(body) else {}  # students are not asked for it
     if "claims" in schema.get("properties", {}):
         fields["claims"] = [{**CLAIMS[0], "at": "t9"}] if fault == "wrong_claims" else CLAIMS
-    texts = (
-        ENGLISH if str(body["messages"][0]["content"]).isascii() else CHINESE
-    )  # students are asked in both languages
+    # Students are asked in both languages.
+    texts = ENGLISH if str(body["messages"][0]["content"]).isascii() else CHINESE
     return {**texts, **fields, "flight_decision": decision}
 
 
@@ -204,9 +203,8 @@ def written_answer(body: dict, can: Collection[str]) -> dict:
 def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
-        disable_nagle_algorithm = (
-            True  # headers and body are two writes: else each answer waits 40 ms for an acknowledgement
-        )
+        # Headers and body are two writes: else each answer waits 40 ms for an acknowledgement.
+        disable_nagle_algorithm = True
 
         def do_GET(self) -> None:
             sent = server.list_models() if server.list_models is not None else None

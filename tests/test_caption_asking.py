@@ -471,9 +471,8 @@ def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):
     path = tmp_path / journal_name(flight_name(0))
 
     async def go_on(window: int) -> None:
-        await AnswerBook(tmp_path).put(
-            flight_name(0), record(0, window)
-        )  # and is killed before the next line of totals
+        # And is killed before the next line of totals.
+        await AnswerBook(tmp_path).put(flight_name(0), record(0, window))
 
     for window in (4, 5):
         asyncio.run(go_on(window))

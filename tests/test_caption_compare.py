@@ -36,9 +36,8 @@ def test_a_budget_that_is_used_up_is_one_clear_error(tmp_path):
 
 def test_text_distance():
     assert text_distance(coc("a b c"), coc("a b c")) == 0.0
-    assert text_distance(coc("a b c"), coc("x y z")) == pytest.approx(
-        0.75
-    )  # the reasoning, one word of four, is shared
+    # The reasoning, one word of four, is shared.
+    assert text_distance(coc("a b c"), coc("x y z")) == pytest.approx(0.75)
     assert 0.0 < text_distance(coc("a b c d"), coc("a b x d")) < 0.5
 
 

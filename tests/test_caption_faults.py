@@ -443,9 +443,10 @@ def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, m
     lines = [line for line in caplog.messages if "failed tries" in line]
     assert any(re.search(r"no answer for \d s, the last: HTTP 503 Loading model", line) for line in lines)
     assert "the last" not in lines[-1]  # it is over
+    # One line for many tries.
     assert [line for line in caplog.messages if "trying again" in line] == [
         f"{server.url}: HTTP 503 Loading model; trying again, failed tries so far: 1"
-    ]  # one line for many tries
+    ]
 
 
 def test_the_log_does_not_promise_a_try_that_does_not_come(caplog):

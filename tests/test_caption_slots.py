@@ -509,9 +509,8 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
         in table
     )
     assert "{side:offset_x} left" in table
-    assert "heading}" not in table.replace("{side:target_heading}", "").replace(
-        "{change:target_heading}", ""
-    )  # not known
+    # Not known.
+    assert "heading}" not in table.replace("{side:target_heading}", "").replace("{change:target_heading}", "")
     with writing_server("The gap of {distance} calls for nothing.") as server:
         run(settings(server.url), tree, tmp_path / "out")
     questions = [body["messages"] for body in map(json.loads, server.bodies) if not is_mirror(body)]

@@ -466,9 +466,8 @@ def test_a_damaged_journal_line_costs_one_request(tree, tmp_path):
 def test_another_prompt_setting_stops_the_resume(tree, tmp_path):
     with TeacherServer() as server:
         run(settings(server.url, limit=1), tree, tmp_path / "out")
-        run(
-            settings(server.url, limit=1, endpoint={"concurrency": 9}), tree, tmp_path / "out"
-        )  # a manner, not a prompt
+        # A manner, not a prompt.
+        run(settings(server.url, limit=1, endpoint={"concurrency": 9}), tree, tmp_path / "out")
         with pytest.raises(ResumeError, match=r"endpoint\.temperature was 0\.6, is 0\.1"):
             run(settings(server.url, limit=1, endpoint={"temperature": 0.1}), tree, tmp_path / "out")
 

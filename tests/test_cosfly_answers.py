@@ -138,9 +138,8 @@ def test_bodies(body, outcome):
         assert outcome[0] in found
 
 
-OURS = Usage(
-    prompt_tokens=1 + 294 + 1, completion_tokens=-(-len(TEXT) // 3)
-)  # "ab", pictures of 640 x 360 and 8 x 8, the answer
+# "ab", pictures of 640 x 360 and 8 x 8, the answer.
+OURS = Usage(prompt_tokens=1 + 294 + 1, completion_tokens=-(-len(TEXT) // 3))
 # What stands in `usage`; what is counted; which counts are ours.
 USAGES = [
     ({"prompt_tokens": 10, "completion_tokens": 2, "total_tokens": 12}, (10, 2), ()),

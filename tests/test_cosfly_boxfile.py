@@ -202,9 +202,8 @@ def test_sizes_alone_in_centimetres_are_asked_about(tmp_path, columns):
     assert "--set" not in str(caught.value)
     every = [[house[0], *(100 * value for value in house[1:])] for house in houses]
     assert len(loaded(tmp_path, text(every), metres_per_unit=0.01)) == 6
-    tower = [
-        ["Buildings", 0, 0, 60 - 9 * k, 50 - 8 * k, 60 + 30 * k] for k in range(4)
-    ]  # storeys set back, over each other
+    # Storeys set back, over each other.
+    tower = [["Buildings", 0, 0, 60 - 9 * k, 50 - 8 * k, 60 + 30 * k] for k in range(4)]
     assert len(loaded(tmp_path, text(tower))) == 5
 
 

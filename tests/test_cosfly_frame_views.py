@@ -80,9 +80,8 @@ def test_depth_colors_mark_sky_and_invalid():
 
 # --- what is told and what is shown ---
 
-ORDERS = [
-    order for count in (1, 2, 3) for order in itertools.permutations(("rgb", "depth", "segmentation"), count)
-]  # 15: all 7 sets, in any order
+# 15: all 7 sets, in any order.
+ORDERS = [order for count in (1, 2, 3) for order in itertools.permutations(("rgb", "depth", "segmentation"), count)]
 NAMES = {
     "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation", "enlarged": "middle"},
     "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation", "放大": "middle"},

@@ -228,9 +228,8 @@ def test_roi_with_holes_and_several_rings_equals_shapely():
     hole = [(10.2, 10.1), (16.4, 11.3), (13.3, 17.2)]
     poking = [(25.3, 2.2), (40.1, 2.2), (40.1, 9.4)]  # a hole that leaves its ring cuts only what is inside
     square = [(20.1, 0.3), (29.4, 0.3), (29.4, 8.9), (20.1, 8.9)]
-    roi = Roi(
-        points_world=star.tolist(), holes=[hole], polygons=[{"points_world": square, "holes": [poking]}]
-    )  # the last ring may overlap the first: together they count as one region
+    # The last ring may overlap the first: together they count as one region.
+    roi = Roi(points_world=star.tolist(), holes=[hole], polygons=[{"points_world": square, "holes": [poking]}])
     grid = free_grid(60, 56, 0.5, -0.3, -0.7)
     region = (shapely.Polygon(star) - shapely.Polygon(hole)) | (shapely.Polygon(square) - shapely.Polygon(poking))
     centers = grid.centers_of(np.stack(np.meshgrid(np.arange(60), np.arange(56)), axis=-1))

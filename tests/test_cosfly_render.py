@@ -373,9 +373,8 @@ def test_rendered_visibility_by_hand():
 
 def test_what_is_outside_the_image_counts_as_hidden():
     hip = np.array([0.0, 10.0, 0.9])
-    aside = world_from_camera(
-        np.array([0.0, 0.0, 0.9]), np.array([0.0, 45.0, 0.0])
-    )  # the box straddles the right border
+    # The box straddles the right border.
+    aside = world_from_camera(np.array([0.0, 0.0, 0.9]), np.array([0.0, 45.0, 0.0]))
     view = view_target(hip, aside, CAMERA)
     score, _ = rendered_visibility(blank_frame(np.full((180, 320), 500.0)), hip, view, aside, CAMERA)
     assert score == pytest.approx(0.5, abs=0.1)

@@ -72,9 +72,8 @@ def test_slabs_fill_the_ground_and_hide_nothing_over_it(shape):
     feet = np.column_stack([places, ground.height_at(places)])
     assert_allclose(signed_distances(index, feet)[0], 0.0, atol=0.04)
     buried = feet - [0.0, 0.0, 2.0]
-    assert (
-        signed_distances(index, buried)[0] < 0.05
-    ).all()  # between slabs in a hollow are wedges of a few centimetres
+    # Between slabs in a hollow are wedges of a few centimetres.
+    assert (signed_distances(index, buried)[0] < 0.05).all()
     over = signed_distances(index, feet + np.array([0.0, 0.0, 3.0]))[0]
     assert (over > 2.8).all()
     assert (over <= 3.04).all()
@@ -150,9 +149,8 @@ def test_feet_are_on_the_ground(town: BoxMap):
 
 
 def test_nobody_walks_on_ground_as_steep_as_a_roof():
-    heights = np.add.outer(
-        np.zeros(40), np.where(np.arange(40) < 20, 0.0, np.arange(40) - 19.0)
-    )  # 45 degrees in the east
+    # 45 degrees in the east.
+    heights = np.add.outer(np.zeros(40), np.where(np.arange(40) < 20, 0.0, np.arange(40) - 19.0))
     flat = make_box_map([[80, 80, -0.1]], [[80, 80, 0.1]], np.zeros((1, 3)), [KINDS["Roads"]])
     box_map = on_ground(flat, Ground(CELL_M * heights, 0.0, 0.0, CELL_M))
     found = walkable_ground(box_map, PedestriansConfig())

@@ -245,9 +245,8 @@ def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_
             assert all((tree / image).is_file() for image in sample.images)
     assert all(len(found) == 1 for found in owners.values())
     manifest = json.loads((out / "manifest.json").read_text())
-    assert (
-        manifest["counts"]["kept"] == sum(map(len, splits.values())) == 5 * 2 * 4 * 2
-    )  # flights, variants, windows, languages
+    # Flights, variants, windows, languages.
+    assert manifest["counts"]["kept"] == sum(map(len, splits.values())) == 5 * 2 * 4 * 2
     assert {split: facts["samples"] for split, facts in manifest["splits"].items()} == {
         split: len(samples) for split, samples in splits.items()
     }

@@ -56,9 +56,8 @@ def make_calm_student(folder: Path) -> Path:
 @pytest.fixture(scope="module")
 def base(tmp_path_factory) -> Path:
     folder = make_calm_student(tmp_path_factory.mktemp("base") / "student")
-    shutil.copy(
-        folder / "generation_config.json", folder / "video_preprocessor_config.json"
-    )  # any file that servers need
+    # Any file that servers need.
+    shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
     return folder
 
 

@@ -172,9 +172,8 @@ def _obvious_edges(colours, mask, rows):
 def test_edges_of_colours_and_mask(shift):
     rng = np.random.default_rng(5)
     upright = _frame(4, (72, 128))[1]
-    mask = np.stack(
-        [np.roll(row, y, axis=0) for y, row in enumerate(upright)]
-    )  # aslant, as upright edges do not tell of up and down
+    # Aslant, as upright edges do not tell of up and down.
+    mask = np.stack([np.roll(row, y, axis=0) for y, row in enumerate(upright)])
     whole = np.roll((mask.astype(int) * 37 % 251 + rng.integers(0, 3, mask.shape)).astype(np.uint8), shift, axis=(0, 1))
     rows = grid_rows(72)
     found, wanted = edges_of(whole[rows], mask), _obvious_edges(whole[rows], mask, rows)

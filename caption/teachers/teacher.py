@@ -161,9 +161,8 @@ class AskingTeacher:
         self.frames = SharedFrames(cfg.image, self.student.encode if self.student else None)
         self._trying, self._sound_s = asyncio.Lock(), float("-inf")  # when a trial prompt was answered last
         self._num_answered = 0  # questions that the engine answered
-        self._answered_before: dict[
-            str, int
-        ] = {}  # cause -> how many of them before the last window that was refused for it
+        # Cause -> how many of them before the last window that was refused for it.
+        self._answered_before: dict[str, int] = {}
 
     async def __aenter__(self) -> AskingTeacher:
         try:

@@ -173,9 +173,8 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
         elif pole.dimension == "course" and (pole.is_than or pole.word.lower() in COMPARATIVES):
             is_covered = pole.value in covers or (said.compares and not covers & {"up", "down"})
         else:
-            is_covered = (
-                pole.value in covers or pole.dimension == "centre" or pole.value == "glimpsed"
-            )  # mostly what a side is told from
+            # Mostly what a side is told from.
+            is_covered = pole.value in covers or pole.dimension == "centre" or pole.value == "glimpsed"
         if is_covered:
             continue
         lost = {

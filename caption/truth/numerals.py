@@ -150,9 +150,8 @@ _ABOUT = re.compile(
     re.IGNORECASE,
 )
 _OR_SO = re.compile(r"\s*(?:or so|or thereabouts|give or take|左右|上下|来)")
-_COUNTED = (
-    "零〇一二两三四五六七八九十百点个秒步帧米度像倍次人成"  # after digits that are no part of the length before them
-)
+# After digits that are no part of the length before them.
+_COUNTED = "零〇一二两三四五六七八九十百点个秒步帧米度像倍次人成"
 _ANY_NUMBER: dict[Language, re.Pattern[str]] = {
     "en": re.compile(rf"\b{ENGLISH_NUMBER}\b", re.IGNORECASE),
     "zh": re.compile(CHINESE_NUMBER),

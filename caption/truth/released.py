@@ -111,9 +111,8 @@ def _text_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
     lies = []
     for language, coc in caption.answers.items():
         found = [one for one in check_evidence(coc, facts, EvidenceConfig(), language) if not _is_of_boxes(one, facts)]
-        if (
-            caption.writing == "slots"
-        ):  # their numbers were filled in; of a state ("nearly stands, 0.13 m/s") the words are a template's
+        # Their numbers were filled in; of a state ("nearly stands, 0.13 m/s") the words are a template's.
+        if caption.writing == "slots":
             found = [one for one in found if not one.startswith("state:")]
         allowed = caption.contradicted.get(language, 0)
         if caption.writing == "claims":  # claims say what a word was meant of, and are not released

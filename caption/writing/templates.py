@@ -100,9 +100,8 @@ class Slot:
         if aspect in ("change", "rate", "growth", "trend"):
             if is_turn:  # whose side is that of a change
                 return None if aspect == "trend" else f"side:{TURNS[quantity]}"
-            return (
-                None if QUANTITIES[quantity].sides else f"trend:{quantity}"
-            )  # a shift in the picture is no place in it
+            # A shift in the picture is no place in it.
+            return None if QUANTITIES[quantity].sides else f"trend:{quantity}"
         if aspect == "side" or (not aspect and has_sides(quantity)):
             return f"side:{TURNS.get(quantity, quantity)}"
         return None

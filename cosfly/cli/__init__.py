@@ -105,9 +105,8 @@ def options_first(words: Sequence[str]) -> list[str]:
 
 def main() -> None:
     """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
-    signal.signal(
-        signal.SIGTERM, lambda number, frame: sys.exit(128 + number)
-    )  # as Ctrl-C: workers end, locks are let go
+    # As Ctrl-C: workers end, locks are let go.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         app(options_first(sys.argv[1:]))
     except CosflyError as error:

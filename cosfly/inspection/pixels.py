@@ -30,9 +30,8 @@ SHORTEST_RUN_PX = 3  # of an id: as much or less is a stripe that rounding made
 # Of a plane 1 / depth is linear in the picture, so that two surfaces fight only where both lie on that line; 1 cm at 30 m.
 PLANE_SHARE = 3e-4
 GRAINLESS = 0.9  # share of equal neighbours on all other surfaces
-VISIBLE_STEP = (
-    60  # of red, green and blue together: more than the grain of one surface; two of one kind and colour fight unseen
-)
+# Of red, green and blue together: more than the grain of one surface; two of one kind and colour fight unseen.
+VISIBLE_STEP = 60
 LEAST_PAIRS = 400  # neighbouring pixels of a surface, for a share of them to mean something
 
 

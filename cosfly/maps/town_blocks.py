@@ -233,9 +233,8 @@ def _campus(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
         height = rng.uniform(8.0, 15.0)
         boxes.add("Buildings", (middle[0], y), long, -1.0, height)
         boxes.add("Buildings", (middle[0], y), (long[0] * 0.3, long[1] * 0.6), height, height + 2.8)
-        boxes.add(
-            "Buildings", (middle[0], y), (long[0] * 0.9, long[1] * 0.5), 0.2, height - 1.0
-        )  # lecture rooms inside
+        # Lecture rooms inside.
+        boxes.add("Buildings", (middle[0], y), (long[0] * 0.9, long[1] * 0.5), 0.2, height - 1.0)
     library = (high[0] - size[0] * 0.14, middle[1])
     boxes.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
     for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):

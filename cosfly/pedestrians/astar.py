@@ -64,9 +64,8 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
     """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2)."""
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
-    heap_key = np.empty(
-        (1024, 2), dtype=np.float64
-    )  # estimated total cost, then cost still to go: depth first in a tie
+    # Estimated total cost, then cost still to go: depth first in a tie.
+    heap_key = np.empty((1024, 2), dtype=np.float64)
     heap_cell = np.empty(1024, dtype=np.int64)
     size = 0
 

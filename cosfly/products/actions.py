@@ -34,9 +34,8 @@ MEASURES = (
     "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m", "approach_m",
     "sweep_deg", "target_path_m", "visible_now", "visible_share", "ordered",
 )  # fmt: skip
-SETTING = (
-    "label."  # in front of a threshold that is a setting of `caption.label` (caption/schema.py); its settings are:
-)
+# In front of a threshold that is a setting of `caption.label` (caption/schema.py); its settings are:
+SETTING = "label."
 THRESHOLDS = (
     "yaw_deg", "hard_turn_deg", "altitude_m", "speed_change_mps", "hover_mps", "moving_mps", "forward_m", "lateral_m", "approach_m",
     "circle_deg",

@@ -23,9 +23,8 @@ from cosfly.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
 AXES = "right-handed, metres, x east, y north, z up; degrees"
-CORNER_M = (
-    0.05  # how far a told corner may be from the one that follows: exporters round, and turn boxes in single precision
-)
+# How far a told corner may be from the one that follows: exporters round, and turn boxes in single precision.
+CORNER_M = 0.05
 COMPUTED = {
     "schema",
     "schema_version",

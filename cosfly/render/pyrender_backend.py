@@ -60,9 +60,8 @@ def _open_screen(width_px: int, height_px: int) -> Any:
         raise EnvironmentMissing(
             "the renderer pyrender is not installed", got=str(error), fix='pip install "cosfly[pyrender]"'
         ) from None
-    except (
-        Exception
-    ) as error:  # PyOpenGL raises its own, an ImportError without libEGL; pyrender's platforms bare assertions
+    # PyOpenGL raises its own, an ImportError without libEGL; pyrender's platforms bare assertions.
+    except Exception as error:
         raise EnvironmentMissing(
             "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {contract.DEBIAN_PACKAGES}"
         ) from None

@@ -159,9 +159,8 @@ def drop_old_checkpoints(folder: Path, keep: int, best_step: int) -> None:
     best = checkpoint_path(folder, best_step)
     for path in sorted(folder.glob("step_*"))[:-keep]:
         if path != best:
-            leaving = path.with_name(
-                f".{path.name}.{os.getpid()}.partial"
-            )  # a kill in the middle leaves no half of one
+            # A kill in the middle leaves no half of one.
+            leaving = path.with_name(f".{path.name}.{os.getpid()}.partial")
             os.replace(path, leaving)
             shutil.rmtree(leaving)
 

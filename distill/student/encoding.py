@@ -23,9 +23,8 @@ from cosfly.student_chat import IMAGE_PART, chat_messages
 from distill.schema import Sample
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 
-END_OF_ANSWER = (
-    f"{END_OF_TURN}\n"  # what a chat template writes after an answer; the end of the turn is taught, the line is not
-)
+# What a chat template writes after an answer; the end of the turn is taught, the line is not.
+END_OF_ANSWER = f"{END_OF_TURN}\n"
 IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch's cross entropy
 
 

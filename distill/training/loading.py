@@ -54,9 +54,8 @@ def _begin_worker(parent_pid: int, _: int) -> None:
     import cv2
     import torch
 
-    end_with_parent(
-        parent_pid
-    )  # else one that has something to hand over waits for ever, and with it the lock of the folder
+    # Else one that has something to hand over waits for ever, and with it the lock of the folder.
+    end_with_parent(parent_pid)
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
 

@@ -19,9 +19,8 @@ from distill.student.model import Device, pick_device
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-PATIENCE = datetime.timedelta(
-    minutes=30
-)  # for the slowest process: loading weights, counting tokens, answering in validation
+# For the slowest process: loading weights, counting tokens, answering in validation.
+PATIENCE = datetime.timedelta(minutes=30)
 
 
 @dataclass(frozen=True)

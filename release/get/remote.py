@@ -216,9 +216,8 @@ class FsspecRemote:
     def __init__(self, address: str) -> None:
         self._address, self.shown = address, without_secrets(address)
         self._opened: tuple[Any, str] | None = None
-        self._file: tuple[str, Any] | None = (
-            None  # the one that was read last: opening asks again, and unpacks a zip's from its begin
-        )
+        # The one that was read last: opening asks again, and unpacks a zip's from its begin.
+        self._file: tuple[str, Any] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_opened": None, "_file": None}

@@ -9,9 +9,8 @@ ADDRESS = re.compile(r"[A-Za-z][\w+.-]*://[^\s,;'\"]*")
 # From the root, a home or a drive; behind letters (`and/or`) it is no path.
 ABSOLUTE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[\\/][^\s,;'\"]*")
 IS_ABSOLUTE = re.compile(r"~|[\\/]|[A-Za-z]:[\\/]")
-RELATIVE = re.compile(
-    r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+"
-)  # one slash: a name on the hub
+# One slash: a name on the hub.
+RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+")
 
 
 def published_name(text: str) -> str:

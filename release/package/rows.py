@@ -19,9 +19,8 @@ from release.columns import PICTURES
 from release.package.depth import DepthErrors, encoded
 from release.record import DepthCodingName
 
-VALUES_A_BATCH = (
-    4  # values between two looks at the size of a page: with more a page takes a whole row group, twice in memory
-)
+# Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
+VALUES_A_BATCH = 4
 MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
 
 
@@ -39,9 +38,8 @@ class _Column:
     """The files of one picture column of a row group, one after the other in memory that every row group uses again."""
 
     def __init__(self, num_bytes: int) -> None:
-        self._memory = np.empty(
-            2 * num_bytes, np.uint8
-        )  # the last file goes beyond; pages that nobody writes to take no memory
+        # The last file goes beyond; pages that nobody writes to take no memory.
+        self._memory = np.empty(2 * num_bytes, np.uint8)
         self.ends = [0]  # of the files that are kept, from byte 0 on
         self._last = 0  # end of the one that was read last
 

@@ -151,9 +151,8 @@ class Counts:
     verdicts: Counter[tuple[str, str]] = field(default_factory=Counter)  # verdict, track
     repairs: Counter[str] = field(default_factory=Counter)
     sentences: Counter[tuple[str, str]] = field(default_factory=Counter)  # language, state
-    whole: Counter[tuple[str, str]] = field(
-        default_factory=Counter
-    )  # language, what the sentences of a caption are together
+    # Language, what the sentences of a caption are together.
+    whole: Counter[tuple[str, str]] = field(default_factory=Counter)
     lengths: dict[tuple[str, str], Sum] = field(default_factory=lambda: defaultdict(Sum))  # language, field
     length_bins: Counter[tuple[str, str, int]] = field(default_factory=Counter)
     weather: Counter[tuple[str | None, str | None]] = field(default_factory=Counter)

@@ -29,9 +29,10 @@ Said = TypeVar("Said")
 SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, AttributeError)
 
 
+# As in a playback tree.
 LOSSLESS = DepthCoding(
     coding="float32", unit="metre", sky=SKY_DEPTH_M, invalid=INVALID_DEPTH_M, min_m=None, max_m=None, max_error_m=0.0
-)  # as in a playback tree
+)
 
 
 @dataclass(frozen=True)

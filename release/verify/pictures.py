@@ -39,9 +39,8 @@ PERSON_HALF_M = np.array(PERSON_HALF_EXTENTS_M)
 NOTHING = np.empty((0, 0), np.float32)
 NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
-Decoded = tuple[
-    np.ndarray, np.ndarray, np.ndarray | None, float
-]  # depth, instance, colours at the grid's rows, `outline_step`
+# Depth, instance, colours at the grid's rows, `outline_step`.
+Decoded = tuple[np.ndarray, np.ndarray, np.ndarray | None, float]
 
 
 def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, findings: Findings) -> Decoded | None:  # fmt: skip

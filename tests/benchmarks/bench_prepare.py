@@ -34,9 +34,8 @@ from distill.schema import open_split, split_path
 from specimens import make_flight
 
 WINDOWS = 1000  # of a flight
-STATE = " ".join(
-    f"({k}.25, {k}.50, {k}.75; -30.0, 12.5, 0.0)" for k in range(24)
-)  # as long as a real prompt's measurements
+# As long as a real prompt's measurements.
+STATE = " ".join(f"({k}.25, {k}.50, {k}.75; -30.0, 12.5, 0.0)" for k in range(24))
 
 
 def write_material(folder: Path, num_windows: int) -> None:

@@ -66,9 +66,8 @@ class Spans:
                 return function(*args, **named)
             finally:
                 end_s = time.monotonic()
-                self.found.append(
-                    (name, end_s, end_s - clock_s, time.thread_time() - used_s)
-                )  # one step: no thread comes between
+                # One step: no thread comes between.
+                self.found.append((name, end_s, end_s - clock_s, time.thread_time() - used_s))
 
         return timed
 

@@ -42,9 +42,8 @@ def main() -> None:
     raw = scenes.town()
     warm_up_ms, result = scenes.cpu_ms(lambda: simplify(raw, SimplifyConfig()))
     rows = [measure("(a) town", raw)]
-    peak_mb = (
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    )  # of (a) alone, with the interpreter and all libraries
+    # Of (a) alone, with the interpreter and all libraries.
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     city = scenes.city()
     if city is not None:
         rows += [measure("(b) city", city), measure("(c) city 12 x 12", scenes.tiled(city, 12, 12))]
