@@ -55,3 +55,14 @@ def _held_by_another(folder: Path) -> Iterator[subprocess.Popen]:
 def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subprocess.Popen]]:
     """Give a context in which another process holds a folder; it is killed at the end."""
     return _held_by_another
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """PyTorch in one thread: sums then do not depend on the machine, and a tiny model is faster so."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -143,3 +145,15 @@ def _write_frame(folder: Path, pose: dict, point: dict, files: tuple[str, ...]) 
             np.save(folder / name, depth)
         else:
             pictures[name].save(folder / name)
+
+
+def hub_snapshot(dataset: Path, cache: Path) -> Path:
+    """Lay a release into a cache as a hub's client keeps it: files are links into ../../blobs. Gives its folder."""
+    snapshot, blobs = cache / "datasets--me--town/snapshots/0123", cache / "datasets--me--town/blobs"
+    blobs.mkdir(parents=True)
+    for number, path in enumerate(sorted(path for path in dataset.rglob("*") if path.is_file())):
+        shutil.copy(path, blobs / str(number))
+        link = snapshot / path.relative_to(dataset)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
+    return snapshot

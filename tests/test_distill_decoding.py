@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,15 +23,9 @@ from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 MOST = 40  # tokens of an answer
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -41,14 +41,6 @@ from specimens import make_playback_tree  # noqa: E402
 NUM_TOKENS = 12
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("local")
@@ -327,6 +319,9 @@ def test_constrained_answers_all_parse(place, clean, tmp_path):
             assert prediction.raw.startswith('{"critical_components":"')
     again = answer(place, tmp_path / "one", constrained=True, max_new_tokens=900, max_samples=2, batch_size=1)
     assert told(read_predictions(again)) == told(predictions)
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_an_adapter_of_another_student_is_refused(place, tmp_path):

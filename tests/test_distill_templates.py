@@ -7,7 +7,6 @@ field alone, and begins its system text with how much to think unless thinking i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +21,8 @@ from distill.student.encoding import END_OF_ANSWER, chat_text, encode_text, prom
 from distill.student.model import END_OF_TURN, Processor  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 WORDS = """
 {%- macro words(content) -%}
@@ -93,14 +94,6 @@ TEMPLATES = {
     "3.6": WORDS + turns("(preserve_thinking is defined and preserve_thinking)", reads_thoughts=True) + END,
     "3.8": WORDS + EFFORT + turns("(preserve_thinking | default(true))", reads_thoughts=False) + END,
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

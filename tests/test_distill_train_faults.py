@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,6 +25,8 @@ from distill.training import fit, validation  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 RUN = """
 import json, os, pathlib, resource, sys
 import torch
@@ -42,14 +43,6 @@ try:
 except CosflyError as error:
     sys.exit(f"{type(error).__name__}: {error}")
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

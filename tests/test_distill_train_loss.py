@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,17 +24,11 @@ from distill.training.loading import Packed  # noqa: E402
 from distill.training.loss import answer_loss, chunked_loss, output_head  # noqa: E402
 from distill.training.settings import TARGET_MODULES, TrainConfig  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 # Adam divides by what gradients were before, so rounding grows from step to step, with a rate that makes a student learn in 12 steps
 # sooner than with usual ones.
 FOUR = {**TWELVE, "max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from owners import S3, python_with
+from specimens_foreign import hub_snapshot
 from test_release_export import TWO_SPLITS, make_release
 from test_release_package import all_bytes
 
@@ -175,14 +176,7 @@ def test_a_web_server_of_static_files(dataset, part, tmp_path):
 
 
 def test_a_snapshot_in_the_hubs_cache(dataset, part, tmp_path):
-    """Files are links into ../../blobs."""
-    snapshot, blobs = tmp_path / "datasets--me--town/snapshots/0123", tmp_path / "datasets--me--town/blobs"
-    blobs.mkdir(parents=True)
-    for number, path in enumerate(sorted(path for path in dataset.rglob("*") if path.is_file())):
-        shutil.copy(path, blobs / str(number))
-        link = snapshot / path.relative_to(dataset)
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
+    snapshot = hub_snapshot(dataset, tmp_path)
     assert shards_of(get(choice(**PART), str(snapshot), tmp_path / "part")) == part
     assert all_bytes(get(choice(), str(snapshot), tmp_path / "all")) == all_bytes(dataset)
 

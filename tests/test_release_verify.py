@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from release_lies import LIES
 from release_tampering import errors_in, forge, read_all, set_depth
-from specimens_foreign import write_foreign_tree
+from specimens_foreign import hub_snapshot, write_foreign_tree
 from typer.testing import CliRunner
 
 from caption.truth.released import read_released
@@ -87,15 +87,7 @@ def test_processes_find_what_one_finds(honest, tmp_path):
 
 
 def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
-    """Files are links into ../../blobs."""
-    snapshot, blobs = tmp_path / "datasets--me--flights/snapshots/0123", tmp_path / "datasets--me--flights/blobs"
-    blobs.mkdir(parents=True)
-    for number, path in enumerate(sorted(path for path in honest.rglob("*") if path.is_file())):
-        shutil.copy(path, blobs / str(number))
-        link = snapshot / path.relative_to(honest)
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(os.path.relpath(blobs / str(number), link.parent))
-    assert errors_in(snapshot) == {}
+    assert errors_in(hub_snapshot(honest, tmp_path)) == {}
 
 
 def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
