@@ -144,6 +144,7 @@ def test_a_hard_conflict_cannot_be_repaired(tree, rules, tmp_path):
     with pytest.raises(NothingKept, match="conflict_not_repairable"):
         captions_of(lines, tree, tmp_path / "a")
     dropped = list(read_captions(tmp_path / "a/out/captions.jsonl"))
+    assert len(dropped) == len(lines)
     assert all(caption.en and (caption.checks.sentences or {}).keys() == {"en"} for caption in dropped)
     kept = captions_of(lines, tree, tmp_path / "b", repair={"hard_conflict": "keep"})
     assert {caption.verdict for caption in kept} == {"HARD_CONFLICT"}

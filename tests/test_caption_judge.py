@@ -95,6 +95,7 @@ def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_
     fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
     captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
     asked = [c for c in captions if c.judge]
+    assert asked
     # The rule teacher names its decision in the text, so replacing the token alone would make a lie.
     assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
 

@@ -71,11 +71,25 @@ def test_no_page_holds_what_a_merge_left():
         assert not left, f"{page.name}: {left}"
 
 
+def anchors_of(page: Path) -> set[str]:
+    """What its headings are called in links: small letters, hyphens for spaces, no punctuation."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", name.lower()).replace(" ", "-") for name in re.findall(r"^#+ +(.+)", text, re.MULTILINE)
+    }
+
+
 def test_links_and_pictures_exist():
-    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-            if "://" not in target:
-                assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    num_anchors = 0
+    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
+            if "://" in target:
+                continue
+            there = page.parent / target if target else page
+            assert there.exists(), f"{page.name} links to {target}"
+            assert not anchor or anchor in anchors_of(there), f"{page.name} links to {target}#{anchor}"
+            num_anchors += bool(anchor)
+    assert num_anchors > 20
 
 
 def test_ci_runs_a_command_of_the_readme():

@@ -26,7 +26,7 @@ from test_release_package import FREE, all_bytes, make_caption, make_inspection,
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.errors import ConfigError, InputError, NothingKept, VerifyError
+from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products import review
 from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.flights import find_flights
@@ -383,10 +383,10 @@ def test_captions_that_nothing_binds_to_the_tree_are_refused(material, tmp_path)
 def test_a_folder_that_holds_something_else_is_left_alone(material, tmp_path):
     (tmp_path / "r/dataset").mkdir(parents=True)
     (tmp_path / "r/dataset/README.md").write_text("mine")
-    with pytest.raises(Exception, match="not cosfly's"):
+    with pytest.raises(ResumeError, match="not cosfly's"):
         run(split_cfg(), [source_of(material)], tmp_path / "r")
     record_of(material, tmp_path / "one")
-    with pytest.raises(Exception, match="other settings"):
+    with pytest.raises(ResumeError, match="other settings"):
         record_of(material, tmp_path / "one", split_cfg(num_frames=6))
     assert (tmp_path / "r/dataset/README.md").read_text() == "mine"
     assert (tmp_path / "one/dataset/release.json").is_file()

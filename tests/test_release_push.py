@@ -235,4 +235,5 @@ def test_a_name_that_is_none_is_refused(name):
 def test_shards_go_before_the_records(dataset):
     names = list(pack(dataset).files)
     assert names[-1] == "checksums.sha256"
+    assert len(names) > 4
     assert all(name.startswith("data/") for name in names[: len(names) - 4])
