@@ -22,17 +22,8 @@ from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused, refuse_decision, way_of
 from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Usage
 from cosfly.errors import InputError, RenderError
-from cosfly.products.captions import (
-    Caption,
-    Checks,
-    Coc,
-    JudgeRecord,
-    Language,
-    Parsed,
-    RepairRecord,
-    Verdict,
-    parse_answer,
-)
+from cosfly.products.answer_text import Parsed, parse_answer
+from cosfly.products.captions import Caption, Checks, Coc, JudgeRecord, Language, RepairRecord, Verdict
 
 
 async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:

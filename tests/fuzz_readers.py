@@ -58,8 +58,9 @@ from cosfly.planners.compare_tables import text_tables
 from cosfly.png.read import parse_png
 from cosfly.products import review
 from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
+from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.products.captions import Coc, Parsed, parse_answer, read_captions
+from cosfly.products.captions import Coc, read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection

@@ -8,7 +8,8 @@ from caption.teachers.rules import write_templates
 from caption.truth.facts import Facts
 from caption.writing.contract import Draft
 from caption.writing.slots import Slots
-from cosfly.products.captions import Coc, Parsed
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Coc
 
 
 def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None = None) -> tuple[Coc, Coc]:

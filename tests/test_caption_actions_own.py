@@ -38,7 +38,8 @@ from cosfly.products.actions import (
     read_actions,
     shipped_actions,
 )
-from cosfly.products.captions import answer_schema, normalize_action, read_captions
+from cosfly.products.answer_text import answer_schema, normalize_action
+from cosfly.products.captions import read_captions
 from cosfly.reading.documents import read_json
 from cosfly.settings import RunConfig
 from cosfly.splits import SPLITS

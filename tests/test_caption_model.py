@@ -14,7 +14,8 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from cosfly.errors import NothingKept
-from cosfly.products.captions import parse_answer, read_captions
+from cosfly.products.answer_text import parse_answer
+from cosfly.products.captions import read_captions
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
 

@@ -29,7 +29,8 @@ from caption.writing.slots import Slots, fact_table
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.errors import NothingKept
 from cosfly.products.actions import action_tokens
-from cosfly.products.captions import Coc, Language, Parsed, read_captions
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Coc, Language, read_captions
 from specimens import make_flight, make_playback_tree
 
 FACTS = Facts(

@@ -30,8 +30,9 @@ from caption.truth.actions import label_of, measure
 from caption.truth.facts import measure_facts
 from caption.windows import current_frames, cut_future, cut_windows
 from cosfly.products.actions import action_tokens
+from cosfly.products.answer_text import answer_schema
 from cosfly.products.boxes import MapHeader, make_box_map
-from cosfly.products.captions import answer_schema, read_captions
+from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.playback import Flight, read_flight, write_flight
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb

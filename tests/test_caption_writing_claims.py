@@ -18,7 +18,8 @@ from caption.truth.facts import Facts
 from caption.writing.claims import MAX_CLAIMS, Claims, read_claims
 from caption.writing.contract import Draft, Refused, more_fields, way_of
 from cosfly.errors import NothingKept
-from cosfly.products.captions import Claim, Parsed, answer_schema, parse_answer, read_captions
+from cosfly.products.answer_text import Parsed, answer_schema, parse_answer
+from cosfly.products.captions import Claim, read_captions
 from specimens import make_playback_tree
 
 WAY = way_of("claims")

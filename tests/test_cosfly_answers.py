@@ -20,7 +20,8 @@ from cosfly.chat.objects import find_object
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
 from cosfly.frame_views import encode_picture
-from cosfly.products.captions import Coc, normalize_action, parse_answer
+from cosfly.products.answer_text import normalize_action, parse_answer
+from cosfly.products.captions import Coc
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

@@ -12,16 +12,8 @@ from specimens_distill import make_caption
 from cosfly.chat.objects import MAX_CHARACTERS
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
-from cosfly.products.captions import (
-    Caption,
-    Coc,
-    answer_schema,
-    is_in_script,
-    normalize_action,
-    parse_answer,
-    read_captions,
-    write_captions,
-)
+from cosfly.products.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
+from cosfly.products.captions import Caption, Coc, read_captions, write_captions
 from cosfly.products.sentences import END, cut_sentences
 
 GOOD = {

@@ -20,7 +20,8 @@ from cosfly.chat.answers import AnswerBook
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
 from cosfly.journal import Journal
-from cosfly.products.captions import parse_answer, write_captions
+from cosfly.products.answer_text import parse_answer
+from cosfly.products.captions import write_captions
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.stage_folder import StageFolder, Tally
 from cosfly.store import dump_json

@@ -23,7 +23,8 @@ from cosfly.chat.protocol import base_url, read_completion, read_models
 from cosfly.chat.refusals import kind_of
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.config import apply_overrides, build
-from cosfly.products.captions import FIELDS, parse_answer
+from cosfly.products.answer_text import parse_answer
+from cosfly.products.captions import FIELDS
 from cosfly.reading.documents import parse_document
 from cosfly.settings import RunConfig
 from cosfly.store import CHECKSUMS, read_checksums

@@ -21,7 +21,8 @@ from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.frame_views import Pictures
-from cosfly.products.captions import Language, Prompt, answer_schema
+from cosfly.products.answer_text import answer_schema
+from cosfly.products.captions import Language, Prompt
 from cosfly.student_chat import (
     IMAGE_ENCODING,
     SentPicture,

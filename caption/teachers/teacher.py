@@ -37,7 +37,8 @@ from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.frame_views import Pictures
-from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing, answer_schema
+from cosfly.products.answer_text import answer_schema
+from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.products.places import flight_of
 
 ENCODING_THREADS = 4

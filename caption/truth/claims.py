@@ -31,7 +31,8 @@ from caption.truth.sentences import Judged
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import Stated, read_stated
 from cosfly.products.actions import kin_of
-from cosfly.products.captions import Claim, Coc, Language, SentenceState, normalize_action
+from cosfly.products.answer_text import normalize_action
+from cosfly.products.captions import Claim, Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
 
 

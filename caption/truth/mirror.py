@@ -12,7 +12,8 @@ from collections.abc import Iterable
 from caption.truth.facts import Facts
 from caption.truth.glossary import Number, load_glossary
 from caption.truth.references import Series
-from cosfly.products.captions import Coc, Language, is_in_script
+from cosfly.products.answer_text import is_in_script
+from cosfly.products.captions import Coc, Language
 from cosfly.products.sentences import cut_sentences
 
 TEXTS = ("critical_components", "reasoning_trace")

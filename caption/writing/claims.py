@@ -21,7 +21,8 @@ from caption.truth.references import QUANTITIES
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from cosfly.errors import plain
-from cosfly.products.captions import Claim, Language, Modality, Parsed
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Claim, Language, Modality
 from cosfly.products.sentences import sentences_of
 
 MAX_CLAIMS = 60

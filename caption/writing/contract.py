@@ -15,7 +15,8 @@ from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.sentences import Judged
 from cosfly.products.actions import action_tokens
-from cosfly.products.captions import Claim, Coc, Language, Parsed, SentenceState, Template, Writing
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Claim, Coc, Language, SentenceState, Template, Writing
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",

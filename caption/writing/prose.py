@@ -10,7 +10,8 @@ from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.judging import judge_sentences
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
-from cosfly.products.captions import Language, Parsed
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Language
 
 
 class Prose:

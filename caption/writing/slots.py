@@ -19,7 +19,8 @@ from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler, facts_of
 from caption.writing.templates import Sentence, read_sentence
 from cosfly import in_place
-from cosfly.products.captions import Coc, Language, Parsed, SentenceState, Template
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Coc, Language, SentenceState, Template
 from cosfly.products.sentences import cut_sentences
 
 MAX_COMPLAINTS = 6  # named at once

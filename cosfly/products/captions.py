@@ -1,15 +1,12 @@
 """Chain-of-Cause captions on disk: the three-field answer with its decision of the closed set (actions.py), `captions.jsonl`.
 
-Shared by caption (which writes), distill and release (which read). How a decision is judged against the geometry lives in
-caption/truth/actions.py; here is only what an answer must look like.
+Shared by caption (which writes), distill and release (which read). What an answer must look like stands in answer_text.py; how a
+decision is judged against the geometry in caption/truth/actions.py.
 """
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Iterator
 from functools import partial
 from operator import is_
 from pathlib import Path
@@ -18,26 +15,11 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import to_json
 
-from cosfly import in_place
 from cosfly.chat.contract import Usage
-from cosfly.chat.objects import find_object
-from cosfly.products.actions import action_tokens
 from cosfly.reading.documents import model_lines
 from cosfly.store import atomic_file
 
-_DECISION = re.compile(
-    r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
-    r"""(?:(?:option|action|decision|answer|(?:flight|final)[\s_-]?(?:decision|action|answer)|动作|决策|飞行决策)["'`*]*\s*[:=]\s*["'`*]*)?"""
-    r"""(?P<action>[a-z]+(?:[\s_-]+[a-z]+)*)(?:\(\))?[\s"'`*_>\])}“”‘’」』】》.,;:!。、]*"""
-)
-
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
-MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
-# A Chinese character carries about as much as three Latin letters, so the same thought is a third as long.
-MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
-MAX_DECISION_CHARACTERS = 100  # with all that may stand round a token
-MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bounded: a server may pad for ever
-
 Language = Literal["en", "zh"]
 TeacherKind = Literal["rules", "endpoint", "vllm", "file", "student"]
 Writing = Literal["slots", "claims", "prose"]
@@ -50,40 +32,6 @@ LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
 
-@in_place.kept()
-def _tokens_by_letters() -> dict[str, str]:
-    return {token.replace("_", ""): token for token in action_tokens()}
-
-
-def normalize_action(text: str) -> str | None:
-    """Give the token for any spelling (spaces, hyphens, case; quotes, marks and brackets round it; `Decision:` before it), else None."""
-    by_letters = _tokens_by_letters()
-    if by_letters.get(text.replace("_", "")) == text:
-        return text
-    if len(text) > MAX_DECISION_CHARACTERS:
-        return None
-    plain = "".join(char for char in unicodedata.normalize("NFKC", text) if unicodedata.category(char) != "Cf")
-    found = _DECISION.fullmatch(plain.lower())
-    return by_letters.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
-
-
-def answer_schema(
-    decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
-) -> dict:
-    """Give the JSON schema of an answer; a given decision is the enum's one value.
-
-    Args:
-        more: further fields and their schemas; they stand after the texts and before the decision, which decoders keep to.
-    """
-    properties: dict[str, dict] = {
-        name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
-        for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
-    }
-    properties |= more or {}
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(action_tokens())}
-    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
-
-
 class Coc(BaseModel):
     """One Chain-of-Cause answer in one language."""
 
@@ -92,105 +40,6 @@ class Coc(BaseModel):
     critical_components: str
     reasoning_trace: str
     flight_decision: str
-
-
-@dataclass(frozen=True)
-class Parsed:
-    """A checked answer: `coc` is None when the structure is wrong, for the `reason`; `recovered` names what was mended.
-
-    therefore: the action of that field, where it was asked for. more: the other further fields, as they came.
-    """
-
-    coc: Coc | None
-    reason: str | None = None
-    recovered: tuple[str, ...] = ()
-    therefore: str | None = None
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-
-_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-_DOTS = ("...", "…", "⋯", "。。。", "···")  # in the place of a text
-_LEFT_OUT = re.compile(r"\.{3,}|…+|⋯+|。{3,}|·{3,}")
-_SLOT = re.compile(r"\{[^{}]*\}")
-_HAN = re.compile(r"[\u4e00-\u9fff]+")
-_LATIN = re.compile(r"[A-Za-z]{2,}")
-# All of it is Chinese but for numbers, marks, slots and single letters: most texts, and one scan tells.
-_PLAIN_ZH = re.compile(
-    r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+)*+"
-)
-_OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
-
-
-def parse_answer(
-    text: str, language: Language = "en", more: Collection[str] = (), finish_reason: str | None = None
-) -> Parsed:
-    """Check the structure of a raw answer (phase 3 of sec:appendix_e).
-
-    What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in `recovered`
-    (cosfly/chat/objects.py), as are raw control characters inside strings. Anything else is a failure with a reason word.
-
-    Args:
-        more: names of the further fields that were asked for.
-        finish_reason: why the writer ended, where it is known.
-    """
-    names = (*FIELDS, *more)
-    found = find_object(text, names, finish_reason)
-    recovered = list(found.mended)
-    parsed = Parsed(None, found.reason) if found.value is None else _checked(found.value, language, names, recovered)
-    return replace(parsed, recovered=tuple(recovered)) if recovered else parsed
-
-
-def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
-    if len(value) != len(names) or not all(map(value.__contains__, names)):
-        return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
-    if not all(isinstance(value[name], str) for name in FIELDS):
-        return Parsed(None, "field_not_text")
-    if not all(value[name].isprintable() or not _CONTROL.search(value[name]) for name in FIELDS):
-        value = {name: _CONTROL.sub("", text) if name in FIELDS else text for name, text in value.items()}
-        recovered.append("control_characters")
-    cleaned = {name: value[name].strip() for name in FIELDS}
-    for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items():
-        problem = _problem_of(cleaned[name], language, characters)
-        if problem is not None:
-            return Parsed(None, f"{name}_{problem}")
-    action = normalize_action(cleaned["flight_decision"])
-    if action is None:
-        return Parsed(None, "decision_not_in_closed_set")
-    therefore = normalize_action(value["therefore"]) if isinstance(value.get("therefore"), str) else None
-    if therefore is None and "therefore" in names:
-        return Parsed(None, "therefore_not_in_closed_set")
-    others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}
-    return Parsed(Coc(**{**cleaned, "flight_decision": action}), therefore=therefore, more=others)
-
-
-def _problem_of(text: str, language: Language, min_characters: int) -> str | None:
-    """Say what makes a text none of a caption: it is short, stands for another one, or is in another language."""
-    if len(text) < min_characters:
-        return "too_short"
-    if (text[0], text[-1]) in (("<", ">"), ("[", "]")) or (
-        any(map(text.__contains__, _DOTS)) and _is_left_out(text, min_characters)
-    ):
-        return "placeholder"
-    return None if is_in_script(text, language) else "wrong_language"
-
-
-def _is_left_out(text: str, min_characters: int) -> bool:
-    """Tell whether dots stand for the text, or for its beginning or end."""
-    at_an_end = _LEFT_OUT.match(text) or _LEFT_OUT.search(text, len(text) - 3)
-    return at_an_end is not None or len(_LEFT_OUT.sub("", text).strip()) < min_characters
-
-
-def is_in_script(text: str, language: Language) -> bool:
-    """Tell whether a text is written in its language: Chinese has no more Latin words than characters, English the reverse.
-
-    Letters of other scripts are of neither. The names in slots are no words.
-    """
-    if text.isascii() if language == "en" else _PLAIN_ZH.fullmatch(text):
-        return True
-    text = _SLOT.sub("", text)
-    num_han, num_words = sum(map(len, _HAN.findall(text))), len(_LATIN.findall(text))
-    num_others = len(_OTHER_LETTER.findall(text))
-    return num_words + num_others <= num_han if language == "zh" else num_han + num_others <= num_words
 
 
 def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) -> Verdict:

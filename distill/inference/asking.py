@@ -12,7 +12,7 @@ from cosfly.chat.contract import Engine, NoAnswer, Request
 from cosfly.chat.protocol import answer_key
 from cosfly.console import Advance
 from cosfly.errors import InputError, TeacherError
-from cosfly.products.captions import answer_schema
+from cosfly.products.answer_text import answer_schema
 from cosfly.stage_folder import Failed
 from cosfly.student_chat import StudentEndpointConfig, picture_to_send, student_request
 from distill.inference.outcome import Answered, OpenFlights

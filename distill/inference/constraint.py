@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.products.captions import Language, answer_schema
+from cosfly.products.answer_text import answer_schema
+from cosfly.products.captions import Language
 from distill.student.model import Student, require
 
 

@@ -11,7 +11,7 @@ from typing import IO
 
 from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.chat.contract import CONTEXT_FULL
-from cosfly.products.captions import parse_answer
+from cosfly.products.answer_text import parse_answer
 from cosfly.products.places import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.stage_folder import Failed, Tally, write_failures

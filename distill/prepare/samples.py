@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 
 from cosfly.errors import InputError
 from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
-from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, parse_answer
+from cosfly.products.answer_text import parse_answer
+from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict
 from cosfly.products.places import FlightChoice
 from cosfly.store import dump_json
 from distill.prepare.splitting import SplitConfig

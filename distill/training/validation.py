@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.console import progress_bar
-from cosfly.products.captions import parse_answer
+from cosfly.products.answer_text import parse_answer
 from distill.schema import Sample
 from distill.student.decoding import decode
 from distill.student.model import Student

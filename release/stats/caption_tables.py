@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from cosfly.products.actions import shipped_actions
-from cosfly.products.captions import FIELDS, MIN_CHARACTERS, MIN_CHARACTERS_ZH
+from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
+from cosfly.products.captions import FIELDS
 from release.record import ReleaseRecord
 from release.stats.cells import SPREAD, pairs, percent, spread_row
 from release.stats.counting import LANGUAGES, STATES, TEXT_BIN, Counts

@@ -9,15 +9,8 @@ import re
 from collections import Counter
 from typing import Any
 
-from cosfly.products.captions import (
-    FIELDS,
-    MAX_CHARACTERS,
-    MIN_CHARACTERS,
-    MIN_CHARACTERS_ZH,
-    PICTURES_MARK,
-    Coc,
-    is_in_script,
-)
+from cosfly.products.answer_text import MAX_CHARACTERS, MIN_CHARACTERS, MIN_CHARACTERS_ZH, is_in_script
+from cosfly.products.captions import FIELDS, PICTURES_MARK, Coc
 from cosfly.products.sentences import sentences_of
 from release.columns import (
     CAPTION_COLUMNS,
