@@ -194,6 +194,19 @@ def test_facts_of_a_hand_made_window(tree):
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
 
+def test_a_walker_who_turns_left_does_so_in_the_facts(tree):
+    """East for two steps, then north: in a mirrored world it would be to the right."""
+    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
+    ways = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)]
+    frames = zip(window.frames, ways, strict=True)
+    window = dataclasses.replace(
+        window, frames=tuple(dataclasses.replace(frame, target_m=(*way, 0.9)) for frame, way in frames)
+    )
+    facts = measure_facts(window)
+    assert facts.target_headings_deg == (None, 0.0, 0.0, 90.0, 90.0)
+    assert facts.target_turn_deg == 90.0
+
+
 def test_the_box_is_that_of_what_is_seen(tree):
     """Where a tree tells the box of the person's pixels, texts measure that one; hidden from view, it has none."""
     flight = flight_in(tree)
