@@ -168,6 +168,7 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
         (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
         (PLAIN.replace("height,yaw_deg", "height,center_z"), {}, "2 columns are the z: z, center_z"),
         (PLAIN.replace(",12,8,8,30", ",12,8,8"), {}, "line 2: 8 cells, where the first line has 9"),
+        (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {}, r"length is not a finite number: '12,5'; write a decimal point"),
         (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {}, r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
         (PLAIN.replace("7,Buildings", "8,Buildings"), {}, "id 8 occurs 2 times"),
         (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),

@@ -71,7 +71,8 @@ def _number(name: str, value: Any) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if isinstance(value, bool) or not abs(number) <= LARGEST:
-        raise WrongRow(f"{name} is not a finite number: {str(value)[:40]!r}")
+        point = "; write a decimal point, no comma" if "," in str(value) else ""
+        raise WrongRow(f"{name} is not a finite number: {str(value)[:40]!r}{point}")
     return number
 
 

@@ -24,7 +24,7 @@ def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
         InputError: the folder is missing or holds no flight, or none is chosen.
     """
     if not root.is_dir():
-        raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check --data")
+        raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
         raise InputError(
