@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO
 from weakref import WeakValueDictionary
 
-from cosfly.errors import ResumeError
+from cosfly.errors import ResumeError, StorageError
 from cosfly.reading.documents import parse_json
 from cosfly.store import storage_errors
 
@@ -93,6 +93,13 @@ def give_up(below: Path | None = None) -> None:
     for path, held in sorted(_held.items(), key=lambda one: len(one[0].parts), reverse=True):
         if below is None or path.is_relative_to(below.resolve()):
             held.give_up()
+
+
+def remove_left_lock(folder: Path) -> None:
+    """Remove the file that a kill left in a finished folder, unless somebody holds it or nothing may be written there."""
+    if (folder / LOCK).exists() and not is_held(folder):
+        with contextlib.suppress(ResumeError, StorageError):
+            hold_folder(folder).release()
 
 
 def is_held(folder: Path) -> bool:

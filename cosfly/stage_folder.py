@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 import cosfly
 from cosfly.config import Config
 from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.folder_lock import LOCK, FolderLock, hold_folder
+from cosfly.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
 from cosfly.journal import Journal
 from cosfly.provenance import (
     MANIFEST_SCHEMA,
@@ -252,6 +252,7 @@ class StageFolder:
         if differing or grown or manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
+        remove_left_lock(out)
         log.debug("%s: complete for the same settings and inputs: %s", record.stage, out)
         return cls(out, record.stage, True)
 
@@ -336,7 +337,8 @@ def _taken_up(
             )
         return record
     if not _holds_work(out):  # an attempt that ended before anything was finished binds nobody to its settings
-        for name in BEGUN:
+        # stage.json last: without it a kill on the way would leave what looks like somebody else's files.
+        for name in reversed(BEGUN):
             (out / name).unlink(missing_ok=True)
         return record
     found = read_stage_record(out)
@@ -345,7 +347,10 @@ def _taken_up(
     if grown:
         log.info("%s: goes on with more: %s", out, "; ".join(grown))
         if (out / "manifest.json").exists():
-            before += [fingerprint(out), *recorded_digests(out).values()]
+            before += [d for d in (fingerprint(out), *recorded_digests(out).values()) if d not in before]
+            # While the manifest stands: once it is gone, nobody could say any more what the products of before were.
+            noted = found.model_copy(update={"grown_from": before})
+            write_model(out / "stage.json", noted, schema=STAGE_SCHEMA, version=VERSION)
         if begins_anew:
             (out / "items.jsonl").unlink(missing_ok=True)
     return record.model_copy(

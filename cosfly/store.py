@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatch
+from glob import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -55,7 +56,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
         raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)  # a kill left it, or somebody put a link there
+        _remove_left(path)
         try:
             with open(partial, "xb") as file:
                 yield file
@@ -70,6 +71,32 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 def _partial(path: Path) -> Path:
     """Give the temporary name of a file or folder; `remove_partials` knows it."""
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def _remove_left(path: Path) -> None:
+    """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of this one."""
+    for left in path.parent.glob(f".{escape(path.name)}.*.partial"):
+        owner = left.name.removeprefix(f".{path.name}.").removesuffix(".partial")
+        if owner.isdecimal() and not _is_another(int(owner)):
+            _remove(left)
+
+
+def _is_another(pid: int) -> bool:
+    """Tell whether another process has this id."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return pid != os.getpid()
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def is_partial_of(name: str, path: Path) -> bool:
@@ -137,10 +164,7 @@ def refuse_links(folder: Path) -> None:
 def remove_partials(folder: Path) -> None:
     """Remove what a kill left under temporary names."""
     for path in sorted(folder.rglob(".*.partial"), reverse=True):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        _remove(path)
 
 
 LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
@@ -220,7 +244,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     partial = _partial(path)
     refuse_link(path)
     with storage_errors(path):
-        partial.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_left(path)
+        partial.mkdir()
         try:
             yield partial
         except BaseException:

@@ -14,6 +14,7 @@ from cosfly.config import Config, MayDiffer
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.folder_lock import give_up
 from cosfly.journal import Journal
+from cosfly.provenance import fingerprint, has_grown_from, read_stage_record
 from cosfly.reading.documents import read_json
 from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
 from cosfly.store import inside, write_bytes, write_json
@@ -106,6 +107,10 @@ class Newer(Demo):
 
     solids: bool = True
     extra: Demo = Demo()
+
+
+class Growing(Config):
+    count: int
 
 
 def _open(out, **changes):
@@ -305,6 +310,80 @@ def test_a_finished_folder_needs_no_lock_and_holds_none(tmp_path, held_by_anothe
         with pytest.raises(ResumeError, match="another process"):
             _open(out, seed=1, resume="force")
     assert (out / "manifest.json").exists()
+
+
+def test_a_lock_that_a_kill_left_in_a_finished_folder_goes(tmp_path):
+    out = tmp_path / "out"
+    stage = _open(out)
+    write_json(out / "product.json", 1)
+    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    (out / ".lock").write_text("{}")
+    assert _open(out).is_complete
+    assert not (out / ".lock").exists()
+
+
+def test_a_kill_while_an_attempt_without_work_is_cleared_away_leaves_a_folder_to_go_on_with(tmp_path, monkeypatch):
+    stage = _open(tmp_path / "out")
+    stage.journal.append({"id": "a", "status": "failed", "code": "x", "message": "y"})
+    write_failures(stage.path / "failures.jsonl", [])
+    give_up()
+    unlink = Path.unlink
+
+    def unlink_one(path, **more):
+        if path.name == "items.jsonl":
+            unlink(path, **more)
+            raise KeyboardInterrupt
+        unlink(path, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink_one)
+        with pytest.raises(KeyboardInterrupt):
+            _open(tmp_path / "out")
+    assert not _open(tmp_path / "out").is_complete
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_what_a_stage_has_grown_from_outlives_a_kill_before_its_new_record(tmp_path, monkeypatch, is_killed):
+    """Else the stages behind it would take the larger product for another one, and not go on."""
+    out = tmp_path / "out"
+    stage = _open(out, config=Growing(count=1))
+    write_json(out / "product.json", 1)
+    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    before = fingerprint(out)
+    if is_killed:
+        unlink = Path.unlink
+
+        def unlink_and_end(path, **more):
+            unlink(path, **more)
+            if path.name == "manifest.json":
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "unlink", unlink_and_end)
+            with pytest.raises(KeyboardInterrupt):
+                _open(out, config=Growing(count=2), grows=("count",))
+        assert not (out / "manifest.json").exists()
+    _open(out, config=Growing(count=2), grows=("count",))
+    assert has_grown_from(out, before)
+    assert len(read_stage_record(out).grown_from) == 2
+
+
+@pytest.mark.parametrize("name", [".a.json.999999999.partial", f".a.json.{os.getpid()}.partial"])
+def test_what_a_kill_left_of_a_file_goes_when_it_is_written_again(tmp_path, name):
+    (tmp_path / name).write_text("half")
+    for other in (".a.json.b.999999999.partial", f".a.json.{os.getppid()}.partial", ".a.json.mine.partial"):
+        (tmp_path / other).write_text("of another file, of a process that lives, of nobody")
+    write_json(tmp_path / "a.json", 1)
+    assert not (tmp_path / name).exists()
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_what_a_kill_left_of_a_folder_goes_when_it_is_written_again(tmp_path):
+    for pid in (os.getpid(), 999_999_999):
+        (tmp_path / f".a.{pid}.partial/b").mkdir(parents=True)
+    with store.atomic_folder(tmp_path / "a") as folder:
+        (folder / "c").write_text("c")
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/c"]
 
 
 def test_a_lock_leads_nowhere_else(tmp_path):
