@@ -60,7 +60,12 @@ def test_what_is_exported_is_what_ships(tmp_path):
     assert result.exit_code == 0, result.output
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {p.name: p.read_bytes() for p in PROMPTS.glob("*.txt")}
     assert CliRunner().invoke(app, ["caption", "prompts", "--check", str(folder)]).exit_code == 0
+    (folder / "user_zh.txt").unlink()  # as after a kill
+    assert CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)]).exit_code == 0
+    edit(folder / "user_en.txt", "$speed", "${speed}")
+    (folder / "user_zh.txt").unlink()
     again = CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)])
+    assert not (folder / "user_zh.txt").exists()
     assert isinstance(again.exception, ConfigError)
     assert "are there already" in str(again.exception)
 

@@ -81,6 +81,8 @@ def _run(
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)
     if was_whole and not (retry_failed and _has_refused(stage, cfg)):
+        if read_manifest(out).facts.get("limit") is None:
+            shutil.rmtree(out / PARTS, ignore_errors=True)  # a kill came before they were gone
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)

@@ -116,12 +116,12 @@ def export_prompts(folder: Path) -> list[Path]:
     """Write the prompts in use into a folder, to begin with; files that stand there already stay.
 
     Raises:
-        ConfigError: a file of these names is there.
+        ConfigError: a file of these names is there, with another text.
     """
     texts = in_place.given("prompts") or shipped_prompts()
     folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
-    there = [name for name in texts if (folder / f"{name}{SUFFIX}").exists()]
+    there = [name for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
     if there:
         raise ConfigError(
             "prompts are there already", where=folder, got=f"{len(there)} of them: {there[0]}{SUFFIX}", fix="choose another folder"
@@ -130,3 +130,8 @@ def export_prompts(folder: Path) -> list[Path]:
     for path, text in zip(paths, texts.values(), strict=True):
         write_bytes(path, text.encode())
     return paths
+
+
+def _is_another(path: Path, text: str) -> bool:
+    """Tell whether something else stands where a text is to be written; the text itself may, of an export that was killed."""
+    return path.exists() and not (path.is_file() and read_text(path) == text)
