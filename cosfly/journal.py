@@ -28,24 +28,27 @@ class Journal:
 
     A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this process does
     not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by `read` and
-    counted in `num_damaged`; what stood in it is done again. `line_num` is the number of the line that was read last.
+    counted in `num_damaged`; what stood in it is done again. `is_cut_short`: the last of these has no end, as a kill leaves it.
+    `line_num` is the number of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.num_damaged = self.line_num = 0
+        self.is_cut_short = False
         self._file: Any = None
         self._lock = threading.Lock()
 
     def read(self) -> Iterator[dict]:
         """Yield the records in order, damaged lines left out."""
-        self.num_damaged = 0
+        self.num_damaged, self.is_cut_short = 0, False
         if not self.path.exists():
             return
         for number, line in enumerate(read_lines(self.path, what="journal"), 1):
             self.line_num, record = number, _record_of(line)
             if record is None:
                 self.num_damaged += 1
+                self.is_cut_short = not line.endswith(b"\n")
             else:
                 yield record
 

@@ -7,6 +7,7 @@ inspection that it was made on by the digest of that file; on another one nobody
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,8 @@ from cosfly.errors import InputError
 from cosfly.journal import Journal
 from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
 from cosfly.reading.files import sha256_file
+
+log = logging.getLogger(__name__)
 
 REVIEW = "review.jsonl"
 Verdict = Literal["accepted", "rejected"]
@@ -48,7 +51,7 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     Args:
         inspected: path of `inspect.json`.
     Raises:
-        InputError: a line is damaged or cannot be used, or was decided on another inspection.
+        InputError: a line is damaged or cannot be used, or was decided on another inspection. The last, cut short by a kill, does not count.
     """
     path, digest = inspected.with_name(REVIEW), sha256_file(inspected)
     journal, found = Journal(path), dict[str, Decision]()
@@ -60,9 +63,11 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
                 fix=f"move {REVIEW} away and decide again with cosfly inspect review, or put that inspection back",
             )  # fmt: skip
         found[decision.folder] = decision
-    if journal.num_damaged:
+    if journal.is_cut_short:
+        log.warning("%s: the last decision was cut short by a kill and does not count: decide it again", path)
+    if num_damaged := journal.num_damaged - journal.is_cut_short:
         raise InputError(
-            "a decision that was changed or cut short", where=path, got=f"{journal.num_damaged} damaged lines",
+            "a decision that was changed", where=path, got=f"{num_damaged} damaged lines",
             fix="put the file back, or move it away and decide again with cosfly inspect review",
         )  # fmt: skip
     return found
