@@ -39,6 +39,8 @@ from release.package.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)
 
+SUMMARY = "summary.json"
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -215,7 +217,7 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
                 wait_for_compiled(stage.name)
                 results.append(_do(stage, out, f"{number}/{len(todo)}", left))
         tree = out / "render"
-        if not all(result.was_complete for result in results) or not (out / "preview.gif").exists():
+        if not _is_summed_up(results, out) or not (out / "preview.gif").exists():
             contact_sheet(tree, out / "contact_sheet.png")
             preview_gif(tree, out / "preview.gif")
         _save_summary(results, out)
@@ -242,10 +244,26 @@ def _save_run(cfg: RunConfig, out: Path) -> None:
     write_bytes(out / "run.yaml", text.encode())
 
 
+def _rows(results: list[StageResult]) -> list[dict[str, Any]]:
+    return [
+        {"stage": r.stage.name, "counts": r.manifest.counts.model_dump(mode="json"), "seconds": r.manifest.seconds}
+        for r in results
+    ]
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    return read_object(path, what="summary") if path.exists() else {}
+
+
+def _is_summed_up(results: list[StageResult], out: Path) -> bool:
+    """Tell whether a run came to its end with these very stages: `summary.json` is written after the pictures."""
+    return _summary(out / SUMMARY).get("stages") == _rows(results)
+
+
 def _save_summary(results: list[StageResult], out: Path) -> None:
     """Write `summary.json`: counts, seconds and peak memory. A resumed run adds to the peak of the one before."""
-    path = out / "summary.json"
-    before = read_object(path, what="summary").get("peak_memory_mb", 0) if path.exists() else 0
+    path = out / SUMMARY
+    before = _summary(path).get("peak_memory_mb", 0)
     if not isinstance(before, int | float):
         raise InputError(
             "not a summary",
@@ -256,8 +274,4 @@ def _save_summary(results: list[StageResult], out: Path) -> None:
         )
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
-    rows = [
-        {"stage": r.stage.name, "counts": r.manifest.counts.model_dump(), "seconds": r.manifest.seconds}
-        for r in results
-    ]
-    write_json(path, {"stages": rows, "peak_memory_mb": round(max(before, peak_mb), 1)})
+    write_json(path, {"stages": _rows(results), "peak_memory_mb": round(max(before, peak_mb), 1)})

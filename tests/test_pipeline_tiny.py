@@ -113,6 +113,20 @@ def test_every_stage_is_complete_and_adds_up(base):
         assert (base / picture).stat().st_size > 10_000
 
 
+def test_pictures_that_a_kill_left_as_they_were_before_the_stages_are_drawn_again(base, tmp_path):
+    """All stages are complete, and nobody wrote the summary of these."""
+    run = begin(base, tmp_path / "run", "release")
+    shutil.copytree(base / "release", run / "release")
+    for name in ("run.yaml", "preview.gif"):
+        shutil.copy(base / name, run)
+    (run / "contact_sheet.png").write_bytes(b"of one walk less")
+    pipeline.run(tiny(), run)
+    assert (run / "contact_sheet.png").read_bytes() == (base / "contact_sheet.png").read_bytes()
+    drawn = (run / "preview.gif").stat().st_mtime_ns
+    pipeline.run(tiny(), run)
+    assert (run / "preview.gif").stat().st_mtime_ns == drawn
+
+
 def test_a_run_is_shown_and_listed(base):
     shown = CliRunner().invoke(app, ["show", str(base)])
     assert shown.exit_code == 0
