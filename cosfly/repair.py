@@ -46,21 +46,19 @@ def _repair_stage(stage: Path, out: Path) -> int:
         return 0
     lock = hold_folder(stage)
     try:
-        num_lines = sum(_set_aside(path, read) for path, read in found)
-        if num_lines:
-            (stage / "manifest.json").unlink(missing_ok=True)
+        return sum(_set_aside(path, read, stage / "manifest.json") for path, read in found)
     finally:
         lock.release()
-    return num_lines
 
 
-def _set_aside(path: Path, read: Callable[[dict], object]) -> int:
+def _set_aside(path: Path, read: Callable[[dict], object], manifest: Path) -> int:
+    """Set aside what is broken. What follows from it is done before and with it: after a kill in between nobody would see it any more."""
     journal = Journal(path)
-    num_lines = journal.set_aside(lambda record: _is_usable(record, read))
+    num_lines = sum(not _is_usable(record, read) for record in journal.read()) + journal.num_damaged
     if num_lines:
-        journal.set_aside(
-            lambda record: TOTALS not in record
-        )  # they have counted what is broken; the next run counts anew
+        manifest.unlink(missing_ok=True)
+        # Totals have counted what is broken; the next run counts anew.
+        journal.set_aside(lambda record: TOTALS not in record and _is_usable(record, read))
         log.warning("%s: %d lines set aside in %s", path, num_lines, path.name + ASIDE)
     return num_lines
 
