@@ -1,0 +1,250 @@
+"""Every command that writes, killed at every point: which commands, with which inputs, and the sweep over their points.
+
+`python tests/crash_sweep.py` sweeps them all; names of commands after it, only these. --few: of each kind of point the first and the last.
+--twice: killed again, at a random point, in the run that goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pkgutil
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from crashes import run, sweep
+
+from cosfly import ahead
+from cosfly.cli import app
+
+TINY = (
+    "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1", "pedestrians.min_distance_m=8",
+    "pedestrians.max_distance_m=12", "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4", "workers=1",
+)  # fmt: skip
+SETTINGS = [word for setting in TINY for word in ("--set", setting)]
+
+
+@dataclass
+class Place:
+    """Where a sweep works: `base` is a finished run, `students` what distillation begins with; servers end with the stack."""
+
+    root: Path
+    stack: ExitStack
+    _made: dict[str, str] = field(default_factory=dict)
+
+    def given(self, name: str) -> str:
+        """Give the folder or address of an input, which is made when it is first asked for."""
+        if name not in self._made:
+            self._made[name] = str(INPUTS[name](self))
+        return self._made[name]
+
+    def do(self, name: str, out: Path) -> Path:
+        """Do the first command of a name."""
+        first = COMMANDS[name][0]
+        assert isinstance(first, list)
+        words = [_filled(word, self, out) for word in first]
+        ended = run(lambda: command(words), out)
+        assert ended.code == 0, ended.said
+        return out
+
+
+def command(words: list[str]) -> None:
+    if code := app(["-q", *words], standalone_mode=False):
+        raise SystemExit(code)
+
+
+def load_all() -> None:
+    """Import and compile here what every child would else for itself."""
+    for name in ("caption", "cosfly", "release"):
+        for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
+            if not module.name.endswith("__main__"):
+                with suppress(ImportError):  # of an extra
+                    importlib.import_module(module.name)
+    ahead.compile_planner("foresight")
+    ahead.compile_render()
+    ahead.compile_inspection()
+
+
+def _base(place: Place) -> Path:
+    return place.do("run", place.root / "base")
+
+
+def _students(place: Place) -> Path:
+    import torch
+    from specimens_students import make_place
+
+    torch.set_num_threads(1)
+    return make_place(place.root / "students")
+
+
+def _trained(place: Place) -> Path:
+    return place.do("distill train", place.root / "trained")
+
+
+def _inferred(place: Place) -> Path:
+    return place.do("distill infer", place.root / "inferred")
+
+
+def _evaluated(place: Place) -> Path:
+    return place.do("distill evaluate", place.root / "evaluated")
+
+
+def _older(place: Place) -> Path:
+    from test_cosfly_trees import make_older
+
+    from specimens import make_playback_tree
+
+    return make_older(make_playback_tree(place.root / "newer", num_flights=1, num_points=7), place.root / "older")
+
+
+def _teacher(place: Place) -> str:
+    from teacher_server import TeacherServer
+
+    return place.stack.enter_context(TeacherServer()).url
+
+
+def _served(place: Place) -> str:
+    from test_release_get import served
+
+    server, address = place.stack.enter_context(served(Path(place.given("base")) / "release/dataset"))
+    server.handle_error = lambda *_: None  # of one that asked and was killed
+    return address
+
+
+INPUTS: dict[str, Callable[[Place], object]] = {
+    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "older": _older, "teacher": _teacher, "served": _served,
+}  # fmt: skip
+
+TRAINING = [
+    "--set", "distill.train.max_pixels=4096", "--set", "distill.train.device=cpu", "--set", "distill.train.max_steps=3", "--set",
+    "distill.train.samples_per_step=2", "--set", "distill.train.batch_size=2", "--set", "distill.train.save_every_steps=1", "--set",
+    "distill.train.data_workers=0", "--set", "distill.train.validation_answers=false", "--set", "distill.train.lora_rank=4",
+    "--set", "distill.train.keep_checkpoints=1",
+]  # fmt: skip
+MAPS, TRACES = "{base}/maps/boxes_3d.json", "{base}/plan/drone_trace.json"
+SIMPLE, WALKS, TREE = "{base}/simplify/step2_simplified.json", "{base}/pedestrians/path.json", "{base}/render"
+DATASET = "{base}/release/dataset"
+THREE = ["--map", MAPS, "--simplified", SIMPLE, "--traces", TRACES, *SETTINGS]
+FLIGHTS = "Town_SynthTown/trajectory_1593759126"  # of the walk that the seed gives
+
+
+def copy_stage(place: Place, out: Path, stage: str, *, damaged: str | None = None) -> None:
+    """Put a finished stage into `out`; of one of its journals the last line is damaged."""
+    shutil.copytree(f"{place.given('base')}/{stage}", out, dirs_exist_ok=True)
+    if damaged is not None:
+        data = (out / damaged).read_bytes()
+        (out / damaged).write_bytes(data[:-9] + b"?" + data[-8:])
+
+
+# Commands by name; {out} is what is watched, other braces are INPUTS. Several: one after the other in the same folder; a function is what comes before.
+COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
+    "maps": [["maps", "--out", "{out}", *SETTINGS]],
+    "simplify": [["simplify", "--map", MAPS, "--out", "{out}", *SETTINGS]],
+    "pedestrians": [["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS]],
+    "pedestrians, more": [
+        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS],
+        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS, "--set", "pedestrians.num_paths=2"],
+    ],
+    "plan": [["plan", "--map", SIMPLE, "--paths", WALKS, "--out", "{out}", *SETTINGS]],
+    "plan compare": [["plan", "compare", SIMPLE, WALKS, "--out", "{out}", *SETTINGS, "--planner", "foresight", "--planner", "track_astar"]],
+    "render": [["render", *THREE, "--out", "{out}", "--set", "render.width_px=64", "--set", "render.height_px=36"]],
+    "weather-gallery": [["render", "weather-gallery", "--map", MAPS, "--traces", TRACES, "--out", "{out}", *SETTINGS]],
+    "zoom-study": [["render", "zoom-study", *THREE, "--out", "{out}", "--every", "10"]],
+    "render sample": [["render", "sample", "--data", TREE, "--map", MAPS, "--out", "{out}/sample.png"]],
+    "gallery": [["gallery", "--data", TREE, "--out", "{out}"]],
+    "convert-tree": [["convert-tree", "--data", "{older}", "--out", "{out}", "--workers", "1"]],
+    "inspect": [["inspect", "--map", SIMPLE, "--traces", TRACES, "--data", TREE, "--out", "{out}", *SETTINGS]],
+    "inspect review": [
+        lambda place, out: copy_stage(place, out, "inspect"),
+        ["inspect", "review", "--inspect", "{out}", "--reject", FLIGHTS, "--by", "somebody", "--reason", "too near"],
+    ],
+    "inspect review, page": [lambda place, out: copy_stage(place, out, "inspect"), ["inspect", "review", "--inspect", "{out}"]],
+    "pedestrians, repaired": [
+        lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
+        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS, "--set", "pedestrians.ground=paved", "--repair"],
+    ],
+    "depth-study": [["depth-study", "--data", TREE, "--out", "{out}"]],
+    "caption": [["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
+    "caption, limited": [["caption", "--data", TREE, "--out", "{out}", "--limit", "2", *SETTINGS], ["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
+    "caption, served": [["caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--set", "caption.endpoint.concurrency=1", "--no-check", *SETTINGS]],
+    "caption prompts": [["caption", "prompts", "--export", "{out}/prompts"]],
+    "caption actions": [["caption", "actions", "--export", "{out}/actions.yaml"]],
+    "compare-strategies": [["caption", "compare-strategies", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--conflicts", "2", *SETTINGS]],
+    "release build": [["release", "build", "{base}", "--out", "{out}", "--workers", "1"]],
+    "release export tree": [["release", "export", DATASET, "--format", "tree", "--out", "{out}", "--workers", "1"]],
+    "release export webdataset": [["release", "export", DATASET, "--format", "webdataset", "--out", "{out}", "--workers", "1"]],
+    "release export lerobot": [["release", "export", DATASET, "--format", "lerobot", "--out", "{out}", "--workers", "1"]],
+    "release export lerobot-v2.1": [["release", "export", DATASET, "--format", "lerobot-v2.1", "--out", "{out}", "--workers", "1"]],
+    "release get": [["release", "get", "{served}", "--out", "{out}", "--workers", "1"]],
+    "release get, a part": [["release", "get", "{served}", "--out", "{out}", "--workers", "1", "--modality", "rgb"]],
+    "release stats": [["release", "stats", DATASET, "--out", "{out}"]],
+    "release card": [["release", "card", DATASET, "--out", "{out}/card.md"]],
+    "release viewer": [["release", "viewer", DATASET, "--out", "{out}/viewer.html"]],
+    "export captions": [["export", "captions", "{base}", "--format", "csv", "--out", "{out}/captions.csv"]],
+    "tiny-student": [["distill", "tiny-student", "--out", "{out}/student"]],
+    "distill prepare": [["distill", "prepare", "--captions", "{students}/captions.jsonl", "--data", "{students}/tree", "--out", "{out}", "--set", "distill.prepare.unbound=accept"]],
+    "distill dual-track": [["distill", "dual-track", "--data", "{students}/tree", "--out", "{out}", "--set", "distill.dual_track.observed=2", "--set", "distill.dual_track.predicted=2"]],
+    "distill train": [["distill", "train", "--dataset", "{students}/set", "--data", "{students}/tree", "--student", "{students}/student", "--out", "{out}", *TRAINING]],
+    "distill infer": [[
+        "distill", "infer", "--dataset", "{students}/set", "--data", "{students}/tree", "--model", "{students}/student", "--out", "{out}",
+        "--set", "distill.infer.max_new_tokens=4", "--set", "distill.infer.device=cpu", "--set", "distill.infer.max_pixels=4096",
+    ]],
+    "distill merge": [["distill", "merge", "--model", "{students}/student", "--adapter", "{trained}/adapter", "--out", "{out}"]],
+    "distill floors": [["distill", "floors", "--dataset", "{students}/set", "--out", "{out}"]],
+    "distill evaluate": [["distill", "evaluate", "--dataset", "{students}/set", "--predictions", "{inferred}/predictions.jsonl", "--out", "{out}"]],
+    "distill report": [["distill", "report", "{evaluated}", "--out", "{out}"]],
+    "run": [["run", "quickstart", "--out", "{out}", *SETTINGS]],
+    "run, more": [["run", "quickstart", "--out", "{out}", *SETTINGS], ["run", "{out}", "--set", "pedestrians.num_paths=2"]],
+}  # fmt: skip
+
+
+def _filled(word: str, place: Place, out: Path) -> str:
+    for name in INPUTS:
+        if f"{{{name}}}" in word:
+            word = word.replace(f"{{{name}}}", place.given(name))
+    return word.replace("{out}", str(out))
+
+
+def works(name: str, place: Place) -> list[Callable[[], None]]:
+    """Give the commands of a name, to be swept in the folder `out` of the place."""
+    out = place.root / "out"
+    return [
+        partial(given, place, out)
+        if callable(given)
+        else partial(command, [_filled(word, place, out) for word in given])
+        for given in COMMANDS[name]
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="COMMAND")
+    parser.add_argument("--few", action="store_true")
+    parser.add_argument("--twice", action="store_true")
+    asked = parser.parse_args()
+    load_all()
+    with tempfile.TemporaryDirectory() as root, ExitStack() as stack:
+        place = Place(Path(root), stack)
+        for name in asked.names or COMMANDS:
+            begin_s = time.monotonic()
+            try:
+                swept = sweep(works(name, place), place.root, few=asked.few, twice=asked.twice)
+            except AssertionError as error:
+                print(f"{name}: does not run undisturbed: {error}", flush=True)
+                continue
+            seconds = f"{time.monotonic() - begin_s:.0f} s"
+            print(
+                f"{name}: {swept.num_steps} steps, killed {swept.num_killed} times, {len(swept.wrong)} wrong, {seconds}",
+                flush=True,
+            )
+            print("".join(f"  {line}\n" for line in swept.wrong), end="", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,358 @@
+"""kill -9 at every point: a command is run in a process whose every step on the disk is counted, and the N-th one ends it and all its workers.
+
+A step is what changes a folder that is watched: a file opened for writing, written to (half of the bytes go out first), cut or made safe,
+and a name made, changed, linked or removed. What a library writes without Python (parquet's rows, tensors) is one step, its name.
+"""
+
+from __future__ import annotations
+
+import builtins
+import io
+import json
+import multiprocessing
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any
+
+from cosfly import worker_pool
+from cosfly.errors import CosflyError
+from cosfly.journal import ASIDE
+from cosfly.provenance import checked_inputs, recorded_digests
+from cosfly.stage_events import EVENTS
+from release.verify.verify import verify
+
+PACKAGES = tuple(f"/{name}/" for name in ("cosfly", "caption", "distill", "release"))
+WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+NAMES = {"os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1, "os.truncate": 1, "os.symlink": 2}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of an undisturbed run: what is done, to which path below the watched folder, and where in our code."""
+
+    event: str
+    path: str
+    place: str
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """Steps of one kind differ in the numbers of their names alone; in a folder that has not its name yet, in the files too."""
+        path, partial, _ = self.path.partition(".partial/")
+        return self.event, re.sub(r"[0-9a-f]{16,}|\d+", "#", path) + partial, self.place
+
+    @property
+    def is_of_a_temporary_file(self) -> bool:
+        return self.path.endswith(".partial") and self.event not in ("os.mkdir", "os.rmdir")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The n-th step of a kind, n from 1 on: how many others come between, as what workers tell of themselves, may differ."""
+
+    kind: tuple[str, str, str]
+    number: int
+
+
+class _Watch:
+    """Counts the steps of this process and of those that it forks, and ends them all at one of them."""
+
+    def __init__(self, root: Path, die_at: Moment | None, traced: int | None) -> None:
+        self.root, self.die_at, self.traced = f"{root}{os.sep}", die_at, traced
+        self.count = multiprocessing.get_context("fork").Value("q", 0)
+
+    def begin(self) -> None:
+        sys.addaudithook(self._hear)
+        really_open, fsync = builtins.open, os.fsync
+
+        def watched_open(file: Any, mode: str = "r", *args: Any, **more: Any) -> Any:
+            opened = really_open(file, mode, *args, **more)
+            if not isinstance(file, int) and set(mode) & set("wax+") and self._is_watched(file):
+                self._count_writes(opened, os.fspath(file))
+            return opened
+
+        def watched_fsync(file: Any) -> None:
+            self._step("fsync", file if isinstance(file, int) else file.fileno())
+            fsync(file)
+
+        builtins.open = io.open = watched_open  # type: ignore[assignment]
+        os.fsync = watched_fsync
+
+    def _count_writes(self, opened: Any, path: Any) -> None:
+        write = opened.write
+
+        def watched_write(data: Any) -> Any:
+            def half() -> None:
+                write(
+                    memoryview(data).cast("B")[: memoryview(data).nbytes // 2]
+                    if "b" in opened.mode
+                    else data[: len(data) // 2]
+                )
+                opened.flush()
+
+            self._step("write", path, half)
+            return write(data)
+
+        opened.write = watched_write
+
+    def _is_watched(self, path: Any) -> bool:
+        return os.path.abspath(os.fsdecode(path)).startswith(self.root)
+
+    def _hear(self, event: str, args: tuple) -> None:
+        if event == "open":
+            path, _, flags = args
+            if not isinstance(path, int) and path is not None and flags & WRITES:
+                self._step("open", path)
+        elif event in NAMES:
+            path, folder = args[NAMES[event] - 1], args[-1]
+            is_relative = event in ("os.remove", "os.rmdir") and folder != -1
+            self._step(event, os.path.join(os.readlink(f"/proc/self/fd/{folder}"), path) if is_relative else path)
+        elif event == "subprocess.Popen":
+            self._step(event, f"{self.root}process")
+
+    def _step(self, event: str, path: Any, half: Callable[[], None] | None = None) -> None:
+        if isinstance(path, int):
+            path = os.readlink(f"/proc/self/fd/{path}")
+        if not self._is_watched(path):
+            return
+        step = Step(event, os.path.abspath(os.fsdecode(path)).removeprefix(self.root), _place())
+        if self.traced is not None:
+            os.write(self.traced, f"{json.dumps([step.event, step.path, step.place])}\n".encode())
+        if self.die_at is None or step.kind != self.die_at.kind:
+            return
+        with self.count.get_lock():
+            self.count.value += 1
+            is_now = self.count.value == self.die_at.number
+        if is_now:
+            if half is not None:
+                half()
+            os.killpg(os.getpgrp(), signal.SIGKILL)
+            time.sleep(60)  # of a thread that the signal has not reached
+
+
+def _place() -> str:
+    """Where in our code a step is made: the two innermost lines."""
+    found, frame = list[str](), sys._getframe(2)
+    while frame is not None and len(found) < 3:  # type: ignore[redundant-expr]
+        name = frame.f_code.co_filename
+        if any(package in name for package in PACKAGES) and "/site-packages/" not in name and "/tests/" not in name:
+            found.append(f"{'/'.join(Path(name).parts[-2:])}:{frame.f_code.co_name}")
+        frame = frame.f_back  # type: ignore[assignment]
+    return " < ".join(found)
+
+
+@dataclass
+class Ended:
+    """How a run ended: its exit code, negative of a signal; what it said; its steps where they were asked for."""
+
+    code: int
+    said: str
+    steps: list[Step]
+
+
+def run(work: Callable[[], object], root: Path, *, die_at: Moment | None = None, traces: bool = False) -> Ended:
+    """Run something in a child of its own that forks its workers; die_at None: undisturbed."""
+    resource_tracker.ensure_running()
+    said, trace = root.with_name(f"{root.name}.said"), root.with_name(f"{root.name}.steps")
+    with open(said, "wb") as voice, open(trace, "wb") as steps:
+        child = os.fork()
+        if not child:
+            _be_child(work, _Watch(root, die_at, steps.fileno() if traces else None), voice.fileno())
+        _, status = os.waitpid(child, 0)
+    lines = trace.read_text().splitlines()
+    return Ended(
+        os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), [Step(*json.loads(line)) for line in lines]
+    )
+
+
+def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
+    code = 1
+    try:
+        os.setsid()
+        os.dup2(voice, 1)
+        os.dup2(voice, 2)
+        sys.stdout = sys.stderr = os.fdopen(voice, "w", buffering=1, closefd=False)
+        worker_pool.multiprocessing = _Forking()  # type: ignore[assignment]
+        watch.begin()
+        work()
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+class _Forking:
+    """In the place of `multiprocessing`: workers that inherit the watch, and all that is imported."""
+
+    @staticmethod
+    def get_context(_: str) -> Any:
+        return multiprocessing.get_context("fork")
+
+
+# --- what stands in a folder ------------------------------------------------------------------------------------------
+
+TIMES = re.compile(
+    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|mean_ms|max_ms|latency_s|time|at|speed)": ?(\{[^}]*\}|"[^"]*"|[\d.]+)'
+)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Give what stands below a folder, without what is documented to differ: times, what happened to workers, broken lines."""
+    paths = [path for path in sorted(root.rglob("*")) if path.name != EVENTS and not path.name.endswith(ASIDE)]
+    found = {path.relative_to(root).as_posix(): path for path in paths}
+    return {name: b"a folder" if path.is_dir() else _plain(path) for name, path in found.items()}
+
+
+def _plain(path: Path) -> bytes:
+    """Give a file without times; of a journal each line once, in order, without its checksum, and no line of totals: it saves reading."""
+    data = path.read_bytes()
+    if path.suffix == ".jsonl":
+        lines = {TIMES.sub(b"", re.sub(rb"^[0-9a-f]{16} ", b"", line)) for line in data.splitlines()}
+        return b"\n".join(sorted(line for line in lines if not line.startswith(b'{"totals"')))
+    if path.name == "manifest.json":  # with the digests of files that hold times
+        data = re.sub(rb'\{\s*"path": "[^"]*\.jsonl"[^}]*\}', b"", data)
+    return TIMES.sub(b"", data) if path.suffix == ".json" else data
+
+
+def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str]:
+    """Say in which files two folders differ."""
+    words = [f"too much: {name}" for name in found.keys() - expected.keys()]
+    words += [f"missing: {name}" for name in expected.keys() - found.keys()]
+    words += [
+        f"{name}: {_first_difference(found[name], expected[name])}"
+        for name in found.keys() & expected.keys()
+        if found[name] != expected[name]
+    ]
+    return sorted(words)
+
+
+def _first_difference(found: bytes, expected: bytes) -> str:
+    """Show two contents from a little before the first byte on that differs."""
+    place = max(next((k for k, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(found)) - 40, 0)
+    return f"{len(found)} bytes, not {len(expected)}, from {place} on {found[place : place + 80]!r}, not {expected[place : place + 80]!r}"
+
+
+def called_complete(root: Path, wholes: list[Path]) -> list[str]:
+    """Name the products that the next stage, or `release verify`, would take though they are what no finished run made.
+
+    Args:
+        wholes: what undisturbed runs made, that of the last command first.
+    """
+    wrong = []
+    for manifest in wholes[0].rglob("manifest.json"):
+        folder = manifest.parent.relative_to(wholes[0])
+        for product in recorded_digests(manifest.parent):
+            path = root / folder / product
+            if path.exists() and _is_taken(path) and not any(_same(path, whole / folder / product) for whole in wholes):
+                wrong.append(f"{folder / product} is taken by the next stage")
+    for record in wholes[0].rglob("release.json"):
+        path = root / record.parent.relative_to(wholes[0])
+        known = [contents(whole / path.relative_to(root)) for whole in wholes]
+        if path.is_dir() and verify(path, level="structure").is_ok and contents(path) not in known:
+            wrong.append(f"{path.relative_to(root)} verifies")
+    return wrong
+
+
+def _same(path: Path, other: Path) -> bool:
+    return other.exists() and _plain(path) == _plain(other)
+
+
+def _is_taken(path: Path) -> bool:
+    try:
+        checked_inputs({"product": path})
+    except CosflyError:
+        return False
+    return True
+
+
+# --- the sweep --------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Swept:
+    """How many steps an undisturbed run takes, how many runs were killed, and what was wrong after them."""
+
+    num_steps: int
+    num_killed: int
+    wrong: list[str]
+
+
+def sweep(works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False) -> Swept:
+    """Kill a command at its steps, run it again after each, and compare what it made with what an undisturbed run makes.
+
+    Args:
+        works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done their work.
+        few: at some of the steps, see `chosen`. twice: also the run that goes on is killed, at some step.
+    """
+    out, whole, begun, rng = root / "out", root / "whole", root / "begun", random.Random(0)
+    for folder in (out, whole, begun):
+        shutil.rmtree(folder, ignore_errors=True)
+    out.mkdir()
+    for work in works[:-1]:
+        _run_through(work, out)
+    shutil.copytree(out, begun)
+    steps = _run_through(works[-1], out).steps
+    out.rename(whole)
+    expected, swept = contents(whole), Swept(len(steps), 0, [])
+    for moment in chosen(steps, few=few):
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(begun, out)
+        killed = run(works[-1], out, die_at=moment)
+        swept.num_killed += killed.code == -signal.SIGKILL
+        found = called_complete(out, [whole, begun])
+        if twice:
+            swept.num_killed += run(works[-1], out, die_at=rng.choice(moments(steps))).code == -signal.SIGKILL
+        again = run(works[-1], out)
+        found += (
+            differences(contents(out), expected) if again.code == 0 else [f"exit {again.code}: {again.said[-800:]}"]
+        )
+        event, path, place = moment.kind
+        swept.wrong += [f"killed at {event} {path} ({place}), time {moment.number}: {words}" for words in found]
+    return swept
+
+
+def _run_through(work: Callable[[], object], out: Path) -> Ended:
+    ended = run(work, out, traces=True)
+    assert ended.code == 0, ended.said
+    return ended
+
+
+def moments(steps: list[Step]) -> list[Moment]:
+    """Give the moment of each step."""
+    counts = Counter[tuple[str, str, str]]()
+    found = []
+    for step in steps:
+        counts[step.kind] += 1
+        found.append(Moment(step.kind, counts[step.kind]))
+    return found
+
+
+def chosen(steps: list[Step], *, few: bool) -> list[Moment]:
+    """Give the moments of the kills.
+
+    Args:
+        few: of each kind the first and the last, and of a file that is written under another name only that it gets its own.
+    """
+    found = moments(steps)
+    if not few:
+        return found
+    last = {moment.kind: moment.number for moment in found}
+    return [
+        moment
+        for moment, step in zip(found, steps, strict=True)
+        if moment.number in (1, last[moment.kind]) and not step.is_of_a_temporary_file
+    ]

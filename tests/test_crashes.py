@@ -1,0 +1,111 @@
+"""kill -9 at every point of commands that write; all of them: `python tests/crash_sweep.py`."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from crash_sweep import COMMANDS, Place, load_all, works
+from crashes import called_complete, sweep
+from toy_workers import stage_in
+from typer.main import get_command
+
+from cosfly.cli import app
+from cosfly.stage_folder import Tally
+from cosfly.store import atomic_folder, write_bytes, write_json
+
+# Of the commands that need a finished run, those that are swept here.
+SWEPT = ("pedestrians, more", "caption, limited", "release build", "release get")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Iterator[Place]:
+    load_all()
+    with ExitStack() as stack:
+        yield Place(tmp_path_factory.mktemp("crashes"), stack)
+
+
+# --- the harness finds what is wrong ----------------------------------------------------------------------------------
+
+
+def careless(out: Path) -> None:
+    """Takes what stands there for finished."""
+    if not (out / "product.json").exists():
+        (out / "product.json").write_text('{"all": "of it"}')
+
+
+def careful(out: Path) -> None:
+    write_json(out / "product.json", {"all": "of it"})
+    with atomic_folder(out / "frames") as folder:
+        for number in range(3):
+            (folder / f"{number}.txt").write_text("a frame")
+
+
+def impatient(out: Path) -> None:
+    """Refuses its own half."""
+    if any(out.iterdir()):
+        raise FileExistsError(out)
+    careful(out)
+
+
+def untidy(out: Path) -> None:
+    """Leaves what another process with its name could not know."""
+    write_bytes(out / f"{len(list(out.iterdir()))}.json", b"{}")
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [(careless, "product.json: 8 bytes, not 16"), (impatient, "exit 1"), (untidy, "too much: 1.json"), (careful, None)],
+)
+def test_what_a_kill_spoils_is_found(work, words, tmp_path):
+    swept = sweep([lambda: work(tmp_path / "out")], tmp_path)
+    assert swept.num_killed == swept.num_steps
+    assert any(words in line for line in swept.wrong) if words else not swept.wrong, swept.wrong
+    assert swept.num_steps >= 2
+
+
+def test_a_product_without_its_records_that_another_stage_would_take_is_found(tmp_path):
+    stage = stage_in(tmp_path / "whole")
+    write_json(stage.path / "product.json", {"all": "of it"})
+    stage.finish([stage.path / "product.json"], Tally(input=1, kept=1))
+    write_json(tmp_path / "killed/s/product.json", {"all": "of"})
+    assert called_complete(tmp_path / "killed", [tmp_path / "whole"]) == ["s/product.json is taken by the next stage"]
+
+
+# --- the commands -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["maps", "caption actions"])
+def test_killed_at_every_step(name, place):
+    swept = sweep(works(name, place), place.root)
+    assert not swept.wrong, "\n".join(swept.wrong)
+    assert swept.num_killed == swept.num_steps > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SWEPT)
+def test_killed_twice_at_steps_of_each_kind(name, place):
+    swept = sweep(works(name, place), place.root, few=True, twice=True)
+    assert not swept.wrong, "\n".join(swept.wrong)
+    assert swept.num_killed > 5
+
+
+def test_every_command_that_writes_is_in_the_sweep():
+    """But for those that only tell, send to a hub, or measure: a measurement that was broken off is not gone on with."""
+    told = {
+        "list",
+        "show",
+        "doctor",
+        "config check",
+        "config show",
+        "config schema",
+        "release verify",
+        "caption doctor",
+        "caption judge-check",
+    }
+    root, names = get_command(app), set[str]()
+    for name, found in root.commands.items():
+        names |= {f"{name} {inner}" for inner in getattr(found, "commands", ())} or {name}
+    swept = [" ".join(words) for commands in COMMANDS.values() for words in commands if not callable(words)]
+    lacking = {name for name in names if not any(line.startswith(f"{name} ") for line in swept)}
+    assert lacking == told | {"release push", "bench"}
