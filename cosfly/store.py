@@ -10,7 +10,6 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatch
-from glob import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -75,10 +74,12 @@ def _partial(path: Path) -> Path:
 
 def _remove_left(path: Path) -> None:
     """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of this one."""
-    for left in path.parent.glob(f".{escape(path.name)}.*.partial"):
-        owner = left.name.removeprefix(f".{path.name}.").removesuffix(".partial")
-        if owner.isdecimal() and not _is_another(int(owner)):
-            _remove(left)
+    begin = f".{path.name}."
+    for name in os.listdir(path.parent):
+        if name.startswith(begin) and name.endswith(".partial"):
+            owner = name.removeprefix(begin).removesuffix(".partial")
+            if owner.isdecimal() and not _is_another(int(owner)):
+                _remove(path.with_name(name))
 
 
 def _is_another(pid: int) -> bool:
