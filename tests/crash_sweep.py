@@ -59,6 +59,9 @@ def command(words: list[str]) -> None:
         raise SystemExit(code)
 
 
+OF_STAGES = ("run", "run, more")  # whose steps in the folders of stages are those of the stages' own commands
+
+
 def load_all() -> None:
     """Import and compile here what every child would else for itself."""
     for name in ("caption", "cosfly", "release"):
@@ -234,7 +237,9 @@ def main() -> None:
         for name in asked.names or COMMANDS:
             begin_s = time.monotonic()
             try:
-                swept = sweep(works(name, place), place.root, few=asked.few, twice=asked.twice)
+                swept = sweep(
+                    works(name, place), place.root, few=asked.few, twice=asked.twice, inside=name not in OF_STAGES
+                )
             except AssertionError as error:
                 print(f"{name}: does not run undisturbed: {error}", flush=True)
                 continue

@@ -291,12 +291,15 @@ class Swept:
     wrong: list[str]
 
 
-def sweep(works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False) -> Swept:
+def sweep(
+    works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False, inside: bool = True
+) -> Swept:
     """Kill a command at its steps, run it again after each, and compare what it made with what an undisturbed run makes.
 
     Args:
         works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done their work.
         few: at some of the steps, see `chosen`. twice: also the run that goes on is killed, at some step.
+        inside: also at steps in folders of the folder.
     """
     out, whole, begun, rng = root / "out", root / "whole", root / "begun", random.Random(0)
     for folder in (out, whole, begun):
@@ -309,6 +312,8 @@ def sweep(works: list[Callable[[], object]], root: Path, *, few: bool = False, t
     out.rename(whole)
     expected, swept = contents(whole), Swept(len(steps), 0, [])
     for moment in chosen(steps, few=few):
+        if not inside and "/" in moment.kind[1]:
+            continue
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(begun, out)
         killed = run(works[-1], out, die_at=moment)
