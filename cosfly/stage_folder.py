@@ -336,12 +336,13 @@ def _taken_up(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )
         return record
-    if not _holds_work(out):  # an attempt that ended before anything was finished binds nobody to its settings
+    found = read_stage_record(out)
+    # An attempt that ended before anything was finished binds nobody to its settings, unless it grew from what was.
+    if not _holds_work(out) and not found.grown_from:
         # stage.json last: without it a kill on the way would leave what looks like somebody else's files.
         for name in reversed(BEGUN):
             (out / name).unlink(missing_ok=True)
         return record
-    found = read_stage_record(out)
     differences, grown = _may_continue(out, record, config, resume, grows)
     before = list(found.grown_from)
     if grown:

@@ -368,6 +368,19 @@ def test_what_a_stage_has_grown_from_outlives_a_kill_before_its_new_record(tmp_p
     assert len(read_stage_record(out).grown_from) == 2
 
 
+def test_what_a_stage_has_grown_from_outlives_a_kill_while_it_begins_anew(tmp_path):
+    out = tmp_path / "out"
+    stage = _open(out, config=Growing(count=1))
+    write_json(out / "product.json", 1)
+    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    before = fingerprint(out)
+    _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
+    (out / "product.json").unlink()
+    give_up()
+    _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
+    assert has_grown_from(out, before)
+
+
 @pytest.mark.parametrize("name", [".a.json.999999999.partial", f".a.json.{os.getpid()}.partial"])
 def test_what_a_kill_left_of_a_file_goes_when_it_is_written_again(tmp_path, name):
     (tmp_path / name).write_text("half")
