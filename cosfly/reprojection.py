@@ -51,7 +51,8 @@ class Agreement:
     it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. planes: of
     those that agree, on planes there; error: median of these, as a share of the depth, NaN: too few. correlation: of brightness, NaN: too few, or no contrast. tint: median difference of
     the three channels, less that of brightness, grey levels. shade: median difference of brightness, grey levels, NaN: too few.
-    shifted: points of one thing that is farther there, as most of it is; 0 where there is none.
+    shifted: points of one thing that is farther there, as most of it is; renamed: of one that has its depth there and another id, as most of
+    it has; 0 where there is none.
     """
 
     seen: int
@@ -65,6 +66,7 @@ class Agreement:
     tint: float
     shade: float
     shifted: int
+    renamed: int
 
 
 def grid_rows(height_px: int) -> np.ndarray:
@@ -91,13 +93,16 @@ def compare_views(
         intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between them.
         least_contrast: deviation of brightness, grey levels, below which nothing is said of the colours' correlation.
     """
-    counts, errors, colours, firm, moved = _carried(one, other, intrinsics, others_intrinsics, only_colours=False)
+    counts, errors, colours, firm, moved, renamed = _carried(
+        one, other, intrinsics, others_intrinsics, only_colours=False
+    )
     correlation, tint, shade = _agreement_of(colours, least_contrast)
     error = median_of(errors) if len(errors) >= LEAST_PLANES else np.nan
     seen, agree, hidden, through, same = counts.tolist()
     return Agreement(
-        seen, agree, hidden, through, same, len(errors), error, correlation, tint, shade, _num_shifted(firm, moved)
-    )
+        seen, agree, hidden, through, same, len(errors), error, correlation, tint, shade, _most_of_one(firm, moved),
+        _most_of_one(firm, renamed),
+    )  # fmt: skip
 
 
 def correlate_colours(
@@ -127,7 +132,7 @@ def way_px(one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np
 
 def _carried(
     one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray | None, *, only_colours: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Give what `_carry` does of two views."""
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
@@ -166,11 +171,11 @@ def median_of(values: np.ndarray) -> float:
     return float(found[middle] if len(values) % 2 else (found[middle - 1] + found[middle]) / 2.0)
 
 
-def _num_shifted(firm: np.ndarray, moved: np.ndarray) -> int:
-    """Give the points of the thing that moved most. firm, moved: ids at points well inside one thing, with its depth and without."""
-    if len(moved) < LEAST_SHIFTED:
+def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
+    """Give the points of the thing that is odd at most points. firm, odd: ids at points well inside one thing, as it should be and not."""
+    if len(odd) < LEAST_SHIFTED:
         return 0
-    counts = np.bincount(moved, minlength=SHARED_ID + 1)
+    counts = np.bincount(odd, minlength=SHARED_ID + 1)
     counts[counts <= np.bincount(firm, minlength=len(counts))[: len(counts)]] = 0
     counts[[0, SHARED_ID]] = 0  # ids of nothing and of many things
     most = int(counts.max())
@@ -222,7 +227,7 @@ def _compare_colours(colours):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, intrinsics, others, turn, shift, moving, flat, only_colours):  # type: ignore[no-untyped-def]  # fmt: skip
     """Counts (5,), errors (k,), colours (k, 6) of points here and there, where both are known; of points among nothing but their own thing
-    its id, of those with its depth and of those that are farther. only_colours: points that come out where there are none are left out of everything."""
+    its id, of those with its depth and of those that are farther; of points with its depth among nothing but one other thing their own id. only_colours: points that come out where there are none are left out of everything."""
     height, width = depth_a.shape
     fx, fy, cx, cy = intrinsics
     other_fx, other_fy, other_cx, other_cy = others
@@ -232,6 +237,7 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
     colours, num_colours = np.empty((COLUMNS * ROWS, 6)), 0
     firm, num_firm = np.empty(COLUMNS * ROWS, np.int64), 0
     moved, num_moved = np.empty(COLUMNS * ROWS, np.int64), 0
+    renamed, num_renamed = np.empty(COLUMNS * ROWS, np.int64), 0
     for j in range(ROWS):
         v = int((j + 0.5) * height / ROWS)
         if only_colours and j >= len(colours_a):
@@ -255,7 +261,15 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             has_colours = k >= 0 and k < len(colours_b) and j < len(colours_a)
             if only_colours and not has_colours:
                 continue
-            best, least, is_through, is_same, is_free, is_whole = 1e9, 1e9, True, not has_ids, True, has_ids
+            best, least, is_through, is_same, is_free, is_whole, is_one = (
+                1e9,
+                1e9,
+                True,
+                not has_ids,
+                True,
+                has_ids,
+                has_ids,
+            )
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
                     off = float(depth_b[row + dy, column + dx]) - z
@@ -272,20 +286,26 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
                         )
                         is_same |= is_own or (flat[inst_a[v, u, 0]] and inst_b[y1, x1, 0] == inst_a[v, u, 0])
                         is_whole &= is_own
+                        is_one &= (
+                            inst_b[y1, x1, 0] == inst_b[row, column, 0]
+                            and inst_b[y1, x1, 1] == inst_b[row, column, 1]
+                            and inst_b[y1, x1, 2] == inst_b[row, column, 2]
+                        )
             if not is_free:
                 continue
             counts[0] += 1
             is_there = best <= TOLERANCE_SHARE * z + TOLERANCE_M
-            if is_whole:
-                own = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8
-                if is_there:
-                    firm[num_firm] = own
-                    num_firm += 1
-                elif (
-                    least > 0.0
-                ):  # farther all round: what is nearer may be another side of the thing, that hides this one
-                    moved[num_moved] = own
-                    num_moved += 1
+            own = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8 if has_ids else np.int64(0)
+            if is_there and is_whole:
+                firm[num_firm] = own
+                num_firm += 1
+            elif is_there and is_one and not flat[inst_a[v, u, 0]]:
+                renamed[num_renamed] = own
+                num_renamed += 1
+            # Farther all round: what is nearer may be another side of the thing, that hides this one.
+            elif not is_there and has_ids and (is_through or (is_whole and least > 0.0)):
+                moved[num_moved] = own
+                num_moved += 1
             if is_there:
                 counts[1] += 1
                 counts[4] += is_same
@@ -311,4 +331,4 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
                 counts[3] += 1
             else:
                 counts[2] += 1
-    return counts, errors[:num_errors], colours[:num_colours], firm[:num_firm], moved[:num_moved]
+    return counts, errors[:num_errors], colours[:num_colours], firm[:num_firm], moved[:num_moved], renamed[:num_renamed]

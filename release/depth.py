@@ -11,6 +11,7 @@ from cosfly.reading.arrays import parse_array, parse_picture
 from release.record import DepthCoding
 
 MM_A_METRE = 1000.0
+SKY_MM = 65535  # what 16 bits have left for the sky
 
 
 def depth_of(data: bytes, coded: DepthCoding, where: str) -> np.ndarray:

@@ -85,6 +85,20 @@ def test_a_thing_that_is_farther_has_moved_and_one_that_is_nearer_may_hide_itsel
     assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).shifted > 0) == is_found
 
 
+@pytest.mark.parametrize(
+    ("kind", "num_renamed", "is_found"), [("Buildings", 40, True), ("Buildings", 2, False), ("Roads", 40, False)]
+)
+def test_a_thing_under_another_id_is_told_but_for_ground(kind, num_renamed, is_found):
+    """A wall at one place, of which in the second picture so many columns have another id."""
+    views = [building_at(20.0), building_at(20.0)]
+    for view in views:
+        view.instance[..., 0] = KINDS[kind]
+    views[0].instance[:, :40, 1] = 8
+    views[1].instance[:, :num_renamed, 1] = 9
+    views[1].instance[:, num_renamed:40, 1] = 8
+    assert (compare_views(*views, CAMERA).renamed > 0) == is_found
+
+
 def test_way_between_two_pictures():
     """A wall at 20 m, 80 px focal length: 0.5 m to the side are 2 px, and a camera that looks at nothing tells none."""
     here = building_at(20.0)

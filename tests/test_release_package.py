@@ -557,7 +557,7 @@ def test_a_flight_that_cannot_be_read_leaves_nothing_behind_and_the_next_run_men
     if left is not None:  # cut short
         assert left < len(data)
         damaged.write_bytes(data[:left])
-    with pytest.raises(InputError, match="nothing is released") as caught:
+    with pytest.raises(InputError, match="nothing is released: 1 thing is wrong") as caught:
         build(copy, tmp_path / "r")
     assert name in str(caught.value)
     assert name in (tmp_path / "r" / "failures.jsonl").read_text()

@@ -169,6 +169,7 @@ RECORD_LIES = {
     "a flight rejected for nothing": lambda r: _one_less(r, "rejected"),
     "larger pictures": lambda r: _stage(r, "render")["config"].update(width_px=1920, height_px=1080),
     "longer windows": lambda r: _stage(r, "caption")["config"]["window"].update(num_frames=9),
+    "a sky of 999 m": lambda r: r["depth"].update(sky=999.0),
     "a town of another map": lambda r: r["maps"][0].update(name="Delft"),
 }
 

@@ -18,7 +18,7 @@ def flight(number: int, num_rows: int, **told) -> Summary:
     values = {
         "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train", "walk": str(number), "pair": None,
         "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [], "frames_digest": "",
-        "way_digest": "", "kinds": [], "hue": [], "sky": "[]",
+        "way_digest": "", "kinds": [], "look": [], "sky": "[]", "kept_places_m": [],
     }  # fmt: skip
     return Summary(**(values | told))
 
@@ -133,12 +133,32 @@ def test_a_thing_is_of_one_kind_in_all_flights_of_a_runs_town(tmp_path):
     assert told_of([flight(1, 1, kinds=[building]), elsewhere], tmp_path) == []
 
 
+LOOK = [5.0, 4.0, 1.8, -12.3, 140.0]  # colourful, sharp, red, blue, brightness
+
+
 @pytest.mark.parametrize(
     ("told", "is_found"),
-    [({}, True), ({"hue": [1.5, -11.0]}, False), ({"sky": '["night"]'}, False), ({"frames_digest": "of others"}, False), ({"is_foreign": True}, False)],
-)  # fmt: skip
-def test_twins_have_the_same_colours_under_one_sky(tmp_path, told, is_found):
-    one, other = flight(1, 1, hue=[1.8, -12.3]), flight(1, 1, rows_file="2.rows", track="perturbed")
+    [
+        ({}, False),
+        ({"look": [5.0, 4.0, -12.3, 1.8, 140.0]}, True),
+        ({"look": [5.0, 4.0, 1.5, -11.0, 140.0]}, False),
+        ({"look": [5.0, 4.0, 1.8, -12.3, 136.0]}, True),
+        ({"look": [5.0, 4.0, 1.8, -12.3, 138.0]}, False),
+        ({"look": [4.2, 4.0, 1.8, -12.3, 140.0]}, True),
+        ({"look": [5.0, 4.8, 1.8, -12.3, 140.0]}, True),
+        ({"look": [5.0, 4.3, 1.8, -12.3, 140.0]}, False),
+    ],
+)
+@pytest.mark.parametrize("excuse", [{}, {"sky": '["night"]'}, {"frames_digest": "of others"}, {"is_foreign": True}])
+def test_twins_look_the_same_under_one_sky(tmp_path, told, is_found, excuse):
+    one, other = flight(1, 40, look=LOOK), flight(1, 40, rows_file="2.rows", track="perturbed", look=LOOK)
     one.pair, other.name = "run/Town01/trajectory_1/aug_001", "run/Town01/trajectory_1/aug_001"
-    other = Summary(**(vars(other) | {"pair": one.name, "hue": [-12.3, 1.8]} | told))
-    assert told_of([one, other], tmp_path) == ["scene_colour"] * is_found
+    other = Summary(**(vars(other) | {"pair": one.name} | told | excuse))
+    assert told_of([one, other], tmp_path) == ["scene_colour"] * (is_found and not excuse)
+
+
+def test_a_few_frames_tell_little_of_brightness(tmp_path):
+    one, other = flight(1, 36, look=LOOK), flight(1, 36, rows_file="2.rows", track="perturbed")
+    one.pair, other.name = "run/Town01/trajectory_1/aug_001", "run/Town01/trajectory_1/aug_001"
+    other = Summary(**(vars(other) | {"pair": one.name, "look": [5.0, 5.0, 1.8, -12.3, 136.0]}))
+    assert told_of([one, other], tmp_path) == []

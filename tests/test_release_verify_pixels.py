@@ -105,7 +105,16 @@ def _obvious_look(colours):
     is_edge = np.arange(len(steps)) % 8 == 7
     red, green, blue = few.mean(axis=(0, 1))
     over = steps[is_edge].mean() if is_edge.any() else np.nan
-    return [hue, steps.mean(), over, steps[~is_edge].mean(), red - green, blue - green, colours[..., :3].std()]
+    return [
+        hue,
+        steps.mean(),
+        over,
+        steps[~is_edge].mean(),
+        red - green,
+        blue - green,
+        colours[..., :3].mean(),
+        colours[..., :3].std(),
+    ]
 
 
 @pytest.mark.parametrize("shape", [(36, 77, 3), (36, 80, 4), (1, 8, 3), (2, 3, 3)])

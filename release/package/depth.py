@@ -12,11 +12,10 @@ from pydantic import BaseModel
 
 from cosfly.errors import InputError, RenderError
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values
-from release.depth import MM_A_METRE
+from release.depth import MM_A_METRE, SKY_MM
 from release.record import DepthCoding, DepthCodingName
 
 MOST_MM = 65534
-SKY_MM = 65535  # what 16 bits have left for the sky
 MOST_PNG_M = 65.5  # beyond, 16 bits of millimetres end
 
 

@@ -30,7 +30,8 @@ class Findings:
         listed = [failure.message for failure in self.failures[:NUM_NAMED]]
         more = f" | and {len(self.failures) - NUM_NAMED} more, see {path}" if len(self.failures) > NUM_NAMED else ""
         kind = VerifyError if all(failure.code == VerifyError.code for failure in self.failures) else InputError
+        wrong = "1 thing is" if len(self.failures) == 1 else f"{len(self.failures)} things are"
         raise kind(
-            f"nothing is released: {len(self.failures)} things are wrong with the material", where=self._stage.path,
+            f"nothing is released: {wrong} wrong with the material", where=self._stage.path,
             got=" | ".join(listed) + more, fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
         )  # fmt: skip

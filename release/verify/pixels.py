@@ -66,10 +66,10 @@ def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
 
 
 def look_of(colours: np.ndarray) -> np.ndarray:
-    """Tell how a picture looks, (7,) grey levels.
+    """Tell how a picture looks, (8,) grey levels.
 
     How colourful and how sharp it is: how far channels lie from their mean, and pixels from the next. How far pixels lie from the next over
-    edges of blocks of 8 px, which lossy codings pack apart, and elsewhere. Red and blue less green. Deviation of all its numbers.
+    edges of blocks of 8 px, which lossy codings pack apart, and elsewhere. Red and blue less green. Mean and deviation of all its numbers.
 
     Args:
         colours: (k, w, 3 or 4) uint8, some of its rows.
@@ -81,10 +81,12 @@ def look_of(colours: np.ndarray) -> np.ndarray:
     edges = steps[BLOCK_PX - 1 :: BLOCK_PX]
     inside = (steps.sum() - edges.sum()) / max(len(steps) - len(edges), 1)
     num_pixels, num_hues = num_rows * width, num_rows * -(-width // LOOK_EVERY) * 3
-    spread = np.sqrt(max(squares / num_numbers - (total / num_numbers) ** 2, 0.0))
+    brightness = total / num_numbers
+    spread = np.sqrt(max(squares / num_numbers - brightness**2, 0.0))
     over = edges.mean() if len(edges) else np.nan
     tint = (red - green) / num_pixels, (blue - green) / num_pixels
-    return np.array([hue / (3.0 * num_hues), steps.mean() if len(steps) else np.nan, over, inside, *tint, spread])
+    sharp = steps.mean() if len(steps) else np.nan
+    return np.array([hue / (3.0 * num_hues), sharp, over, inside, *tint, brightness, spread])
 
 
 class Edges(NamedTuple):

@@ -10,6 +10,7 @@ from typing import Any
 
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table
 from cosfly.stage_folder import flattened
@@ -17,6 +18,7 @@ from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
+from release.depth import SKY_MM
 from release.record import ReleaseRecord, content_digest, shard_path
 from release.subsample import RULE, select_frames
 from release.verify.across import Summary, frames_digest
@@ -47,6 +49,15 @@ def _check_contract(record: ReleaseRecord, findings: Findings) -> None:
     _differ(findings, "rule", "frame_selection", record.frame_selection, RULE)
     if (record.depth is not None) != ("depth" in record.settings.modalities):
         findings.error("depth_coding", "release.json: depth", record.depth, "how depth is stored exactly where it is released")  # fmt: skip
+    elif record.depth is not None:
+        is_png = record.depth.coding == "millimetre_png"
+        told = {
+            "unit": "millimetre" if is_png else "metre",
+            "sky": SKY_MM if is_png else SKY_DEPTH_M,
+            "invalid": INVALID_DEPTH_M,
+        }
+        for name, value in told.items():
+            _differ(findings, "depth_coding", f"depth.{name}", getattr(record.depth, name), value)
 
 
 def _check_sums(record: ReleaseRecord, findings: Findings) -> None:

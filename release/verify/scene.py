@@ -29,6 +29,7 @@ from release.verify.findings import Findings
 from release.verify.person import check_shown
 from release.verify.pictures import check_picture, decode, least_step, view_of
 from release.verify.pixels import BLOCK_PX, NUM_IDS, look_of, new_kinds
+from release.verify.places import Kept, kept_rows, thinned
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -47,19 +48,25 @@ COLOUR_LEAST, COLOUR_LEAST_AT_PX = (0.65, 0.82), (160.0, 320.0)
 # Grey levels: of a pale square the grain alone, 4 from frame to frame, leaves honest frames a correlation of 0.7.
 CONTRAST = 10.0
 TINT = 2.0  # grey levels of hue beyond the median of a flight; honest 0.1
-# Grey levels of brightness beside the frame before, and times the median of a flight: honest 3.3 and, in dense fog, 9 where 2 are usual.
+# Grey levels of brightness beside the frame before, less what its way through fog explains, and times the median of a flight: honest 4.7.
 SHADE, SHADE_TIMES = 6.0, 8.0
+NEARER_M = 0.5  # a way towards the person or away from it by which fog shows in the brightness
 # Of the points that agree, as float32, on planes: depth that was made rough has none. Honest 0.8 and more in the median of a flight.
 PLANES_LEAST = 0.1
 # How much better the next frame's place must explain a frame's colours to be where they are from: of colours that agree with the frame
-# before as usual in the flight, of others (honest 0.03 at most), and of frames that lie nearer to each other than so much: rows of colours are
+# before as usual in the flight or around it, of others (honest 0.03 at most), and of frames that lie nearer to each other than so much: rows of colours are
 # a pixel off at most, and honest frames 0.5 px apart agreed better by 0.067 with the next one's place.
 BETTER_BY_USUAL, BETTER_BY, UNUSUAL = 0.07, 0.045, 0.04
+AROUND = 5  # frames before and after, which by night may agree less than the flight does, or tell nothing
 BETTER_BY_NEAR, NEAR_PX = 0.1, 2.0
+# Frames so near to each other may agree better with the next one's place by what is usually lost on the way, so many times: pictures without
+# smoothed edges lose by where in a pixel a point comes out (honest 1.7 times 0.08).
+FEW_PX, LOST_TIMES = 3.0, 2.0
 # Of the lesser of both neighbours, in hue and in detail: honest 0.6 and 0.9 of ours; and what these must have for that to mean something.
 LOOKS_LEAST, LOOK_LEAST = (0.2, 0.6), 2.0
+TWINS_LOOK = (0, 1, 4, 5, 6)  # of `look_of`, what twins have about the same of
 # Steps over edges of blocks to those elsewhere: honest 0.998 to 1.004 over a flight; JPEG of quality 40 1.85. So many edges, for that to mean something.
-BLOCKS_MOST, LEAST_EDGES = 1.1, 300
+BLOCKS_MOST, LEAST_BLOCK_EDGES = 1.1, 300
 # Between the two nearest depths of a frame's sample: honest 4e-6 m; of so many frames of a flight the least counts.
 STEP_MOST_M, STEPS_LOOKED_AT = 2e-4, 8
 # Flights of others: depth may be rough, but it is equally rough in all frames.
@@ -81,15 +88,17 @@ class _Pairs:
 @dataclass(frozen=True)
 class Shown:
     """What is kept of a flight's pictures to compare it with others. keys: of each row a number that tells its colour picture from others,
-    and one for its depth; 0 where it has none. kinds: id * 256 + kind of what is seen. hue: red and blue less green, grey levels, or nothing.
+    and one for its depth; 0 where it has none. kinds: id * 256 + kind of what is seen. look: how colourful and sharp, red and blue less green, brightness, grey levels, or nothing.
+    kept: rows and frames that are compared with other walks.
     """
 
     keys: list[tuple[int, int]]
     kinds: list[int]
-    hue: list[float]
+    look: list[float]
+    kept: list[tuple[int, Kept]]
 
 
-NOTHING_SHOWN = Shown([], [], [])
+NOTHING_SHOWN = Shown([], [], [], [])
 
 
 def check_pictures(
@@ -106,9 +115,11 @@ def check_pictures(
     """
     keys: list[tuple[int, int]] = []
     pairs, kinds = _Pairs(), np.full(NUM_IDS, -1, np.int16)
-    looks = np.full((len(flight), 7), np.nan)
+    looks = np.full((len(flight), 8), np.nan)
     outlines = np.full(len(flight), np.nan)
     steps: list[float] = []  # of some frames' depth
+    kept: list[tuple[int, Kept]] = []
+    to_keep = kept_rows(len(flight))
     before: list[tuple[int, View]] = []  # the two frames before
     for i, files in enumerate(pictures):
         advance()
@@ -127,6 +138,8 @@ def check_pictures(
         view = view_of(flight, i, decoded)
         if decoded[0].size:
             _compare(flight, i, view, before, pairs)
+            if i in to_keep and view.instance.size and not np.isnan(flight.target_m[i]).any():
+                kept.append((i, thinned(view, flight.intrinsics[i])))
         before = [*before[-1:], (i, view)]
     _judge(flight, pairs, rounded_as, findings)
     check_shown(flight, outlines, findings)
@@ -136,9 +149,9 @@ def check_pictures(
         least = min((step for step in steps if np.isfinite(step)), default=0.0)
         if least > STEP_MOST_M:
             findings.error("depth_coding", flight.name, f"depths that are {least:.4f} m apart or equal", "float32 as it was drawn, as the record says: depths that differ by millionths")  # fmt: skip
-    hues = looks[np.isfinite(looks[:, 4]), 4:6]
+    known = looks[np.isfinite(looks).all(axis=1)][:, TWINS_LOOK]
     ids = np.flatnonzero(kinds >= 0)
-    return Shown(keys, (ids << 8 | kinds[ids]).tolist(), hues.mean(axis=0).tolist() if len(hues) else [])
+    return Shown(keys, (ids << 8 | kinds[ids]).tolist(), known.mean(axis=0).tolist() if len(known) else [], kept)
 
 
 def _keys(files: Pictures, decoded: object) -> tuple[int, int]:
@@ -209,7 +222,7 @@ def _judge_blocks(flight: FlightRows, steps: np.ndarray, findings: Findings) -> 
         steps: (n, 2) grey levels, from pixel to pixel over edges of blocks and elsewhere; NaN where nobody knows.
     """
     known = steps[np.isfinite(steps).all(axis=1)]
-    if len(known) * flight.size_px[0, 0] < LEAST_EDGES * BLOCK_PX:
+    if len(known) * flight.size_px[0, 0] < LEAST_BLOCK_EDGES * BLOCK_PX:
         return
     over, inside = known.mean(axis=0)
     if inside > 0.0 and over > BLOCKS_MOST * inside:
@@ -223,9 +236,30 @@ def _judge_planes(flight: FlightRows, found: list[Agreement], findings: Findings
         findings.error("scene_depth", flight.name, f"depth of which {np.median(shares):.0%} of the points lie on planes", f"at least {PLANES_LEAST:.0%}: depth as it was drawn, without noise")  # fmt: skip
 
 
-def _better_by(way: float, *, is_unusual: bool) -> float:
-    """How much better a frame's colours must agree with the next frame's place, `way` px away, to be from there."""
-    return BETTER_BY_NEAR if way < NEAR_PX else BETTER_BY if is_unusual else BETTER_BY_USUAL
+def _around(colours: np.ndarray) -> np.ndarray:
+    """Give the median correlation of the frames round each, (n,); NaN where one of them has too little contrast to have any: so has its neighbour."""
+    return np.array([np.median(colours[max(0, k - AROUND) : k + AROUND + 1]) for k in range(len(colours))])
+
+
+def _better_by(way: float, usual: float, *, is_unusual: bool) -> float:
+    """How much better a frame's colours must agree with the next frame's place, `way` px away, to be from there. usual: how much the flight's
+    agree with the frame before; NaN where nobody knows."""
+    least = BETTER_BY_NEAR if way < NEAR_PX else BETTER_BY if is_unusual else BETTER_BY_USUAL
+    return max(least, LOST_TIMES * (1.0 - usual)) if way < FEW_PX else least
+
+
+def _shades(flight: FlightRows, pairs: _Pairs) -> np.ndarray:
+    """Give how much brighter each frame is than the one before, grey levels (n,), less what fog makes of coming nearer.
+
+    What fog lies before is brighter or darker by how far away it is. How much a metre makes is the median of the flight's own pairs.
+    """
+    rows, shades = np.array(pairs.rows), np.array([pair.shade for pair in pairs.found])
+    place, person = flight.pose[rows, :3], flight.target_m[rows - 1]
+    farther_m = np.linalg.norm(place - person, axis=1) - np.linalg.norm(flight.pose[rows - 1, :3] - person, axis=1)
+    far = np.isfinite(shades) & (np.abs(farther_m) > NEARER_M)
+    if far.sum() < LEAST_PAIRS:
+        return shades
+    return shades - float(np.median(shades[far] / farther_m[far])) * np.nan_to_num(farther_m)
 
 
 def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findings: Findings) -> None:
@@ -254,10 +288,11 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
         findings.error("scene_colour", flight.name, f"colours that agree by {np.nanmedian(usuals):.2f} from frame to frame", "pictures of this flight")  # fmt: skip
     if rounded_as == "float32" and not flight.is_foreign:
         _judge_planes(flight, pairs.found, findings)
-    shades = np.abs([pair.shade for pair in pairs.found])
-    shade_most = max(SHADE, SHADE_TIMES * float(np.nanmedian(shades))) if np.isfinite(shades).any() else np.inf
-    compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, pairs.ways_px, usuals, drops, strict=True)
-    for i, gap, pair, elsewhere, way, usual_colour, drop in compared:
+    shades = _shades(flight, pairs)
+    shade_most = max(SHADE, SHADE_TIMES * float(np.nanmedian(np.abs(shades)))) if np.isfinite(shades).any() else np.inf
+    around = np.minimum(usuals, _around(colours))
+    compared = zip(pairs.rows, pairs.gaps, pairs.found, pairs.elsewhere, pairs.ways_px, usuals, around, drops, shades, strict=True)  # fmt: skip
+    for i, gap, pair, elsewhere, way, usual_colour, near_colour, drop, shade in compared:
         if pair.seen < LEAST_SEEN:
             continue
         share, through = pair.agree / pair.seen, pair.through / pair.seen
@@ -275,11 +310,13 @@ def _judge(flight: FlightRows, pairs: _Pairs, rounded_as: DepthCodingName, findi
             continue
         if pair.same < SAME_LEAST * pair.agree:
             findings.error("scene_instance", where, f"{pair.same / pair.agree:.1%} of the instances of the frame before", f"at least {SAME_LEAST:.0%} where the depth agrees")  # fmt: skip
+        elif pair.renamed and gap <= NEAR_FRAMES and not flight.is_foreign:
+            findings.error("scene_instance", where, f"a thing of {pair.renamed} points under another id than in the frame before", "one id for a thing")  # fmt: skip
         if pair.correlation < usual_colour - drop:
             findings.error("scene_colour", where, f"a picture that resembles the one before by {pair.correlation:.2f}, its camera's way allowed for (1: the same)", f"at least {usual_colour - drop:.2f}, by the flight's other frames: look whether it is of this frame")  # fmt: skip
-        elif abs(pair.shade) > shade_most and gap <= NEAR_FRAMES and not flight.is_foreign:
-            findings.error("scene_colour", where, f"a picture that is {abs(pair.shade):.0f} grey levels {'brighter' if pair.shade > 0 else 'darker'} than the frame before", f"at most {shade_most:.0f}, by the flight's other frames")  # fmt: skip
+        elif abs(shade) > shade_most and gap <= NEAR_FRAMES and not flight.is_foreign:
+            findings.error("scene_colour", where, f"a picture that is {abs(shade):.0f} grey levels {'brighter' if shade > 0 else 'darker'} than the frame before, its camera's way allowed for", f"at most {shade_most:.0f}, by the flight's other frames")  # fmt: skip
         elif pair.tint > usual_tint + TINT:
             findings.error("scene_colour", where, f"colours that differ by {pair.tint:.0f} grey levels from the frame before", f"at most {usual_tint + TINT:.0f}, by the flight's other frames")  # fmt: skip
-        elif elsewhere > pair.correlation + _better_by(way, is_unusual=pair.correlation < usual_colour - UNUSUAL):
+        elif elsewhere > pair.correlation + _better_by(way, usual_colour, is_unusual=pair.correlation < near_colour - UNUSUAL):  # fmt: skip
             findings.error("scene_colour", where, f"a picture that resembles the one before by {pair.correlation:.3f}, and would by {elsewhere:.3f} if it were the next frame's", "pictures in their frames' order: compare it with those beside it")  # fmt: skip
