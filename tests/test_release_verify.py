@@ -198,6 +198,16 @@ def test_another_teacher_in_rows_and_record_is_found(honest, tmp_path):
     assert "provenance" in errors_in(forge(honest, tmp_path / "forged", rows_too, teachers), "rows")
 
 
+@pytest.mark.parametrize(("stage", "key"), [("plan", "map"), ("render", "boxes")])
+def test_stages_that_went_by_other_maps_are_told(honest, tmp_path, stage, key):
+    forged = forge(
+        honest, tmp_path / "forged", change_record=lambda r: _stage(r, stage)["inputs"].update({key: "0" * 64})
+    )
+    report = verify(forged, level="structure")
+    assert report.is_ok
+    assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "provenance")]
+
+
 def _one_less(record: dict, reason: str) -> None:
     """One flight more was found, and left out."""
     flights = record["history"]["flights"]

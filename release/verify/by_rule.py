@@ -29,6 +29,12 @@ RMS_SHARE, RMS_ROUNDING = 0.02, 0.01
 REVIEWED = "rejected: review"  # by people: docs/files.md, "Decisions"
 RULES = "rules"  # the kind of teacher that asks nobody
 
+# Which stages read the same map, and under which name of their inputs.
+MAPS_BETWEEN = {
+    "simplified map": (("pedestrians", "map"), ("plan", "map"), ("render", "simplified"), ("inspect", "simplified")),
+    "map": (("simplify", "maps"), ("render", "boxes")),
+}
+
 
 def check_rules(record: ReleaseRecord, findings: Findings) -> None:
     """Make again what the record's own rules give."""
@@ -36,6 +42,7 @@ def check_rules(record: ReleaseRecord, findings: Findings) -> None:
     _check_walk_names(record, findings)
     _check_towns(record, findings)
     _check_inputs(record, findings)
+    _check_maps_between(record, findings)
     _check_asks(record, findings)
     _check_rejected(record, findings)
     _check_caption_settings(record, findings)
@@ -110,6 +117,16 @@ def _check_inputs(record: ReleaseRecord, findings: Findings) -> None:
             got = last[name].inputs.get("data") if name in last else None
             if got is not None and got not in trees:
                 findings.error("provenance", f"release.json: provenance: {source.run}: {name}: inputs.data", got, f"{source.tree_sha256}, the tree's")  # fmt: skip
+
+
+def _check_maps_between(record: ReleaseRecord, findings: Findings) -> None:
+    """Walks, flights, pictures and inspection go by one simplified map, which was made of the map that is drawn."""
+    for source in record.provenance.sources:
+        inputs = {stage.stage: stage.inputs for stage in source.stages}
+        for name, readers in MAPS_BETWEEN.items():
+            told = {f"{stage}.{key}": inputs[stage][key] for stage, key in readers if key in inputs.get(stage, {})}
+            if len(set(told.values())) > 1:
+                findings.warn("provenance", f"release.json: provenance: {source.run}: inputs", told, f"one {name} in all of them, unless they were made of several on purpose")  # fmt: skip
 
 
 def _check_asks(record: ReleaseRecord, findings: Findings) -> None:
