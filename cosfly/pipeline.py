@@ -26,7 +26,7 @@ import cosfly.simplify.stage
 import release.package.stage
 from cosfly import estimate
 from cosfly.ahead import compiled_ahead
-from cosfly.errors import ConfigError, CosflyError, InputError
+from cosfly.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.folder_lock import give_up, hold_folder
 from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
@@ -102,6 +102,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     and `summary.json` in the run folder, in that of each town where there are several.
     """
     use_limits(cfg.reading)
+    check_out(out)
     towns = check(cfg)
     left = _TimeLeft(cfg, out)
     if not towns:
@@ -153,6 +154,19 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
                 fix=f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'",
             )  # fmt: skip
     return towns
+
+
+def check_out(out: Path) -> None:
+    """Refuse to make a run in the folder of a stage: its tree would hold a second one, and what is read of it would be of both.
+
+    Raises:
+        ResumeError: there is a stage's record.
+    """
+    if (out / "stage.json").exists() and not (out / "run.yaml").exists():
+        raise ResumeError(
+            "the folder of a stage, not of a run", where=out, got="stage.json in it",
+            fix="choose another --out; a run goes on with its own folder, in which those of its stages stand",
+        )  # fmt: skip
 
 
 def check_with_files(cfg: RunConfig) -> None:

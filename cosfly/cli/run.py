@@ -49,6 +49,7 @@ def run(
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     out = out or Path("runs") / cfg.name
     if dry_run:
+        pipeline.check_out(out)
         pipeline.check_with_files(cfg)
         return _tell_estimate(cfg, out)
     options.set_aside(out, repair)
