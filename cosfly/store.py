@@ -49,10 +49,10 @@ def _concerns(error: OSError, path: Path) -> bool:
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or the new."""
-    partial = _partial(path)
     refuse_link(path)
-    if path.is_dir():
+    if path.is_dir():  # asked first: `.` and `/` have no name to put a temporary one beside
         raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
+    partial = _partial(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_left(path)

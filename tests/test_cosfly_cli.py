@@ -72,17 +72,41 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
         (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
         (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
+        (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
+        (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
+        (
+            ("run", "quickstart", "--out", "stage", "--dry-run"),
+            ("stage: the folder of a stage", "choose another --out"),
+        ),
     ],
 )
 def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, parts):
     monkeypatch.chdir(tmp_path)
     for name in ("taken", "town.csv"):
         (tmp_path / name).write_text("a file")
+    write_json(tmp_path / "stage/stage.json", {})
     status, line = answer(capfd, monkeypatch, *words)
     assert status == 1
     assert line.startswith("error: ")
     for part in parts:
         assert part in line
+
+
+@pytest.mark.parametrize(
+    ("redirect", "status", "told"),
+    [
+        ("> /dev/full", 1, "error: cannot write the output; got No space left on device"),
+        (">&-", 0, ""),
+        ("2>&-", 0, ""),
+    ],
+)
+@pytest.mark.parametrize("words", ["config show quickstart", "list ."])
+def test_an_output_that_is_full_or_closed_is_no_bug(tmp_path, words, redirect, status, told):
+    command = f"{sys.executable} -m cosfly {words} {redirect}"
+    done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert done.stderr.startswith(told)
+    assert "Traceback" not in done.stderr
 
 
 def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):

@@ -34,6 +34,14 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]  # no litter
 
 
+@pytest.mark.parametrize("place", [".", "/", "there"])
+def test_a_folder_in_the_place_of_a_file_is_one_error(tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    with pytest.raises(StorageError, match="where a folder is"):
+        write_json(Path(place), {})
+
+
 def test_nan_is_never_a_value(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "a.json", {"x": float("nan")})

@@ -13,7 +13,7 @@ from string import Template
 from cosfly import in_place
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.files import read_text
-from cosfly.store import refuse_links, write_bytes
+from cosfly.store import refuse_links, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ def export_prompts(folder: Path) -> list[Path]:
         ConfigError: a file of these names is there, with another text.
     """
     texts = in_place.given("prompts") or shipped_prompts()
-    folder.mkdir(parents=True, exist_ok=True)
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
     there = [name for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
     if there:

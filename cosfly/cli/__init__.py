@@ -115,6 +115,14 @@ def main() -> None:
         if end.code in ENDED:
             _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
         _end(end.code)
+    except OSError as error:
+        from cosfly.store import DISK_FULL
+
+        if error.filename is not None or error.errno not in DISK_FULL:
+            raise
+        # What stands in no file's name is the output of the command itself, as in `cosfly config show > FILE`.
+        sys.stdout = None  # type: ignore[assignment]  # what is left in it cannot be written at the end either
+        _fail(f"cannot write the output; got {error.strerror}; free some space, then run the same command again", 1)
 
 
 def _fail(message: str, status: int) -> None:
@@ -129,8 +137,9 @@ def _end(status: int | str | None) -> None:
     """End the process. One of several, as a launcher starts them, ends at once: threads that the libraries of such a group leave behind
     abort the interpreter's own end now and then (2 of some 200), which a launcher takes for a failure of the whole training.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # a process may be started with either closed
+            stream.flush()
     if os.environ.get("WORLD_SIZE", "1") != "1" and (status is None or isinstance(status, int)):
         logging.shutdown()
         os._exit(status or 0)
