@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet, shipped_actions
 from cosfly.products.coverage import Coverage
 from cosfly.products.frames import FrameFile
@@ -18,6 +19,7 @@ from cosfly.store import sha256_bytes, write_model
 from release.columns import SplitName
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"
+RECORD = "release.json"
 
 Counts = dict[str, int]
 SplitBy = Literal["walk", "town"]
@@ -315,6 +317,15 @@ def shard_pattern(split: SplitName, digest: str) -> str:
     return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
+def release_folder(folder: Path) -> Path:
+    """Give the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them below it.
+
+    A folder that holds none is given as it is, for its reader to say so.
+    """
+    places = (folder, folder / "dataset", folder / "release/dataset")
+    return next((place for place in places if (place / RECORD).is_file()), folder)
+
+
 def write_record(path: Path, record: ReleaseRecord) -> None:
     write_model(path, record, schema=RELEASE_SCHEMA, version=RELEASE_VERSION)
 
@@ -323,8 +334,13 @@ def read_record(path: Path) -> ReleaseRecord:
     """Read `release.json`.
 
     Raises:
-        InputError: names the file and the field.
+        InputError: there is none; or names the file and the field.
     """
+    if not path.exists():
+        raise InputError(
+            "there is no release", where=path, expected="the folder of a release, or of a run that has one",
+            fix="check the path, or make one: cosfly release build",
+        )  # fmt: skip
     return read_model(
         path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record", tree=path.parent
     )

@@ -607,6 +607,24 @@ def test_digests_of_bytes_do_not_depend_on_the_folder(dataset, tmp_path):
     assert digest[0] == digest[1]
 
 
+@pytest.mark.parametrize("below", ["", "dataset", "release/dataset"])
+def test_a_release_is_found_from_its_stage_and_from_its_run(below, dataset, tmp_path):
+    shutil.copytree(dataset, tmp_path / "run" / below)
+    (tmp_path / "run/render").mkdir()  # a run has its tree beside the release, and it is the release that is asked for
+    assert open_release(tmp_path / "run").folder == tmp_path / "run" / below
+    assert "by their record" in str(verify(tmp_path / "run", level="structure"))
+    card = CliRunner().invoke(app, ["release", "card", str(tmp_path / "run")])
+    assert card.output == (dataset / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("words", [["card"], ["stats", "--out", "x"], ["export", "--format", "tree", "--out", "x"]])
+def test_where_there_is_no_release_that_is_said(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["release", *words, "."])
+    assert "there is no release" in str(done.exception)
+    assert "a run that has one" in str(done.exception)
+
+
 # --- verified ---------------------------------------------------------------------------------------------------------
 
 

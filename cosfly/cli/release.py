@@ -79,7 +79,10 @@ def _frames_setting(frames: str | None) -> list[str]:
 @app.command("verify")
 def release_verify(
     folder: Annotated[
-        Path, typer.Argument(help="Release folder, playback tree, or export of a release; the hub's cache too.")
+        Path,
+        typer.Argument(
+            help="Release folder, a run with one, playback tree, or export of a release; the hub's cache too."
+        ),
     ],
     level: Annotated[
         str,
@@ -121,7 +124,7 @@ def release_verify(
 
 @app.command("stats")
 def release_stats(
-    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
     out: Annotated[Path, typer.Option(help="Folder for stats.html, stats.md and stats.json.")],
     pixels: Annotated[
         int,
@@ -139,7 +142,7 @@ def release_stats(
 
 @app.command("card")
 def release_card(
-    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
     out: Annotated[Path | None, typer.Option(help="File to write; by default it is printed.")] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
@@ -147,11 +150,10 @@ def release_card(
     """Render the data-set card of a release from its release.json, as `verify` expects it in README.md."""
     from cosfly.store import write_bytes
     from release.card.render import render_card
-    from release.record import read_record
+    from release.record import read_record, release_folder
 
     options.resolve(config, overrides)
-    dataset = folder / "dataset" if (folder / "dataset/release.json").exists() else folder
-    card = render_card(read_record(dataset / "release.json"))
+    card = render_card(read_record(release_folder(folder) / "release.json"))
     if out is None:
         typer.echo(card, nl=False)
     else:
@@ -190,7 +192,7 @@ def release_viewer(
 
 @app.command("export")
 def release_export(
-    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
     out: Annotated[Path, typer.Option(help="Folder for the export and its records.")],
     format: Annotated[
         Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"],
@@ -220,7 +222,10 @@ def release_export(
 @app.command("get")
 def release_get(
     source: Annotated[
-        str, typer.Argument(help="Release folder, or an address: https://..., hf://datasets/..., zip://::...")
+        str,
+        typer.Argument(
+            help="Release folder, a run with one, or an address: https://..., hf://datasets/..., zip://::..."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the release and its records.")],
     town: Annotated[list[str] | None, typer.Option(help="Only this town; repeat for more.")] = None,
@@ -258,7 +263,7 @@ def release_get(
 
 @app.command("push")
 def release_push(
-    folder: Annotated[Path, typer.Argument(help="Release folder.")],
+    folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
     repo: Annotated[str, typer.Option(help="Repository of data on the hub: OWNER/NAME; made if there is none.")],
     yes: Annotated[bool, typer.Option("--yes", help="Send it. Without: only say what would go.")] = False,
     public: Annotated[

@@ -20,7 +20,7 @@ from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_
 from cosfly.store import inside
 from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.depth import depth_of
-from release.record import DepthCoding, ReleaseRecord, read_record
+from release.record import DepthCoding, ReleaseRecord, read_record, release_folder
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
 SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
@@ -90,13 +90,12 @@ class Release:
 
 
 def open_release(folder: Path) -> Release:
-    """Open a release folder, or the `dataset` folder inside a release stage's.
+    """Open a release folder, or that inside a release stage's or a run's.
 
     Raises:
         InputError: it is none, or its record names files that no release has; lists them all.
     """
-    if not (folder / "release.json").is_file() and (folder / "dataset" / "release.json").is_file():
-        folder = folder / "dataset"
+    folder = release_folder(folder)
     record = read_record(folder / "release.json")
     wrong = []
     for shard in record.shards:

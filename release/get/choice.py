@@ -14,6 +14,7 @@ from cosfly.store import CHECKSUMS, sha256_bytes
 from release.columns import SplitName
 from release.get.remote import Remote
 from release.record import (
+    RECORD,
     RELEASE_SCHEMA,
     RELEASE_VERSION,
     ReleasedFlight,
@@ -22,7 +23,6 @@ from release.record import (
     shard_path,
 )
 
-RECORD = "release.json"
 MOST_RECORD_BYTES = 256_000_000  # some 400 bytes a flight
 
 

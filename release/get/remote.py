@@ -23,6 +23,7 @@ from cosfly.reading.files import open_file
 from cosfly.runner import advance
 from cosfly.store import inside
 from release.package.publishable import published_name
+from release.record import release_folder
 
 Answer = TypeVar("Answer")
 MB = 1024 * 1024
@@ -102,8 +103,7 @@ class FolderRemote:
     """A folder of this machine, read as every folder is."""
 
     def __init__(self, folder: Path) -> None:
-        if not (folder / "release.json").is_file() and (folder / "dataset" / "release.json").is_file():
-            folder = folder / "dataset"
+        folder = release_folder(folder)
         self.folder, self.shown = folder, str(folder)
 
     def size(self, name: str) -> int:

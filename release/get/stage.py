@@ -41,11 +41,12 @@ from cosfly.store import (
 )
 from release.card.numbers import compute_numbers
 from release.columns import PLACE, SPLIT_NAMES, SplitName, flight_name, flight_spans, schema
-from release.get.choice import RECORD, Choice, chosen_flights, fetch_record
+from release.get.choice import Choice, chosen_flights, fetch_record
 from release.get.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
 from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
 from release.package.rows import open_writer
 from release.record import (
+    RECORD,
     PartOf,
     ReleasedFlight,
     ReleaseRecord,

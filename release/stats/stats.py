@@ -8,7 +8,7 @@ from cosfly.console import progress_bar
 from cosfly.store import write_bytes, write_json
 from release.card.numbers import COLUMNS as CARD_COLUMNS
 from release.card.numbers import Counted, check_rows, row_lists
-from release.record import read_record
+from release.record import read_record, release_folder
 from release.stats.counting import COLUMNS, Counts
 from release.stats.page import markdown, page_html
 from release.stats.pixels import look_at
@@ -23,7 +23,7 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     Raises:
         InputError: it is no release, or something in it cannot be read.
     """
-    dataset = dataset / "dataset" if (dataset / "dataset/release.json").is_file() else dataset
+    dataset = release_folder(dataset)
     record = read_record(dataset / "release.json")
     counts, card = Counts(), Counted()
     with progress_bar("stats: rows", sum(shard.rows for shard in record.shards)) as advance:

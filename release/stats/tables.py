@@ -40,7 +40,9 @@ def _release(record: ReleaseRecord, counts: Counts) -> Table:
     rendered = [flight.frames_available for flight in record.flights]
     released = [flight.frames for flight in flights]
     planned = history.trajectories
-    steps = ", ".join(f"{step:g}" for step in sorted(counts.step_s))
+    steps: Cell = ", ".join(f"{step:g}" for step in sorted(counts.step_s)) or None
+    if len(counts.step_s) == 1:
+        steps = next(iter(counts.step_s))  # a number stands where numbers stand
     rows: list[list[Cell]] = [
         ["trajectories", numbers.trajectories],
         *pairs("flights, ", sorted(tracks.items())),
@@ -51,7 +53,7 @@ def _release(record: ReleaseRecord, counts: Counts) -> Table:
         ["frames of a flight as rendered, most", max(rendered, default=None)],
         ["frames of a flight as released, least", min(released, default=None)],
         ["frames of a flight as released, most", max(released, default=None)],
-        ["time step, s", steps or None],
+        ["time step, s", steps],
         *pairs("frames of ", counts.image_px.most_common()),
         ["captions", numbers.captions.frames_with],
         ["trajectories planned for one accepted", ratio(planned.planned, planned.accepted) if planned else None],

@@ -28,7 +28,7 @@ from cosfly.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
 from release.export.manifest import ExportRecord, read_export, render_readme
-from release.record import DepthCoding, ReleaseRecord, read_record
+from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
 from release.verify.drawn_again import Drawn
@@ -41,7 +41,7 @@ from release.verify.shards import check_shards
 from release.verify.sources import Entry, FlightSource, Shards, Tree
 from release.verify.tars import found_tars
 
-RECORD, EXPORT = "release.json", "export.json"
+EXPORT = "export.json"
 RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
 LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
 
@@ -66,7 +66,7 @@ def verify(
     watch: Watch = Watch(),
     source: Path | None = None,
 ) -> Verified:
-    """Check a folder (or the `dataset` folder inside a release stage's, or the format's inside an export's).
+    """Check a folder (or the release inside a release stage's or a run's, or the format's inside an export's).
 
     Args:
         level: how far to go; each level does what the ones before it do.
@@ -79,8 +79,8 @@ def verify(
     """
     findings, how = Findings(), _How(level, reader, workers, watch, source)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
-        inner = (folder / "dataset" / RECORD, *(folder / name / EXPORT for name in FORMATS))  # in the stage's folder
-        folder = next((path.parent for path in inner if path.is_file()), folder)
+        exports = (folder / name / EXPORT for name in FORMATS)  # in the stage's folder
+        folder = next((path.parent for path in exports if path.is_file()), release_folder(folder))
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
     elif (folder / EXPORT).is_file():
