@@ -25,7 +25,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
-from cosfly.topview import TopView, draw_map
+from cosfly.topview import TopView, draw_map, draw_text
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
@@ -612,3 +612,17 @@ def test_the_overview_is_north_up():
     picture = draw_map(box_map, TopView.around(np.stack(box_map.bounds()), 104)).astype(int)
     assert picture[12, 90, 2] > picture[12, 90, 0] + 50  # blue, top right
     assert picture[90, 90, 1] > picture[90, 90, 2] + 20  # green, bottom right
+
+
+@pytest.mark.parametrize("text", ["t = 106.5 s", "segmentation"])
+def test_a_halo_lies_round_the_letters(text):
+    """Thicker strokes are a wider font in OpenCV 5: a halo of them stood beside its letters."""
+
+    def columns(halo) -> np.ndarray:
+        picture = np.full((40, 240, 3), 128, np.uint8)
+        draw_text(picture, text, 20, 25, 0.42, (255, 255, 255), halo=halo)
+        return np.flatnonzero((picture != 128).any(axis=(0, 2)))
+
+    letters, with_halo = columns(None), columns((0, 0, 0))
+    assert letters[0] - 1 <= with_halo[0] <= letters[0]
+    assert letters[-1] <= with_halo[-1] <= letters[-1] + 1
