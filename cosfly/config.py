@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib.resources
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
@@ -15,6 +15,7 @@ from cosfly.reading.files import read_text
 from cosfly.reading.settings_text import MOST_DEPTH, parse_yaml
 
 MOST_LISTED = 15  # names of settings in a message
+MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"
 # What validators are given as context where wrong values were left out: then what is lacking is nobody's mistake.
 LEFT_OUT = {"wrong values": "left out"}
 
@@ -155,6 +156,9 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
         if last in getattr(group, "formerly", {}):
             return f"{field}: unknown setting ({group.formerly[last]})"
         known = list(getattr(group, "model_fields", {}))
+        elsewhere = [name for name in _names(model) if f".{name}".endswith(f".{last}")]
+        if 0 < len(elsewhere) <= MOST_ELSEWHERE:
+            return f"{field}: unknown setting (did you mean {' or '.join(map(repr, elsewhere))}?)"
         hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
         return f"{field}: unknown setting{hint}"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
@@ -163,6 +167,13 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
         return f"{field}: not a list, got {detail['input']!r}; write [{detail['input']}]"
     what = "not a group of settings" if kind == "model_type" else plain(detail["msg"])
     return f"{field}: {what}{got}"
+
+
+def _names(model: Any, above: str = "") -> Iterator[str]:
+    """Yield the names of all settings and groups of a model, as `--set` takes them."""
+    for field in getattr(model, "model_fields", {}):
+        yield above + field
+        yield from _names(_group(model, [field]), f"{above}{field}.")
 
 
 def _group(model: Any, parents: Iterable[Any]) -> Any:

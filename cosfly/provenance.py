@@ -89,12 +89,12 @@ def read_stage_record(folder: Path) -> StageRecord:
 
 def fingerprint(path: Path) -> str:
     """Give one digest for an input: a file's bytes, what a finished stage says of its products, or a playback tree's trajectory files."""
-    if path.is_file():
-        return sha256_file(path)
-    if not path.is_dir():
+    if not path.exists():
         raise InputError(
             "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
         )
+    if not path.is_dir():
+        return sha256_file(path)  # which says so where it is a pipe or a device
     if _has_record(path, "manifest.json", MANIFEST_SCHEMA):
         outputs = read_object(path / "manifest.json", what="manifest").get("outputs", [])
         return sha256_bytes(dump_json(outputs).encode())

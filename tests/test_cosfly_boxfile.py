@@ -179,7 +179,8 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
         (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]}, r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
         (PLAIN.replace(",", ";"), {}, r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
         (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),
-        ("", {}, "holds no boxes"),
+        ("", {}, r"holds no boxes; got nothing after the first line; expected a box a line.*docs/files\.md"),
+        (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {}, r"length is not a finite number: '12,5'; write a decimal point"),
         (PLAIN + "\"a", {}, "not a table"),
     ],
 )  # fmt: skip

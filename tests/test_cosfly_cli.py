@@ -15,7 +15,7 @@ import typer
 
 from cosfly import cli, doctor
 from cosfly.chat.wire import Connections, Response
-from cosfly.cli.options import tell_product
+from cosfly.cli.options import resolve, tell_product
 from cosfly.doctor import Check
 from cosfly.errors import InputError
 from cosfly.settings import RunConfig
@@ -72,6 +72,10 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
         (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
         (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
+        (("run", "stage"), ("stage: a folder", "no run.yaml", "cosfly list stage")),
+        (("config", "check", str(Path("deep/stage"))), ("deep/stage: a folder", "no run.yaml", "quickstart")),
+        (("release", "viewer", "town.csv", "--out", "x"), ("town.csv", "there is no such folder", "check the path")),
+        (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
         (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
         (
@@ -84,12 +88,20 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, par
     monkeypatch.chdir(tmp_path)
     for name in ("taken", "town.csv"):
         (tmp_path / name).write_text("a file")
-    write_json(tmp_path / "stage/stage.json", {})
+    for folder in ("stage", "deep/stage"):
+        write_json(tmp_path / folder / "stage.json", {})
+    (tmp_path / "zero.json").symlink_to("/dev/zero")
     status, line = answer(capfd, monkeypatch, *words)
     assert status == 1
     assert line.startswith("error: ")
     for part in parts:
         assert part in line
+
+
+def test_a_folder_named_as_a_configuration_that_ships_hides_it_from_nobody(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quickstart").mkdir()
+    assert resolve(Path("quickstart"), None).name == "quickstart"
 
 
 @pytest.mark.parametrize(

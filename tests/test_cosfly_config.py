@@ -125,6 +125,23 @@ def test_a_former_name_leads_to_the_present_one():
         load(Outer, None, ["plan.flies_at=3"])
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("altitude_max_m=40", r"altitude_max_m: unknown setting \(did you mean 'plan\.altitude_max_m'\?\)"),
+        (
+            "render.altitude_max_m=40",
+            r"render\.altitude_max_m: unknown setting \(did you mean 'plan\.altitude_max_m'\?\)",
+        ),
+        ("endpoint.json_schema=false", r"did you mean 'caption\.endpoint' or 'distill\.infer\.endpoint'\?"),
+        ("plan.wokers=2", r"plan\.wokers: unknown setting"),
+    ],
+)
+def test_a_setting_in_the_wrong_section_is_told_its_own(given, words):
+    with pytest.raises(ConfigError, match=words):
+        load(RunConfig, None, [given])
+
+
 def test_where_no_name_is_near_the_known_ones_are_listed():
     with pytest.raises(ConfigError, match=r"plan\.xyz: unknown setting \(there are altitude_m\)"):
         load(Outer, None, ["plan.xyz=3"])

@@ -34,6 +34,7 @@ from cosfly.products.town import read_town_map
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths
 from cosfly.reading import arrays, documents, files, tables
+from cosfly.reading.files import read_text
 from cosfly.reading.limits import Limits, use_limits
 from cosfly.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
 from cosfly.store import CHECKSUMS, inside, read_checksums
@@ -239,6 +240,15 @@ def test_a_result_of_another_shape_is_named():
 
 
 # --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_text_of_another_coding_is_placed(tmp_path):
+    path = tmp_path / "town.csv"
+    path.write_bytes("type,name\nBuildings,Köln\n".encode("latin-1"))
+    with pytest.raises(
+        InputError, match=r"not UTF-8 text; got the byte 0xf6 in line 2; if it is text, save it as UTF-8"
+    ):
+        read_text(path)
 
 
 def test_a_limit_is_named_and_can_be_raised(tmp_path, limited):

@@ -108,11 +108,19 @@ def _config_path(config: Path | None) -> Path | None:
     """A path, or the bare name of a configuration that ships with cosfly."""
     from cosfly.config import shipped
 
-    if config is not None and not config.exists() and config.suffix == "" and len(config.parts) == 1:
-        packaged = shipped(f"{config}.yaml")
-        if packaged.exists():
-            return packaged
-        names = sorted(path.stem for path in packaged.parent.glob("*.yaml") if path.stem != "glossary")
+    if config is None or config.is_file():
+        return config
+    is_bare = config.suffix == "" and len(config.parts) == 1
+    if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
+        return packaged  # whatever folder of this name stands here
+    names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
+    if config.is_dir():
+        raise ConfigError(
+            "a folder, and not that of a run", where=config, got="no run.yaml",
+            expected=f"a YAML file, a run folder, or one that ships: {', '.join(names)}",
+            fix=f"cosfly list {config} names the runs in it",
+        )  # fmt: skip
+    if is_bare:
         raise ConfigError(
             f"no such configuration{nearest(str(config), names)}", where=config,
             expected=f"a YAML file, or one that ships: {', '.join(names)}",

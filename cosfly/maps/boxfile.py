@@ -126,18 +126,22 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     """
     path = cfg.inputs()["boxes"]
     readers = {".csv": _table_rows, ".geojson": _feature_rows}
-    if path.suffix.lower() == ".json":
+    suffix = path.suffix.lower()
+    if suffix == ".json":
         return _told(_read_ours(cfg, path), cfg, path)
-    if path.suffix.lower() not in readers:
+    if suffix not in readers:
         raise InputError(
             "not a kind of map that is known",
             where=path,
             got=path.suffix or "no suffix",
             expected=".json, .csv or .geojson",
         )
-    rows = list(readers[path.suffix.lower()](cfg, path))
+    rows = list(readers[suffix](cfg, path))
     if not rows:
-        raise InputError("the map holds no boxes", where=path)
+        raise InputError(
+            "the map holds no boxes", where=path, got="nothing after the first line" if suffix == ".csv" else "no features",
+            expected="a box a line, or a feature each; docs/files.md has examples",
+        )  # fmt: skip
     boxes, ids, places = BoxList(), list[Any](), dict[str, list[str]]()
     for row in rows:
         try:

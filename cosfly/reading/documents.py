@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from cosfly.errors import InputError, plain
-from cosfly.reading.files import decoded, read_bytes, read_lines
+from cosfly.reading.files import decoded, not_utf8, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -122,7 +122,7 @@ def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", 
             expected=error.wanted,
         ) from None
     except UnicodeDecodeError as error:
-        raise InputError("not UTF-8 text", where=where, got=str(error)) from None
+        raise not_utf8(error, where) from None
     except UnicodeEncodeError:
         raise InputError(
             f"the {what} holds half of a surrogate pair", where=where, expected="whole characters"

@@ -138,7 +138,14 @@ def decoded(data: bytes, where: object) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError("not UTF-8 text", where=str(where), got=str(error)) from None
+        raise not_utf8(error, where) from None
+
+
+def not_utf8(error: UnicodeDecodeError, where: object) -> InputError:
+    """Say which byte of which line is no UTF-8, and what to do."""
+    line = error.object[: error.start].count(b"\n") + 1
+    got = f"the byte 0x{error.object[error.start]:02x} in line {line}"
+    return InputError("not UTF-8 text", where=str(where), got=got, fix="if it is text, save it as UTF-8")
 
 
 def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:

@@ -99,7 +99,9 @@ def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path
     """
     samples = open_split(dataset, split)
     if not samples:
-        raise InputError("the split is empty", where=dataset, got=split, fix="choose another split")
+        raise InputError(
+            "the split is empty", where=dataset, got=split, fix="choose another --split, or prepare more walks"
+        )
     lines: dict[str, list[str]] = {name: [] for name in WRITTEN}
     languages: list[Language] = ["en", "zh"]
     for language in languages:

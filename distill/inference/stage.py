@@ -226,7 +226,12 @@ def run(
         return out / PREDICTIONS
     split = open_split(dataset, cfg.split)
     if not len(split):
-        raise InputError("the split is empty", where=dataset, got=cfg.split, fix="choose another split")
+        raise InputError(
+            "the split is empty",
+            where=dataset,
+            got=cfg.split,
+            fix="--set distill.infer.split=val, or prepare more walks",
+        )
     samples = split[: cfg.max_samples] if cfg.max_samples else split
     results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]

@@ -259,7 +259,9 @@ def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
         InputError: it was trained on other weights, or is malformed.
     """
     path = adapter / ADAPTER_FACTS
-    value = read_json(path, what="adapter")
+    value = read_json(
+        path, what="adapter", fix="a training that was stopped goes on: run its cosfly distill train again"
+    )
     with validation_errors(path):
         facts = AdapterFacts.model_validate(value)
     found = base_digests(model)
