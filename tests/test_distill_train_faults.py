@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -18,7 +19,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, make_place, samples_of  # noqa: E402
 
-from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError  # noqa: E402
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept, ResumeError  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
 from distill.student.model import load_student, student_folder  # noqa: E402
 from distill.training import fit, validation  # noqa: E402
@@ -238,6 +239,19 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
     newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
     assert newest is not None
     assert newest.name == "step_00000006"
+
+
+def test_a_reader_that_is_killed_in_the_middle_of_a_step_is_one_error(place, tmp_path, monkeypatch):
+    def meanwhile(*args):
+        readers = multiprocessing.active_children()
+        assert readers
+        for reader in readers:
+            reader.kill()
+        time.sleep(30)  # torch's handler of SIGCHLD raises here
+
+    monkeypatch.setattr(fit, "answer_loss", meanwhile)
+    with pytest.raises(EnvironmentMissing, match=r"ended by the system.*run the same command again"):
+        run(place, tmp_path / "out", data_workers=1, validation_samples=0)
 
 
 def test_a_second_process_is_refused(place, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import time
@@ -85,18 +86,29 @@ def in_order(function: Callable[[Asked], Given], orders: Iterable[Asked], worker
         multiprocessing_context="fork" if workers else None,
         collate_fn=_as_it_is,
     )
-    try:
+    with reader_errors():
         for given in loader:
             if isinstance(given, CosflyError):
                 raise given
             yield given
+
+
+@contextlib.contextmanager
+def reader_errors() -> Iterator[None]:
+    """Turn torch's word that a process which reads samples was killed into an error for people.
+
+    torch says it from a signal's handler, so wherever this process then is: in the middle of a step as well as where it waits for a sample.
+    """
+    try:
+        yield
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
         raise EnvironmentMissing(
             "a process that reads samples was ended by the system",
             got=str(error).splitlines()[0][:160],
-            fix="give the machine more memory (a container also --shm-size), or lower distill.train.data_workers",
+            fix="run the same command again; where memory was short, give the machine more (a container also --shm-size), "
+            "or lower distill.train.data_workers",
         ) from error
 
 

@@ -26,7 +26,7 @@ from distill.student.random_student import make_random_student, random_student_s
 from distill.student.taught import taught_by
 from distill.training.census import Census, choose_over_all, take_census
 from distill.training.fit import LOG, Lesson, fit, seeded
-from distill.training.loading import Supply, num_workers
+from distill.training.loading import Supply, num_workers, reader_errors
 from distill.training.memory import GB, memory_errors
 from distill.training.preflight import findings, tell
 from distill.training.ranks import Ranks, joined
@@ -149,7 +149,7 @@ def run(
         samples = open_split(dataset, "train")
         if preset is not None:
             ranks.first_does(lambda: str(made_student(cfg, samples, base, seed)))
-        with memory_errors(cfg):
+        with memory_errors(cfg), reader_errors():
             lesson, taught = _lesson(cfg, samples, dataset, trees, base, out, seed, ranks)
             progress = fit(lesson, out)
         ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, base_name, opened[0]))
