@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from cosfly.errors import InputError, plain
-from cosfly.reading.files import decoded, not_utf8, read_bytes, read_lines
+from cosfly.reading.files import CHECK_PATH, decoded, not_utf8, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -152,13 +152,15 @@ def _place_in(value: Any) -> str | None:
     return None
 
 
-def read_json(path: Path, *, what: str = "file", tree: Path | None = None, each_key_once: bool = False) -> Any:
+def read_json(
+    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, each_key_once: bool = False
+) -> Any:
     """Read a JSON file.
 
     Raises:
         InputError: it is missing, unreadable or not JSON.
     """
-    data = read_bytes(path, what=what, tree=tree)
+    data = read_bytes(path, what=what, fix=fix, tree=tree)
     return parse_document(data, path, what=what, each_key_once=each_key_once)
 
 
