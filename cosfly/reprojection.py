@@ -229,8 +229,6 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
     """Counts (5,), errors (k,), colours (k, 6) of points here and there, where both are known; of points among nothing but their own thing
     its id, of those with its depth and of those that are farther; of points with its depth among nothing but one other thing their own id. only_colours: points that come out where there are none are left out of everything."""
     height, width = depth_a.shape
-    fx, fy, cx, cy = intrinsics
-    other_fx, other_fy, other_cx, other_cy = others
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
     errors, num_errors = np.empty(COLUMNS * ROWS), 0
@@ -247,13 +245,7 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             d = float(depth_a[v, u])
             if not (d > 0.0 and d < FAR_M) or (has_ids and moving[inst_a[v, u, 0]]):
                 continue
-            x, y = (u + 0.5 - cx) / fx * d, (v + 0.5 - cy) / fy * d
-            px = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * d + shift[0]
-            py = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * d + shift[1]
-            z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
-            if z < NEAR_M:
-                continue
-            s, t = other_fx * px / z + other_cx, other_fy * py / z + other_cy
+            s, t, z = _carried_point(u, v, d, intrinsics, others, turn, shift)
             if not (s > 1.5 and t > 1.5 and s < width - 2.5 and t < height - 2.5):
                 continue
             column, row = int(s), int(t)
@@ -261,36 +253,9 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             has_colours = k >= 0 and k < len(colours_b) and j < len(colours_a)
             if only_colours and not has_colours:
                 continue
-            best, least, is_through, is_same, is_free, is_whole, is_one = (
-                1e9,
-                1e9,
-                True,
-                not has_ids,
-                True,
-                has_ids,
-                has_ids,
+            best, least, is_through, is_same, is_free, is_whole, is_one = _around(
+                depth_b, inst_b, row, column, z, inst_a, v, u, has_ids, moving, flat
             )
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    off = float(depth_b[row + dy, column + dx]) - z
-                    best, least = min(best, abs(off)), min(least, off)
-                    if off <= 0.05 * z + 0.3:
-                        is_through = False
-                    if has_ids:
-                        y1, x1 = row + dy, column + dx
-                        is_free &= not moving[inst_b[y1, x1, 0]]
-                        is_own = (
-                            inst_b[y1, x1, 0] == inst_a[v, u, 0]
-                            and inst_b[y1, x1, 1] == inst_a[v, u, 1]
-                            and inst_b[y1, x1, 2] == inst_a[v, u, 2]
-                        )
-                        is_same |= is_own or (flat[inst_a[v, u, 0]] and inst_b[y1, x1, 0] == inst_a[v, u, 0])
-                        is_whole &= is_own
-                        is_one &= (
-                            inst_b[y1, x1, 0] == inst_b[row, column, 0]
-                            and inst_b[y1, x1, 1] == inst_b[row, column, 1]
-                            and inst_b[y1, x1, 2] == inst_b[row, column, 2]
-                        )
             if not is_free:
                 continue
             counts[0] += 1
@@ -314,21 +279,67 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
                         colours[num_colours, c] = colours_a[j, u, c]
                         colours[num_colours, 3 + c] = colours_b[k, column, c]
                     num_colours += 1
-                # Of a plane 1 / z is linear in the picture, so that between four pixels it is exact.
-                x0, y0 = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
-                a, b = s - 0.5 - x0, t - 0.5 - y0
-                d00, d01 = float(depth_b[y0, x0]), float(depth_b[y0, x0 + 1])
-                d10, d11 = float(depth_b[y0 + 1, x0]), float(depth_b[y0 + 1, x0 + 1])
-                if min(d00, d01, d10, d11) <= 0.0:  # invalid
-                    continue
-                q00, q01, q10, q11 = 1.0 / d00, 1.0 / d01, 1.0 / d10, 1.0 / d11
-                is_plane = abs(q00 + q11 - q01 - q10) < 1e-5 / z
-                if is_plane:
-                    q = (1 - b) * ((1 - a) * q00 + a * q01) + b * ((1 - a) * q10 + a * q11)
-                    errors[num_errors] = abs(1.0 / q - z) / z
+                error = _error_on_plane(depth_b, s, t, z)
+                if not np.isnan(error):
+                    errors[num_errors] = error
                     num_errors += 1
             elif is_through:
                 counts[3] += 1
             else:
                 counts[2] += 1
     return counts, errors[:num_errors], colours[:num_colours], firm[:num_firm], moved[:num_moved], renamed[:num_renamed]
+
+
+@njit(cache=True, nogil=True)
+def _carried_point(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no-untyped-def]
+    """Where the middle of pixel (u, v), at depth d, comes out in the other picture: px, px, and its depth there, m; NaN px where nearer than NEAR_M."""
+    x, y = (u + 0.5 - intrinsics[2]) / intrinsics[0] * d, (v + 0.5 - intrinsics[3]) / intrinsics[1] * d
+    z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
+    if z < NEAR_M:
+        return np.nan, np.nan, z
+    across = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * d + shift[0]
+    down = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * d + shift[1]
+    return others[0] * across / z + others[2], others[1] * down / z + others[3], z
+
+
+@njit(cache=True, nogil=True)
+def _around(depth, instance, row, column, z, inst_a, v, u, has_ids, moving, flat):  # type: ignore[no-untyped-def]
+    """What nine pixels say of a point at depth z, of the thing at (v, u) of `inst_a`: least distance in depth, least depth beyond it; is it nearer than all;
+    does one show its thing, or a surface that may show in its place; does none show who moves; do all show its thing; do all show one."""
+    best, least, is_through, is_same, is_free, is_whole, is_one = 1e9, 1e9, True, not has_ids, True, has_ids, has_ids
+    for y in range(row - 1, row + 2):
+        for x in range(column - 1, column + 2):
+            off = float(depth[y, x]) - z
+            best, least = min(best, abs(off)), min(least, off)
+            if off <= 0.05 * z + 0.3:
+                is_through = False
+            if has_ids:
+                is_free &= not moving[instance[y, x, 0]]
+                is_kind = instance[y, x, 0] == inst_a[v, u, 0]
+                is_own = is_kind and instance[y, x, 1] == inst_a[v, u, 1] and instance[y, x, 2] == inst_a[v, u, 2]
+                is_same |= is_own or (is_kind and flat[inst_a[v, u, 0]])
+                is_whole &= is_own
+                is_one &= (
+                    instance[y, x, 0] == instance[row, column, 0]
+                    and instance[y, x, 1] == instance[row, column, 1]
+                    and instance[y, x, 2] == instance[row, column, 2]
+                )
+    return best, least, is_through, is_same, is_free, is_whole, is_one
+
+
+@njit(cache=True, nogil=True)
+def _error_on_plane(depth, s, t, z):  # type: ignore[no-untyped-def]
+    """How far the depth between four pixels is from z, as a share of it; NaN where they are not of one plane.
+
+    Of a plane 1 / depth is linear in the picture, so that between four pixels it is exact.
+    """
+    x, y = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
+    a, b = s - 0.5 - x, t - 0.5 - y
+    d00, d01, d10, d11 = float(depth[y, x]), float(depth[y, x + 1]), float(depth[y + 1, x]), float(depth[y + 1, x + 1])
+    if min(d00, d01, d10, d11) <= 0.0:  # invalid
+        return np.nan
+    q00, q01, q10, q11 = 1.0 / d00, 1.0 / d01, 1.0 / d10, 1.0 / d11
+    if not abs(q00 + q11 - q01 - q10) < 1e-5 / z:
+        return np.nan
+    q = (1 - b) * ((1 - a) * q00 + a * q01) + b * ((1 - a) * q10 + a * q11)
+    return abs(1.0 / q - z) / z
