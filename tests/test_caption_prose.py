@@ -19,8 +19,10 @@ from specimens_prose import (
     CASES,
     EIGHTH_SET,
     ELEVENTH_SET,
+    FIFTEENTH_SET,
     FIFTH_SET,
     FOLLOW,
+    FOURTEENTH_SET,
     FOURTH_SET,
     HOLD,
     NINTH_SET,
@@ -29,6 +31,7 @@ from specimens_prose import (
     SIXTH_SET,
     TENTH_SET,
     THIRD_SET,
+    THIRTEENTH_SET,
     TWELFTH_SET,
     WINDOWS,
     Case,
@@ -105,11 +108,14 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         (SEVENTH_SET, 1, 0.71, 0.83, 0.83),
         (EIGHTH_SET, 0, 0.76, 0.83, 0.63),
         (ELEVENTH_SET, 0, 0.77, 0.81, 0.69),
-        # Not met: hard styles and common ones. Wanted are 3 % flagged, too.
-        (SIXTH_SET, 0, 0.39, 0.50, 0.24),
-        (NINTH_SET, 1, 0.55, 0.68, 0.46),
-        (TENTH_SET, 6, 0.46, 0.62, 0.46),
-        (TWELFTH_SET, 2, 0.52, 0.62, 0.52),
+        # Of these the wordings are not met: hard styles and common ones. What they gave before they were read stands in docs/captions.md.
+        (SIXTH_SET, 1, 0.56, 0.65, 0.51),
+        (NINTH_SET, 0, 0.72, 0.82, 0.69),
+        (TENTH_SET, 3, 0.61, 0.75, 0.62),
+        (TWELFTH_SET, 0, 0.70, 0.78, 0.65),
+        (THIRTEENTH_SET, 0, 0.68, 0.77, 0.66),
+        (FOURTEENTH_SET, 0, 0.62, 0.75, 0.57),
+        (FIFTEENTH_SET, 0, 0.67, 0.76, 0.68),
     ],
     ids=[
         "gold",
@@ -124,12 +130,15 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         "ninth",
         "tenth",
         "twelfth",
+        "thirteenth",
+        "fourteenth",
+        "fifteenth",
     ],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(
     path: Path, flagged_at_most: int, of_all: float, numbers: float, sides: float
 ):
-    """Bounds of what is reached on sets that are read by now, and on four that are not; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
+    """Bounds of what is reached on sets that are read by now; wanted are 75 % of all, 95 % of the numbers, 80 % of the sides."""
     captions = list(read_gold_prose(path))
     flagged, caught = measure(
         (one.language, one.facts, one.coc, [(error.kind, error.in_text(one.coc)) for error in one.errors])
@@ -148,25 +157,41 @@ def test_true_captions_told_of_other_windows_stay_true():
     assert len({name for name, _, _, is_wrong in found if is_wrong}) <= 4
 
 
+def state_of(text: str, language: Language) -> str:
+    coc = Coc(critical_components=text, reasoning_trace=FILLER[language], flight_decision="ascend")
+    return judge_sentences(coc, FOLLOW, CFG, language)[0].state
+
+
 @pytest.mark.parametrize(
     ("language", "known", "unmet"),
     [
-        ("en", "The altitude is {} m.", "The matinee altitude is {} m."),
+        ("en", "Altitude {} m and distance 19.7 m.", "Matinee altitude {} m and tombola distance 19.7 m."),
+        ("zh", "高度{}米和距离19.7米。", "戏台高度{}米和锣鼓距离19.7米。"),
+    ],
+)
+def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_only_by_a_number_of_nothing(
+    language, known, unmet, monkeypatch
+):
+    assert state_of(known.format("18.9"), language) == "contradicted"
+    assert state_of(unmet.format("18.9"), language) == "unread"  # that of another frame
+    assert state_of(unmet.format("35.0"), language) == "contradicted"
+    monkeypatch.setattr(judging, "is_met", lambda *_, **__: True)
+    assert (
+        state_of(unmet.format("18.9"), language) == "contradicted"
+    )  # it is for its wording alone that it is left unread
+
+
+@pytest.mark.parametrize(
+    ("language", "known", "cited"),
+    [
         ("en", "The altitude is {} m.", "Section 7 of the manual says that the altitude is {} m."),
-        ("zh", "高度为 {} 米。", "戏台开锣之际高度为 {} 米。"),
         ("zh", "高度为 {} 米。", "《规程》第 7 条：高度为 {} 米。"),
     ],
 )
 @pytest.mark.parametrize("value", ["18.9", "35.0"], ids=["of another frame", "of nothing"])
-def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_nothing(language, known, unmet, value, monkeypatch):
-    def state_of(text: str) -> str:
-        coc = Coc(critical_components=text.format(value), reasoning_trace=FILLER[language], flight_decision="ascend")
-        return judge_sentences(coc, FOLLOW, CFG, language)[0].state
-
-    assert state_of(known) == "contradicted"
-    assert state_of(unmet) == "unread"
-    monkeypatch.setattr(judging, "is_met", lambda *_, **__: True)
-    assert state_of(unmet) == "contradicted"  # it is for its wording alone that it is left unread
+def test_what_is_cited_contradicts_nothing(language, known, cited, value):
+    assert state_of(known.format(value), language) == "contradicted"
+    assert state_of(cited.format(value), language) == "unread"
 
 
 def test_the_wordings_of_all_captions_that_were_read_have_been_met():

@@ -10,7 +10,7 @@ from caption.truth.prose.statements import NOW, Form, Statement
 
 _DRONE, _TARGET = {"speed"}, {"target_speed", "target_mean"}
 _ANOTHER_MOMENT = re.compile(
-    r"\b(?:now|again|but|then|last|latest|final\w*|yet|before|after\w*|until|since|at t\d|was|were|had|again|first)\b|现|又|再|随后|最后|但|后|曾|先|末|t\d"
+    r"\b(?:now|again|but|then|last|latest|final\w*|yet|before|after\w*|until|since|at t\d|was|were|had|again|first)\b|现|又|再|随后|最后|最近|但|后|曾|先|末|t\d"
 )
 _BETWEEN = re.compile(r"[\s,:;(]*(?:and|with)?[\s,]*")
 

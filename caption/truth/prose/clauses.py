@@ -11,9 +11,9 @@ from caption.truth.prose.numerals import Numeral, numerals
 from cosfly.products.captions import Language
 
 _BREAKS = {
-    "en": r"[;:()\[\]]|→(?=\s*[a-z])|(?<!approx)(?<!\bca)(?<!\bvs)(?<!resp)(?<!max)(?<!min)(?<!avg)\.(?=\s)|\s-\s|,(?!\s*(?:and |or )?[-+]?[#\d])|(?<![#\d]),|(?<=t\d),(?=\s*[-+]?#)|\b(?:given|considering|but|while|whilst|whereas|although|though|yet|because|(?<!in )which|who|since(?= the| it| they| we| our| he| she| neither)|(?<=, )as(?= the| it| they| we| he| she)|so(?! far| that))\b"
-    r"|\band(?= (?:the|its|it|they|their|our|we|i|he|she|has|have|is|are|was|keeps|now|so|then|both|that|not)\b)|\"|\||•",
-    "zh": r"[;:()\[\]。]|→(?=\s*[^\d#\s+-])|、(?!\s*[-+]?[#\d])|(?<![#\d])、|,(?!\s*[-+]?[#\d])|(?<![#\d]),|(?<=t\d),(?=\s*[-+]?#)|考虑到|鉴于|而(?!且)|但是|但|不过|并且|且|因为|由于|同时|\||•",
+    "en": r"[;:()\[\]]|→(?=\s*[a-z])|(?<!approx)(?<!\bca)(?<!\bvs)(?<!resp)(?<!max)(?<!min)(?<!avg)\.(?=\s)|\s-\s|,(?!\s*(?:and |or )?[-+]?[#\d])|(?<![#\d]),|(?<=t\d),(?=\s*[-+]?#)|\b(?:given|considering|(?<!all )but|while|whilst|whereas|although|though|yet|because|(?<!in )which|who|since(?= the| it| they| we| our| he| she| neither)|(?<=, )as(?= the| it| they| we| he| she)|so(?! far| that))\b"
+    r"|\band(?= (?:the|its|it|they|their|our|we|i|he|she|has|have|is|are|was|keeps|bears|lies|now|so|then|both|that|not)\b)|\"|\||•",
+    "zh": r"[;:()\[\]。]|→(?=\s*[^\d#\s+-])|、(?!\s*[-+]?[#\d])|(?<![#\d])、|,(?!\s*[-+]?[#\d])|(?<![#\d]),|(?<=t\d),(?=\s*[-+]?#)|考虑到|鉴于|而(?!且)|(?<=米)却|(?<=秒)却|(?<=度)却(?!在)|但是|但|不过|并且|且|因为|由于|同时|\||•",
 }
 _FRAME = re.compile(r"(?<![a-z])t(\d{1,2})(?!\d)")
 _AGO = {"en": re.compile(r"\s*(?:ago|earlier|before|back|prior)\b"), "zh": re.compile(r"\s*(?:钟)?(?:之前|以前|前)")}
@@ -93,8 +93,7 @@ def parse(text: str, language: Language) -> Sentence:
     tokens = load_lexicon(language).scan(text)
     tokens += [Token("time", "t" + match[1], match.start(), match.end()) for match in _FRAME.finditer(text)]
     tokens += _spans(text, found, language)
-    if language == "zh":
-        tokens += _unknown_moments(text, tokens)
+    tokens += _unknown_moments(text, tokens, language)
     if language == "en":
         tokens += _particles(text, tokens)
         if _GROUND.search(text):
@@ -118,13 +117,18 @@ def parse(text: str, language: Language) -> Sentence:
     return Sentence(text, language, kept, clauses)
 
 
-_AT_SOME_TIME = re.compile(r"(?<=[\u4e00-\u9fff])(?<![同及随小此适届暂临准一当按定实平有这那])时(?![刻候间长段常])")
+_AT_SOME_TIME = {
+    "en": re.compile(r"(?<![a-z])(?:frame|step|image|photo) #(?![.#])"),
+    "zh": re.compile(
+        r"第#[帧步]|(?<=[\u4e00-\u9fff])(?<![同及随小此适届暂临准一当按定实平有这那])时(?![刻候间长段常])"
+    ),
+}
 
 
-def _unknown_moments(text: str, tokens: list[Token]) -> list[Token]:
-    """Read "入院时" as a moment of which nothing more is known."""
+def _unknown_moments(text: str, tokens: list[Token], language: Language) -> list[Token]:
+    """Read "入院时" and "frame 4", which may count from 0 or 1, as moments of which nothing more is known."""
     ends = {t.end for t in tokens if t.kind == "time"}
-    found = _AT_SOME_TIME.finditer(text)
+    found = _AT_SOME_TIME[language].finditer(text)
     return [Token("time", "some", match.start(), match.end()) for match in found if match.start() not in ends]
 
 

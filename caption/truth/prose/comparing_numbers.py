@@ -167,6 +167,8 @@ class NumberComparison:
 
     def _range(self, s: Statement) -> bool | None:
         (numeral, low, step), (_, high, _) = self.read(s.numbers[0]), self.read(s.numbers[1])
+        if numeral.unit == "mps" and not s.sure_names and self._speeds(replace(s, side=0)):
+            return True  # "twice as quick as the drone, 1.34 to 0.59 m/s"
         if self._falls(s) and s.mode == "value":
             return self._course(replace(s, frames=None, trend=0))  # "21.8 to 18.1 m" is a way down
         if high < low:

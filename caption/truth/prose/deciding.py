@@ -43,7 +43,7 @@ _REFUSED = {
 # "rather than turn", "without any extra rotation", "no need to": refused before it is named.
 _INSTEAD = {
     "en": re.compile(r"\b(?:rather than|instead of|without|no need|no reason|no case|no hurry|too small|nothing to)\b"),
-    "zh": re.compile(r"而非|而不|无需|不必|不需|没有理由|没有必要|不用|何必|不值得|暂不"),
+    "zh": re.compile(r"比[^,]{0,8}$|而非|而不|无需|不必|不需|没有理由|没有必要|不用|何必|不值得|暂不"),
 }
 _LATER = {
     "en": re.compile(r"\b(?:before|until|till|after|once|later)\b"),
@@ -57,6 +57,8 @@ def actions_of(sentence: Sentence, clause: Clause, *, is_plan: bool) -> list[Sai
     for token in clause.of("action"):
         if token.value == "fast" and _SHEDS.search(sentence.text, 0, token.start):
             continue  # "bleeds off yet more speed"
+        if _RULED_OUT[sentence.language].search(sentence.text, 0, token.start):
+            continue
         if not _is_refused(sentence, clause, token) and not _IS_ATTRIBUTE.match(sentence.text, token.end):
             side = _side_of(sentence, clause, token) if token.value in _SIDED else 0
             force = _force(sentence, clause, token, is_plan=is_plan)
@@ -69,6 +71,8 @@ def _force(sentence: Sentence, clause: Clause, token: Token, *, is_plan: bool) -
     if clause.is_blocked(token.start, ("if", "may")) or _LATER[language].search(text, clause.start, token.start):
         return "option"
     named = [t for t in clause.of("who", "drone", "target") if t.end <= token.start]
+    if language == "zh" and _BIDS.match(text, clause.start) and not _TOLD["zh"].search(text, clause.start, token.start):
+        return "directive"
     if named and named[-1].value == "target" and not _is_asked(sentence, clause, named[-1].end, token.start):
         return "told"  # "the walker turns left"
     if _PERFECT[language].search(text, clause.start, token.start):
@@ -87,6 +91,10 @@ def _is_praised(text: str, clause: Clause, token: Token, language: str) -> bool:
     return _PRAISED["zh"].search(text, clause.start, token.start) is not None
 
 
+_RULED_OUT = {  # a list of what was not chosen
+    "en": re.compile(r"\b(?:ruled out|excluded|discarded|rejected)\b(?!.*\b(?:left|remain\w*|instead)\b)"),
+    "zh": re.compile(r"排除(?:方案|选项|的)?(?!.*(?:剩|余下|改))"),
+}
 _SHEDS = re.compile(r"\b(?:bleed|shed|scrub|los|drop|dump|wash|tak)\w* (?:off )?(?:\w+ )?$")
 _IS_ATTRIBUTE = re.compile(
     r"\s*(?:offset|error|drift|deviation|component|angle|rate|偏移|误差|偏差|分量)"
@@ -105,8 +113,10 @@ def _is_asked(sentence: Sentence, clause: Clause, start: int, end: int) -> bool:
 
 _TOLD = {
     "en": re.compile(r"\b(?:is|are|was|were|has|have|had|been|keeps|kept)\b|'s\b|'ve\b|'re\b"),
-    "zh": re.compile(r"了|已|正|曾|刚|(?<!超|不|错)过(?!于|头|去|来)|(?<!接|顺|随)着|一直"),
+    "zh": re.compile(r"了|已|正|曾|刚|(?<!超|不|错)过(?!于|头|去|来)|(?<!接|顺|随|跟)着|一直"),
 }
+# What opens a clause that bids something in Chinese.
+_BIDS = re.compile(r"[\s“”]*(?:那就|因此|所以)?(?:就|应当?|宜|接下来|接着|改为|转为|最干脆的是|立刻|直接)")
 # "bleeding off speed is wiser than turning": recommended after it is named; in Chinese before.
 _PRAISED = {
     "en": re.compile(
@@ -159,6 +169,8 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Sa
         return []
     sided = {one.action for one in said if one.side}
     rest = [one for one in said if one.force in ("open", "option", "aim") and (one.side or one.action not in sided)]
+    beside = [one for one in said if one.side or one.action not in named]
+    rest += [one for one in beside if any(one.clause == other.clause and one != other for other in opposites)]
     return [] if decision in _allowed(rest) else opposites
 
 

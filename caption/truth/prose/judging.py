@@ -16,7 +16,7 @@ from caption.truth.prose.numerals import masked
 from caption.truth.prose.pool import Pool
 from caption.truth.prose.reading import read_form
 from caption.truth.prose.statements import Form, Statement
-from caption.truth.prose.wording import is_met
+from caption.truth.prose.wording import cites, is_met
 from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
@@ -33,8 +33,11 @@ _PROBLEM = {
     "percent": "number",
     "speeds": "number",
     "extreme": "number",
+    "record": "comparison",
+    "course_side": "side",
 }
-_SELDOM_MISREAD = ("comparison", "state", "clock", "list", "range", "extreme")
+_NEVER_MISREAD = ("state", "course", "pair", "centre", "record", "course_side")
+_SELDOM_MISREAD = ("comparison", "visibility", "clock", "list", "range", "extreme")
 _SHOWN = 120  # characters of a sentence in a message
 
 
@@ -106,19 +109,29 @@ def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: 
     Less is asked of what is seldom misread: who is faster, who stands or walks, and a number that the window does not give for anything.
     """
     is_nothing = s.kind in _NUMBERS and s.kind != "clock" and not numbers.is_of_the_window(s)
-    return is_met(form.text, language, s.clause, is_nothing or s.kind in _SELDOM_MISREAD)
+    is_speed = (
+        s.kind == "number"
+        and s.sure_mode == "value"
+        and bool(s.sure_names)
+        and s.is_named
+        and form.numerals[s.numbers[0]].unit == "mps"
+    )
+    is_plain_trend = s.kind == "trend" and s.is_sure and s.is_named
+    is_length = s.is_single and form.numerals[s.numbers[0]].unit == "m"
+    if is_nothing or is_speed or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
+        return not cites(form.text)
+    if s.kind in _NUMBERS and (numbers.is_on_wrong_side(s) or numbers.is_in_wrong_unit(s)):
+        return not cites(form.text)
+    return is_met(
+        form.text, language, s.clause, loosely=s.kind in _SELDOM_MISREAD, alone=s.kind in ("number", "visibility")
+    )
 
 
 def _against_decision(judged: list[Judged], forms: list[Form], decision: str, language: Language) -> list[Judged]:
     """Compare the decision with what the texts argue for: their plans, or where they name none the last sentence."""
     said = [one for form in forms for one in form.actions]
     opposites = argues_against(decision, said, list(forms[-1].actions) if forms else [])
-    if not any(
-        is_met(form.text, language, one.clause, loosely=True)
-        for form in forms
-        for one in form.actions
-        if one in opposites
-    ):
+    if not any(not cites(form.text) for form in forms for one in form.actions if one in opposites):
         return judged
     last = judged[-1]
     problems = (*last.problems, f"decision: {decision} against {last.text[:_SHOWN]}")

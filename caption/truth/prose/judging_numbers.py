@@ -16,6 +16,7 @@ _EXTREME = re.compile(
     r"\b(?:low|high|peak|top|trough|maximum|minimum|mean|average) (?:of|at) (?:only |just )?$|\baverag(?:es|ed|ing) $|\b(?:bottomed out|bottomed|topped out|peaked|topped) at $|\bas (?:low|high|fast|slow) as (?:only |just )?$"
     r"|(?:最高|最低|最大|最小|最快|最慢|峰值|谷底|平均|均值|平均值)(?:为|是|曾|达|到|至|报|只有|仅|约)*\s*$"
 )
+_AT_FIRST = re.compile(r"\b(?:first|initially|start\w*|beg[ai]n\w*)\b|一开始|起初|最初|开头|第一步|首步")
 _TURNS = ("yaw", "target_turn", "bearing")
 _OF_TURNS = frozenset([*_TURNS, "heading", "target_heading"])
 _WHOLE = 4  # numbers of a list that runs over the window
@@ -30,6 +31,8 @@ class NumberJudge(NumberComparison):
         self.pool = pool
 
     def holds(self, s: Statement) -> bool | None:
+        if self.is_in_wrong_unit(s):
+            return False
         found = self.compare(s)
         if s.kind == "number" and not self._is_possible(s, is_meant=found is True):
             return None if self._is_others_turn(s) else False
@@ -38,6 +41,26 @@ class NumberJudge(NumberComparison):
         if found is False and not self.runs_against_itself(s) and not self._is_plain(s) and self.is_of_the_window(s):
             return None
         return None if found is False and self._is_others_turn(s) else found
+
+    def is_in_wrong_unit(self, s: Statement) -> bool:
+        """Tell whether numbers of a foreign unit are nothing that their words may mean, but would be in ours: "12.5 ft" of 12.5 m."""
+        if s.kind not in ("number", "course", "list", "range"):
+            return False
+        read = [self.read(i) for i in s.numbers]
+        return all(
+            numeral.factor != 1.0
+            and self.pool.holds(value / numeral.factor, numeral.unit, (step / numeral.factor,) * 2, s.names)
+            and not self.pool.holds(value, numeral.unit, (slack := 0.05 * value + step, slack), s.names)
+            for numeral, value, step in read
+        )
+
+    def is_on_wrong_side(self, s: Statement) -> bool:
+        """Tell whether an offset is right but for its side, or an angle of somebody named is false with its side."""
+        if s.kind != "number" or not s.side:
+            return False
+        numeral = self.form.numerals[s.numbers[0]]
+        is_turn = numeral.unit == "deg" and not numeral.sign and s.is_single
+        return is_turn or (numeral.unit == "px" and self._is_mirrored(s))
 
     def _is_reached_otherwise(self, s: Statement) -> bool:
         """Tell whether a value that a rise or fall ends at is one of its series, but nowhere after a lower or higher one."""
@@ -52,6 +75,8 @@ class NumberJudge(NumberComparison):
             for i, v in enumerate(known)
             if abs(v - value) <= near
         ]
+        if any(i == 0 for _, i in places) and _AT_FIRST.search(self.form.text, *s.clause):
+            return False  # nothing is known of before
         return bool(places) and not any(s.reached * (known[i] - v) > 0 for known, i in places for v in known[:i])
 
     def _is_others_turn(self, s: Statement) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -50,6 +51,10 @@ class WordJudge:
                 return self._visibility(s)
             case "state":
                 return self._state(s)
+            case "record":
+                return self._record(s)
+            case "course_side":
+                return self._course_side(s)
         return self._comparison(s)
 
     def _frames(self, s: Statement) -> list[int]:
@@ -127,6 +132,32 @@ class WordJudge:
     def _is_mixed(self, name: str, values: list[float]) -> bool | None:
         turns = {b > a for a, b in pairwise(values) if a != b}
         return len(turns) == 2
+
+    def _record(self, s: Statement) -> bool | None:
+        """Tell whether the value of now is the largest or smallest of the window; the kindest answer of the series that are meant."""
+        answers: list[bool | None] = []
+        for name in s.names:
+            series, known = self.measured.series(name), [abs(v) for v in self.measured.known(name)]
+            if len(known) < 2 or series[-1] is None:
+                continue
+            off = max(known) - abs(series[-1]) if s.word == "max" else abs(series[-1]) - min(known)
+            spread = max(known) - min(known)
+            answers.append(
+                True if off <= 0.1 * spread else None if off <= 0.4 * spread or spread <= 0.02 * max(known) else False
+            )
+        return True if True in answers else False if answers and None not in answers else None
+
+    def _course_side(self, s: Statement) -> bool | None:
+        """Tell whether the target goes to a side of the drone's heading; unsure where it drifts there in the picture or turns that way."""
+        course = [math.sin(math.radians(v)) * s.side for v in self.measured.known("relative_course")]
+        if not course:
+            return None
+        if course[-1] > 0.1:
+            return True
+        drift = [-s.side * v for v in self.measured.known("offset_x")]
+        turn = s.side * (self.facts.target_turn_deg or 0.0)
+        is_other = (len(drift) >= 2 and drift[-1] - drift[0] > 2.0) or turn > 5.0
+        return None if is_other or max(course[-2:]) > -0.3 else False
 
     # --- places ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from caption.truth.prose.statements import NOW
 # Of another moment, or of a part of the window.
 _ELSEWHERE = {
     "en": re.compile(
-        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since(?! the (?!start|first|last|begin)| its?\b| we\b| they\b| he\b| she\b| our\b| both\b)|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|used to|did|against|versus|vs)\b|\|"
+        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since(?! the (?!start|first|last|begin)| its?\b| we\b| they\b| he\b| she\b| our\b| both\b)|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|early|used to|did|against|versus|vs)\b|\|"
     ),
     "zh": re.compile(
         r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每(?!秒)|比|较|差|再|随|还|(?<![到至])了|(?<![已现])(?:升到|降到)(?!了)|增|减|\|"
@@ -54,6 +54,8 @@ class Moments:
             frame = self._headed_moment()
         if frame is not None:
             return (frame,)
+        if self._is_aside_of_past():
+            return None
         following = [n.start for n in self._measured() if n.start > numeral.start]
         after = following[0] if following else self.clause.end
         if _ELSEWHERE[self.language].search(_AFTER_CHANGE.sub("", self._without_todays(numeral))):
@@ -80,7 +82,10 @@ class Moments:
 
     def _measured(self) -> list[Numeral]:
         numerals = [self.sentence.numerals[i] for i in self.clause.numerals]
-        return [n for n in numerals if n.unit not in ("s", "frames")]
+        times = self.clause.of("time", "some")  # "frame 4"
+        return [
+            n for n in numerals if n.unit not in ("s", "frames") and not any(t.start <= n.start < t.end for t in times)
+        ]
 
     @staticmethod
     def _todays(numeral: Numeral) -> tuple[str, ...]:
@@ -89,6 +94,10 @@ class Moments:
     def _is_told_of_now(self, numeral: Numeral, *, is_value: bool) -> bool:
         """Tell whether a clause without a time speaks of now: it names its own quantity or owner, or nothing before it was of another time."""
         since = self.text.rfind(";", 0, self.clause.start) + 1
+        if _FROM_THEN_ON.search(self.text, since, self.clause.start) and _REACHES.search(
+            self.text, self.clause.start, numeral.start
+        ):
+            return False  # "from t3 on both sped up, the drone to 5.8 m/s": at some frame since
         before = [c for c in self.sentence.clauses if since <= c.start and c.end <= self.clause.start]
         if self.clause.has("time", *self._todays(numeral)):
             return True
@@ -100,9 +109,14 @@ class Moments:
 
     def beside(self, numeral: Numeral) -> int | None:
         match = _MOMENT_AFTER[self.language].match(self.text, numeral.end)
+        if match is None and self.language == "en" and (nth := _NTH_AFTER.match(self.text, numeral.end)):
+            return _frame_of(nth) if nth["of"] == "frame" or numeral.unit == "mps" else None
         match = match or _MOMENT_BEFORE[self.language].search(self.text, max(0, numeral.start - _REACH), numeral.start)
+        if match is not None and _IS_OF_ANOTHER.search(self.text, 0, match.start()):
+            match = None
         if match is None:
-            return None
+            is_now = _IS_AT[self.language].search(self.text, self.clause.start, numeral.start)
+            return NOW if is_now and all(t.value == "now" for t in self.clause.of("time")) else None
         if self.language == "zh" and match.groupdict().get("first"):
             return 1 if numeral.unit == "mps" else 0
         return NOW if match["frame"] is None else int(match["frame"])
@@ -117,6 +131,13 @@ class Moments:
         if spanning or self.clause.has("link", "than", "from", "between"):
             return None
         return times[0][1][0]
+
+    def _is_aside_of_past(self) -> bool:
+        """Tell whether a number alone in brackets may belong to where something came from: "from a near standstill (0.11 m/s) he ran"."""
+        if self.clause.tokens or not self.text.startswith("(", max(0, self.clause.start - 1)):
+            return False
+        before = self.text.rfind(",", 0, self.clause.start) + 1
+        return _CAME_FROM.search(self.text, before, self.clause.start) is not None
 
     def _headed_moment(self) -> int | None:
         """Give the frame under which a sentence stands: "t4 log: height 18.3 m, range 22.5 m"."""
@@ -139,6 +160,13 @@ class Moments:
         return spans[0] if len(set(spans)) == 1 and len(named) <= 1 else None
 
 
+def _frame_of(nth: re.Match[str]) -> int:
+    """Give the frame of "in the second step" or "frame"; a step is told at its end."""
+    if nth["nth"] not in _ORDER:
+        return NOW
+    return _ORDER.index(nth["nth"]) + (nth["of"] == "step")
+
+
 def _is_reached(time: Token, numeral: Numeral) -> bool:
     """Tell whether "up to" is to a number and not to a time: "已降到 17.8 米"."""
     return time.value == "until" and 0 <= numeral.start - time.end <= 1
@@ -155,6 +183,18 @@ def _reaches_now(clause: Clause) -> bool:
     )
 
 
+_ORDER = ("first", "second", "third", "fourth")
+_NTH_AFTER = re.compile(
+    r"\s*(?:in|at|during|over) the (?P<nth>first|second|third|fourth|last|final|latest) (?P<of>step|frame)\b"
+)
+_IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $")  # "after 1.3 m/s at t2 only 0.19 is left"
+_IS_AT = {  # what a value has come to
+    "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$"),
+    "zh": re.compile(r"已(?:经)?(?:提速?|升|降|减速?|放慢|加速|回落|收|缩|变|压)(?:到|至|为)(?:约)?\s*$"),
+}  # fmt: skip
+_CAME_FROM = re.compile(r"\b(?:from|after|before|against)\b|从|自|由")
+_FROM_THEN_ON = re.compile(r"[从自]\s*t\d\s*(?:起|开始|以后|之后)|\b(?:from|since) t\d\b")
+_REACHES = re.compile(r"[到至](?:了)?\s*$|\b(?:to|reach\w*|hit\w*|touch\w*) $")
 # Times that reach up to now: what goes on after them without a time is told of now.
 _TODAY = ("now", "window", "last_step", "last_second", "last", "last_s", "mean")
 _SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}

@@ -13,6 +13,7 @@ from caption.truth.prose.numerals import Numeral
 OVER_OTHER = re.compile(
     r"\s*(?:straight |directly |right |vertically )?(?:above|over|below|beneath|under|underneath|higher than|lower than)"
     r" (?:us|me|him|her(?! \w)|them|the (?:drone|aircraft|camera|craft|uav|walker|person|pedestrian|target|subject))\b(?!')"
+    r"|\s*below(?=\s*(?:$|[.,;)]))"  # "10.6 m out and 22 m below"
 )
 # "4.0 m beneath t2", "0.3 m below that of the first frame": how much higher it is than then.
 OVER_MOMENT = re.compile(

@@ -16,15 +16,20 @@ from caption.truth.prose.statements import Statement
 _BLOCKED = {
     "en": re.compile(
         r"\b(?:instead|rather|same|as if|lost and found|further|let|if|unless|should|would|could|might|than|without|instead of|apart from"
-        r"|except|despite|although|though|even|neither|nor|not|no|never|nothing|nobody|hardly|barely|anything|too|enough|almost|nearly)\b|n't\b|\?"
+        r"|except|despite|although|though|even|neither|nor|not|no|never|nothing|nobody|hardly|barely|anything|too|enough|almost|nearly|lack\w*|missing is)\b|n't\b|\?"
     ),
-    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|虽|尽管|再|免|而非|反而|身后|旁"),
+    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|虽|尽管|再|免|而非|反而|身后|旁|用(?=上升|下降|爬升|加速|减速|后退|前进)"),
+}  # fmt: skip
+# The same without what only concedes: "though half hidden" tells that it is.
+_DENIED = {
+    "en": re.compile(r"\b(?:instead|rather|same|as if|lost and found|let|if|unless|should|would|could|might|than|without|instead of|apart from|except|neither|nor|not|no|never|nothing|nobody|hardly|barely|anything|too|enough|almost|nearly)\b|n't\b|\?"),
+    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|再|免|而非|反而|身后|旁"),
 }  # fmt: skip
 _ADVERB = re.compile(
     r"\s*(?:in|on|at|now|away|after|before|here|there|behind|through|along|up|down|where|as|about|then|once)\b"
 )
 _RELATED = {
-    "en": re.compile(r"\s*(?:-?hand side)?\s*of (?:our|its|his|hers?|him|them|us|it|their|that|this|the (?!image|frame|picture|cent|middle|cross|screen))"),
+    "en": re.compile(r"\s*(?:-?hand side)?\s*of (?:our|its|his|hers?|him|them|us|it|their|that|this|where|what|the (?!image|frame|picture|cent|middle|cross|screen))"),
     "zh": re.compile(r"\s*(?:的)?一侧"),
 }  # fmt: skip
 _STANDS_AT = re.compile(
@@ -48,7 +53,7 @@ def is_plain(found: Statement, token: Token, sentence: Sentence, clause: Clause,
     """Tell whether a word that the window does not bear out is a contradiction."""
     text, language = sentence.text, sentence.language
     part = text[clause.start : clause.end]
-    if found.negated or found.kind == "steady" or _is_blocked(found, token, sentence, clause):
+    if found.negated or found.kind in ("steady", "mixed") or _is_blocked(found, token, sentence, clause):
         return False
     if is_reasoning and clause.has("action") and not _is_told(part, clause, language):
         return False  # what to do
@@ -98,7 +103,7 @@ def is_asserted(found: Statement, token: Token, sentence: Sentence, clause: Clau
         has_subject = any(gap < 0 or gap == 1 for gap in people)  # "the motionless walker"
         has_subject = has_subject or (language == "zh" and not clause.has("quantity"))
         has_subject = has_subject and not _STANDS_AT.match(text, token.start)
-    blocked = _BLOCKED[language].search(text, clause.start, token.start) or "?" in text
+    blocked = _DENIED[language].search(text, clause.start, token.start) or "?" in text
     part = text[clause.start : clause.end]
     is_to_do = is_reasoning and clause.has("action") and not _is_told(part, clause, language)
     return has_subject and not (found.negated or blocked or is_to_do or clause.has("who", "scene"))

@@ -10,6 +10,7 @@ from caption.truth.prose.clauses import Clause, parse
 from caption.truth.prose.cues import Context, times_of
 from caption.truth.prose.deciding import actions_of
 from caption.truth.prose.reading_numbers import NumberReader
+from caption.truth.prose.reading_plain import PlainReader
 from caption.truth.prose.reading_states import StateReader
 from caption.truth.prose.reading_words import WordReader
 from caption.truth.prose.statements import NOW, Form, Said, Statement
@@ -37,7 +38,9 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
         words.read(numbers.beside.used_sides)
         states = StateReader(sentence, clause, context, in_scene=in_scene, is_plan=is_plan, is_reasoning=is_reasoning)
         states.read()
-        statements += numbers.statements + words.statements + states.statements
+        plain = PlainReader(sentence, clause, context, in_scene=in_scene, is_plan=is_plan, is_reasoning=is_reasoning)
+        plain.read()
+        statements += numbers.statements + words.statements + states.statements + plain.statements
         left_out = left_out or numbers.left_out or words.left_out or states.left_out
         if is_reasoning or is_plan:
             actions += actions_of(sentence, clause, is_plan=is_plan)

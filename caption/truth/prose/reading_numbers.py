@@ -63,6 +63,7 @@ class NumberReader:
             self.sentence.numerals[i] = numeral
             if numeral.unit not in ("s", "frames"):
                 groups.setdefault(numeral.group, []).append(i)
+        self._share_units_of_ends()
         for members in groups.values():
             self._share_unit(members)
             self._read_group(members)
@@ -76,14 +77,24 @@ class NumberReader:
             if not self.sentence.numerals[i].unit:
                 self.sentence.numerals[i] = replace(self.sentence.numerals[i], unit=first.unit, factor=first.factor)
 
+    def _share_units_of_ends(self) -> None:
+        """Give the unit of the end to the start of a way that has none: "from 6 to about 4.3 m/s"."""
+        for i, j in itertools.pairwise(self.clause.numerals):
+            first, last = self.sentence.numerals[i], self.sentence.numerals[j]
+            if not first.unit and last.unit and self.changing.is_from_to(first, last):
+                self.sentence.numerals[i] = replace(first, unit=last.unit, factor=last.factor)
+
     def _speeds(self) -> None:
         """Read two speeds that are set against each other: one is the drone's, the other the target's."""
         for a, b in self.sureness.pairs:
             i, j = self.sentence.numerals.index(a), self.sentence.numerals.index(b)
             if i not in self.clause.numerals or self.clause.is_blocked(a.start) or self.clause.has("link", "between"):
                 continue
+            there = next((c for c in self.sentence.clauses if c.start <= b.start < c.end), self.clause)
             if any(t.value[0] == "t" and t.value[1:].isdigit() for t in self.clause.of("time")):
                 continue
+            if there.has("time", "prev1", "prev2", "start", "past"):
+                continue  # "0.37 m/s, against 3.46 the frame before"
             owners = [self.sureness.owners.right_beside(n) for n in (a, b)]
             if re.match(r"\s*的?[^(]*\(", self.text[b.end :]) or self.text[: self.clause.start].endswith(":"):
                 owners = owners_behind(self.sentence, self.clause)  # "speeds of 5.8 and 4.9 m/s (drone, walker)"
@@ -214,7 +225,11 @@ class NumberReader:
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
             found = replace(found, names=names or found.names)
-        self.statements.append(self._surely(found, numeral))
+        found = self._surely(found, numeral)
+        units = [self.sentence.numerals[i].unit for i in self.clause.numerals]
+        is_single = bool(found.sure_names) and not trend and units.count(numeral.unit) == 1
+        is_named = self.clause.has("who", "drone", "target") or self.clause.has("quantity")
+        self.statements.append(replace(found, is_single=is_single, is_named=is_named))
         if (end := self.beside.extreme(numeral)) and names:
             self.statements.append(replace(found, kind="extreme", names=found.sure_names or names, word=end))
 
@@ -265,6 +280,10 @@ class NumberReader:
             s = replace(s, sure_names=s.names)
         if s.mode == "value" or s.sure_frames is not None or s.frames is None or len(s.frames) != 2:
             return s
+        if any(0 < t.start - numeral.end <= 8 for t in self.clause.of("time", "start", "past")):
+            return s  # "2.1 degrees at first and 3.3 in the last step"
+        if self.text.startswith(("at t", "在t"), self.clause.start) and not self.clause.has("time", "since"):
+            return s  # "at t3 the target had slid 10 px"
         if s.names == ("yaw",) and s.frames == (-2, NOW) and self.changing.turned_by(numeral):
             return replace(s, sure_names=("yaw", "heading"), sure_frames=s.frames, sure_mode="change")
         if not s.sure_names and s.names == ("yaw",) and s.side:
@@ -281,6 +300,8 @@ class NumberReader:
         """Make one statement of "from A to B": two values of one series, the later one after the earlier."""
         singles = [s for s in self.statements if s.kind == "number"]
         for early, late in itertools.pairwise(singles):
+            if early not in self.statements:
+                continue  # the end of another course
             a, b = self.sentence.numerals[early.numbers[0]], self.sentence.numerals[late.numbers[0]]
             if a.unit == b.unit and self.changing.is_from_to(a, b):
                 self.statements = [s for s in self.statements if s is not early and s is not late]

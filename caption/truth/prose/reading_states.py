@@ -18,6 +18,7 @@ _RUNNING = re.compile(r"\b(?:run|running|jog|jogs|jogging|sprint|sprinting|sprin
 _IDIOM = re.compile(
     r"\s+(?:out of|out|low|late|short|high|hot|parallel|in parallel|smoothly)\b"
 )  # "running out of room"
+_COMPARED = re.compile(r"\b(?:\w+er|more|less) $")
 _STILL = ("standing still", "motionless", "stationary", "standstill", "immobile", "站着", "站立", "站定", "原地不动")
 _EVERY = tuple(range(32))  # frame of the longest window
 _ALWAYS = {
@@ -64,7 +65,7 @@ class StateReader(ClauseWords):
         text = self.text[token.start : token.end]
         after = self.text[token.end : token.end + 14]
         if text in ("lost", "covered", "lose") and re.match(
-            r"\s*(?:about |roughly |some |a |only |just |another )?[#\d]|\s*(?:height|altitude|speed|two|three|four)",
+            r"\s*(?:about |roughly |some |a |only |just |another )?[#\d]|\s*(?:height|altitude|speed|two|three|four|more|less|twice|half|as much|ground|the ground|the distance|some|a (?:distance|way|lot|bit|little|few))\b",
             after,
         ):
             return
@@ -73,6 +74,8 @@ class StateReader(ClauseWords):
             and not self._is_sight()
         ):
             return
+        if text == "可见" and token.start == self.clause.start and self.clause.end - token.end >= 4:
+            return  # "it can be seen that"
         if self.is_plan or ((self.in_scene and not self.clause.has("who", "target")) and not self._is_sight()):
             self.left_out = self.left_out or self.is_plan
             return
@@ -141,6 +144,8 @@ class StateReader(ClauseWords):
         told = any(
             self.sentence.numerals[i].unit in ("m", "mps") for i in self.clause.numerals
         )  # the number says it better
+        if token.value == "walking" and self.clause.has("trend", "pace_down"):
+            return  # "slower and slower", until he stands
         if self.is_plan or owner != ("target" if is_target else "drone") or self.in_scene:
             return
         if (
@@ -150,6 +155,8 @@ class StateReader(ClauseWords):
         ):
             return
         text = self.text[token.start : token.end]
+        if text == "still" and _COMPARED.search(self.text, 0, token.start):
+            return  # "slower still"
         if text in ("still", "stand", "stands", "static", "flat") and not re.match(
             r"\s*(?:$|[,.;])", self.text[token.end : token.end + 10]
         ):

@@ -12,6 +12,9 @@ from caption.truth.prose.reading_ratios import ratio_statement
 from caption.truth.prose.statements import NOW
 
 _HARDLY = re.compile(r"\b(?:hardly|barely|scarcely) (?:\w+ )?$|几乎(?:没有|没|不|未)?(?:怎么)?$")
+_BEFOREHAND = re.compile(r"\b(?:after|before|following|despite) $")  # "has opened to 21.7 m after dipping"
+_TAKES_OBJECT = re.compile(r"cut|reduc|shrink|shorten|widen")
+_OBJECT = re.compile(r" (?:the |its |our |their |his |her )?")  # "cut the distance"
 _SIGHT = ("line of sight", "sight line", "视线", "3d", "diagonal")  # lengths where a number follows; they do not grow
 _BACK = re.compile(r"\b(?:is|are|keeps) (?:\w+ )?(?:back|return\w*|unwind\w*)|正[^#,]{0,5}回")
 _MUCH = {
@@ -29,6 +32,9 @@ _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between 
 _AS_HIGH = re.compile(r"\s*(?:as )?(?:high|far|long|wide|tall|deep)\b")  # of two lengths
 _FURTHER = re.compile(r"(?:further|farther) (?:under|below|beneath|above|down|up|left|right|along|into|to the)\b")
 _BESIDE = re.compile(r"[侧方]")
+_NO_CHANGE = re.compile(
+    r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
+)
 _GOES = re.compile(r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行")
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
 
@@ -63,9 +69,13 @@ class WordReader(ClauseWords):
             self.left_out = self.left_out or not self.in_scene
             return
         names = () if self._is_hedge(token) else self._trend_names(token)
-        if not names or (token.value in ("up", "down") and self._is_of_speeds(token, names)):
+        if (
+            not names
+            or _NO_CHANGE.match(self.text, token.start)
+            or (token.value in ("up", "down") and self._is_of_speeds(token, names))
+        ):
             return
-        if _HARDLY.search(self.text[: token.start]):
+        if _HARDLY.search(self.text[: token.start]) or _BEFOREHAND.search(self.text, self.clause.start, token.start):
             self.left_out = True
             return
         negated = self.sentence.is_negated(self.clause, token)
@@ -85,6 +95,7 @@ class WordReader(ClauseWords):
             negated=negated,
             span=self._trend_span(),
             frames=self._trend_frames(token),
+            is_named=self.clause.has("quantity"),
         )
 
     def _is_of_speeds(self, token: Token, names: tuple[str, ...]) -> bool:
@@ -125,7 +136,7 @@ class WordReader(ClauseWords):
                 len(same) > 1 or nearest in ("over", "pitch")
             ):
                 return ()
-            if nearest == "speed":
+            if nearest == "speed" and self.clause.has("quantity", "speed"):
                 return self._speed_names(token)  # "the drone's speed climbs"
             return () if self._owner(token) == "target" else ("altitude",)
         if len(same) > 1 and any(t.value in _VERTICAL for t in same) and self._is_of_flier():
@@ -186,6 +197,8 @@ class WordReader(ClauseWords):
                 cost = gap(cue, token.start, token.end) + 10 * crossing(
                     self.sentence, self.clause, cue, token.start, token.end
                 )
+                if _TAKES_OBJECT.match(self.text, token.start) and _OBJECT.fullmatch(self.text, token.end, cue.start):
+                    cost = 0
                 ranked.append((cost, -(cue.end - cue.start), cue.value))
         if ranked:
             return min(ranked)[2]
@@ -213,9 +226,15 @@ class WordReader(ClauseWords):
         frames = [f[0] for time, f in times_of(self.clause) if len(f) == 1]
         if len(frames) == 2:
             return (frames[0], frames[1])
-        if len(frames) == 1 and frames[0] != NOW and self.clause.has("time", "since"):
+        if len(frames) == 1 and frames[0] != NOW and self._is_since(frames[0]):
             return (frames[0], NOW)
         return None
+
+    def _is_since(self, frame: int) -> bool:
+        """Tell whether "since" stands before the time of a frame: "since t1", not "from 25.6 m down to 23.6 m at t3"."""
+        times = [time for time, frames in times_of(self.clause) if frames[0] == frame]
+        reach = 10 if self.language == "en" else 2
+        return any(0 <= times[0].start - t.end <= reach for t in self.clause.of("time", "since"))
 
     def _trend_frames(self, token: Token) -> tuple[int, ...] | None:
         if self.clause.has("time", "now") or (
@@ -277,7 +296,9 @@ class WordReader(ClauseWords):
         """Tell whether a side of the nose is where somebody goes or stands: "走向机头右侧", "walks off to the left of our heading"."""
         if topic == "yaw":
             return self.clause.has("who", "target") or _BESIDE.search(self.text, token.start, token.end + 1) is not None
-        return topic == "bearing" and _GOES.search(self.text, self.clause.start, self.clause.end) is not None
+        return (
+            topic in ("bearing", "offset") and _GOES.search(self.text, self.clause.start, self.clause.end) is not None
+        )
 
     def _topic(self, token: Token, owner: str) -> str:
         ranked = []
@@ -318,7 +339,7 @@ class WordReader(ClauseWords):
                 return "offset"
             case "quantity", "bearing":
                 return "bearing"
-            case "bend", _:
+            case "bend", "bend":
                 return "bend" if owner == "target" else ""
             case "position", "side" | "frame":
                 return "offset" if owner == "target" else ""
@@ -389,7 +410,7 @@ class WordReader(ClauseWords):
             return  # "a second and a half", "twice at 5 m/s"
         if (
             re.match(
-                r"\s*(?:a |an )?(?:second|frame|step|of the (?:window|picture|frame|image)|way|visible|hidden|turn|the (?:window|picture|frame|image)|of an? )|\s*秒|侧|边|帧|步",
+                r"\s*(?:a |an )?(?:met(?:re|er)|second|frame|step|of the (?:window|picture|frame|image)|way|visible|hidden|turn|the (?:window|picture|frame|image)|of an? )|\s*秒|侧|边|帧|步",
                 text,
             )
             or self.in_scene

@@ -19,8 +19,9 @@ from caption.truth.prose.statements import NOW, Mode
 from caption.truth.prose.versus import pairs_of_speeds
 
 _OFF_TO = re.compile(
-    r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er)|axis|cross ?hairs?|reticle|midline)\b"
+    r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:and #(?:\.#)? ?(?:px|pixels) (?:to the )?(?:left|right|above|below) (?:of )?)?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er)|axis|cross ?hairs?|reticle|midline)\b"
 )
+_ASIDE = re.compile(r"偏[左右](?:了|约|大约|近)?\s*$")
 _CLOSING = re.compile(
     r"\b(?:clos(?:ing|ure)|approach\w*|opening|relative|vertical\w*|climb\w*|sink\w*|descen\w*|surplus|margin|lead|deficit|wind)\b|接近|靠近|逼近|远离|相对|垂直|爬升|升降|下降|富余|风"
 )
@@ -70,7 +71,14 @@ class Sureness:
             return ()
         if numeral.unit == "px" and self.language == "en" and (beside := _OFF_TO.match(self.text, numeral.end)):
             return ("offset_x",) if beside["x"] else ("offset_y",)
-        if numeral.unit == "px" and numeral.side and not self.clause.has("quantity", "box", "width", "tall", "height"):
+        if (
+            numeral.unit == "px"
+            and numeral.side
+            and (
+                _ASIDE.search(self.text, 0, numeral.start)
+                or not self.clause.has("quantity", "box", "width", "tall", "height")
+            )
+        ):
             return ("offset_x",)
         if numeral.unit == "px" and OFF_CENTRE.search(self.text, 0, numeral.start):
             return ("offset_y",)

@@ -50,22 +50,27 @@ _START, _END, _NEXT = "^", "$", ";"
 
 
 @lru_cache(maxsize=4096)
-def is_met(text: str, language: Language, span: tuple[int, int], loosely: bool = False) -> bool:
+def is_met(text: str, language: Language, span: tuple[int, int], loosely: bool = False, alone: bool = False) -> bool:
     """Tell whether the neighbouring words of a clause of a masked sentence were met together.
 
     span: of the clause. Wanted are all groups of three, of two for a short clause without a word that the lexicon does not hold. loosely: all
     groups of two but one. A clause that names neither a quantity nor anybody goes on about the one before it, and is looked at with it.
     """
-    if _CITES.search(text):
+    if cites(text):
         return False
     sentence = parse(text, language)
     at = next(i for i, clause in enumerate(sentence.clauses) if (clause.start, clause.end) == span)
     words = words_of(sentence, sentence.clauses[at])
     is_short = len(words) <= _SHORT and all(word[0] in "<#" or word in _ALIKE for word in words)
-    if at and not sentence.clauses[at].has("quantity") and not sentence.clauses[at].has("who"):
+    if at and not alone and not sentence.clauses[at].has("quantity") and not sentence.clauses[at].has("who"):
         words = [*words_of(sentence, sentence.clauses[at - 1]), _NEXT, *words]
     unmet = _neighbours([_START, *words, _END], PAIR if loosely or is_short else TRIPLE) - met(language)
     return len(unmet) <= loosely
+
+
+def cites(text: str) -> bool:
+    """Tell whether a sentence says what a rule or another text says."""
+    return _CITES.search(text) is not None
 
 
 def words_of(sentence: Sentence, clause: Clause) -> list[str]:
