@@ -86,6 +86,13 @@ def test_processes_find_what_one_finds(honest, tmp_path):
     assert str(one) == str(two)
 
 
+@pytest.mark.parametrize(("name", "is_found"), [("LICENSE", False), (".gitattributes", False), ("notes.txt", True)])
+def test_a_file_that_no_record_knows_is_told_but_for_a_licence_and_what_the_hub_adds(honest, tmp_path, name, is_found):
+    folder = shutil.copytree(honest, tmp_path / "release")
+    (folder / name).write_text("words")
+    assert errors_in(folder, "structure") == ({"unexpected": 1} if is_found else {})
+
+
 def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
     assert errors_in(hub_snapshot(honest, tmp_path)) == {}
 

@@ -15,7 +15,8 @@ from cosfly.reading.files import open_file, sha256_file
 from cosfly.store import CHECKSUMS, read_checksums
 from release.verify.findings import Findings
 
-ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
+# What the hub and its client put beside a data set, and the text of a licence.
+ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface", "LICENSE", "LICENSE.txt", "LICENSE.md")
 SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap checks
 
 
