@@ -1,7 +1,9 @@
 """Every command that writes, killed at every point: which commands, with which inputs, and the sweep over their points.
 
 `python tests/crash_sweep.py` sweeps them all; names of commands after it, only these. --few: of each kind of point the first and the last.
---twice: killed again, at a random point, in the run that goes on.
+--twice: killed again, at a random point, in the run that goes on. Exit code 1: something was wrong after a kill, or nothing was killed.
+
+It is a process of its own: what it kills are forks, and a fork of a process that has run others' threads (tests before it) may hang.
 """
 
 from __future__ import annotations
@@ -232,6 +234,7 @@ def main() -> None:
     parser.add_argument("--twice", action="store_true")
     asked = parser.parse_args()
     load_all()
+    is_right = True
     with tempfile.TemporaryDirectory() as root, ExitStack() as stack:
         place = Place(Path(root), stack)
         for name in asked.names or COMMANDS:
@@ -242,6 +245,7 @@ def main() -> None:
                 )
             except AssertionError as error:
                 print(f"{name}: does not run undisturbed: {error}", flush=True)
+                is_right = False
                 continue
             seconds = f"{time.monotonic() - begin_s:.0f} s"
             print(
@@ -249,6 +253,9 @@ def main() -> None:
                 flush=True,
             )
             print("".join(f"  {line}\n" for line in swept.wrong), end="", flush=True)
+            is_right &= not swept.wrong and swept.num_killed > 0
+    if not is_right:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":
