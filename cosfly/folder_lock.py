@@ -51,7 +51,7 @@ class FolderLock:
 
     def give_up(self) -> None:
         """Let others in, and leave a folder in which nothing was done as it was before."""
-        others = [entry for entry in self.path.parent.iterdir() if entry != self.path] if self._file is not None else []
+        others = [entry for entry in self._entries() if entry != self.path] if self._file is not None else []
         if self._file is None or any(entry.name not in self._nothing for entry in others):
             return self.release()
         with contextlib.suppress(OSError):
@@ -61,6 +61,12 @@ class FolderLock:
         with contextlib.suppress(OSError):  # somebody who waited is there already
             for folder in self._made:
                 folder.rmdir()
+
+    def _entries(self) -> list[Path]:
+        try:
+            return list(self.path.parent.iterdir())
+        except OSError:  # somebody has removed the folder meanwhile
+            return []
 
     def __del__(self) -> None:
         self.release()

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -207,6 +208,13 @@ def test_a_command_that_is_refused_before_it_did_anything_leaves_nothing(tmp_pat
     assert sorted(path.name for path in stage.path.iterdir()) == ["items.jsonl", "stage.json"]
 
 
+def test_a_folder_that_somebody_removed_meanwhile_can_be_given_up(tmp_path):
+    stage = _open(tmp_path / "out")
+    shutil.rmtree(stage.path)
+    give_up(tmp_path)
+    assert not stage.path.exists()
+
+
 def test_a_setting_that_may_differ_is_not_on_record(tmp_path):
     _open(tmp_path / "out").journal.append({"id": "a", "status": "kept"})
     again = _open(tmp_path / "out", config=Demo(threads=2))
@@ -334,7 +342,7 @@ def test_a_kill_while_an_attempt_without_work_is_cleared_away_leaves_a_folder_to
     stage = _open(tmp_path / "out")
     stage.journal.append({"id": "a", "status": "failed", "code": "x", "message": "y"})
     write_failures(stage.path / "failures.jsonl", [])
-    give_up()
+    give_up(tmp_path)
     unlink = Path.unlink
 
     def unlink_one(path, **more):
@@ -384,7 +392,7 @@ def test_what_a_stage_has_grown_from_outlives_a_kill_while_it_begins_anew(tmp_pa
     before = fingerprint(out)
     _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
     (out / "product.json").unlink()
-    give_up()
+    give_up(tmp_path)
     _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
     assert has_grown_from(out, before)
 
