@@ -115,18 +115,8 @@ def correlate_colours(
 
 def way_px(one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray) -> float:
     """Give how far things lie apart in two pictures, px: the median of nine points of the first; 0 where none of them has a depth."""
-    height, width = one.depth.shape
-    u, v = (
-        places.reshape(-1) for places in np.meshgrid(width * np.arange(1, 6, 2) // 6, height * np.arange(1, 6, 2) // 6)
-    )
-    depth_m = one.depth[v, u].astype(np.float64)
-    fx, fy, cx, cy = intrinsics
-    here = np.stack([(u + 0.5 - cx) / fx * depth_m, (v + 0.5 - cy) / fy * depth_m, depth_m], axis=1)
-    x, y, z = ((here @ one.rotation.T + one.position_m - other.position_m) @ other.rotation).T
-    is_known = (depth_m > 0.0) & (depth_m < FAR_M) & (z > NEAR_M)
-    fx, fy, cx, cy = others_intrinsics
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ways = np.hypot(fx * x / z + cx - u - 0.5, fy * y / z + cy - v - 0.5)[is_known]
+    turn, shift = _from_to(one, other)
+    ways = _ways(one.depth, intrinsics.astype(np.float64), others_intrinsics.astype(np.float64), turn, shift)
     return median_of(ways) if len(ways) else 0.0
 
 
@@ -136,8 +126,7 @@ def _carried(
     """Give what `_carry` does of two views."""
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
-    turn = other.rotation.T @ one.rotation
-    shift = other.rotation.T @ (one.position_m - other.position_m)
+    turn, shift = _from_to(one, other)
     colours, others_colours = one.colours, other.colours
     if colours is None or others_colours is None:
         colours = others_colours = NO_COLOURS
@@ -145,6 +134,11 @@ def _carried(
         one.depth, one.instance, colours, other.depth, other.instance, others_colours, _grid_row_at(len(one.depth)),
         intrinsics, others, turn, shift, MOVING, FLAT, only_colours,
     )  # fmt: skip
+
+
+def _from_to(one: View, other: View) -> tuple[np.ndarray, np.ndarray]:
+    """Give what takes points of one camera to another's, (3, 3) and (3,) m."""
+    return other.rotation.T @ one.rotation, other.rotation.T @ (one.position_m - other.position_m)
 
 
 @lru_cache
@@ -288,6 +282,21 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             else:
                 counts[2] += 1
     return counts, errors[:num_errors], colours[:num_colours], firm[:num_firm], moved[:num_moved], renamed[:num_renamed]
+
+
+@njit(cache=True, nogil=True)
+def _ways(depth, intrinsics, others, turn, shift):  # type: ignore[no-untyped-def]
+    """How far nine points come out from where they are, px, (k,) of those that have a depth."""
+    height, width = depth.shape
+    ways, num = np.empty(9), 0
+    for j in range(9):
+        u, v = width * (1 + 2 * (j % 3)) // 6, height * (1 + 2 * (j // 3)) // 6
+        d = float(depth[v, u])
+        s, t, _ = _carried_point(u, v, d, intrinsics, others, turn, shift)
+        if 0.0 < d < FAR_M and not np.isnan(s):
+            ways[num] = np.hypot(s - u - 0.5, t - v - 0.5)
+            num += 1
+    return ways[:num]
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosfly.png.read import Png
 from release.verify.findings import Findings
-from release.verify.pixels import MOST_STEP, PERSON_ID
+from release.verify.pixels import outline_of
 from release.verify.rows import FlightRows
 
 MOST_ROWS = 8  # of the person that are looked at: what they lean on has to be undone too
@@ -30,14 +30,8 @@ def outline_step(colours: Png, instance: np.ndarray, box: np.ndarray) -> float:
     if x1 <= x0 or y1 <= y0:
         return np.nan
     rows = np.unique(np.linspace(y0, y1 - 1, MOST_ROWS).astype(int))
-    part = slice(max(0, x0 - 1), x1 + 1)
-    mask = instance[rows, part].astype(np.int64)
-    is_person = (mask[..., 1] | mask[..., 2] << 8) == PERSON_ID
-    is_outline = is_person[:, 1:] != is_person[:, :-1]
-    if is_outline.sum() < LEAST_PLACES:
-        return np.nan
-    steps = np.abs(np.diff(colours.rows(rows)[:, part, :3].astype(np.int64), axis=1)).sum(axis=2)
-    return float(np.minimum(steps, MOST_STEP)[is_outline].mean())
+    total, num = outline_of(colours.rows(rows), instance, rows, max(0, x0 - 1), min(width, x1 + 1))
+    return total / num if num >= LEAST_PLACES else np.nan
 
 
 def check_shown(flight: FlightRows, steps: np.ndarray, findings: Findings) -> None:

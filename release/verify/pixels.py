@@ -21,6 +21,7 @@ LEAST_EDGES, MOST_STEP = (
     30,
     120,
 )  # edges, for their mean to say something; grey levels of three channels, of which more count no more
+EIGHT_PIXELS = 24  # bytes of a mask's row that are looked at at once
 BEND_EVERY, LEAST_BENDS = 4, 200  # pixels of a row; points, for their median to say something
 LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 NEAR_M = 0.3  # where rays begin: the renderers' near plane
@@ -234,6 +235,9 @@ def _edge_steps(colours, instance, rows):  # type: ignore[no-untyped-def]
     height, width = instance.shape[:2]
     sums, squares = np.zeros((3, 2 * MOVED_PX + 1)), np.zeros((3, 2 * MOVED_PX + 1))
     counts, steps = np.zeros(3, np.int64), np.zeros(max(width - 1, 0))
+    num_bytes = 3 * max(width - 1, 0)
+    changes = np.zeros(-(-num_bytes // EIGHT_PIXELS) * EIGHT_PIXELS, np.uint8)
+    words = changes.view(np.uint64)
     for j in range(len(rows)):
         for x in range(width - 1):
             step = np.int64(0)
@@ -244,16 +248,46 @@ def _edge_steps(colours, instance, rows):  # type: ignore[no-untyped-def]
             row = rows[j] + 2 * (k - 1)
             if row < 0 or row >= height:
                 continue
-            mask = instance[row]
-            for x in range(MOVED_PX, width - 1 - MOVED_PX):
-                if mask[x, 0] == mask[x + 1, 0] and mask[x, 1] == mask[x + 1, 1] and mask[x, 2] == mask[x + 1, 2]:
+            mask = instance[row].reshape(3 * width)
+            for b in range(num_bytes):
+                changes[b] = mask[b] ^ mask[b + 3]
+            for w in range(0, len(words), 3):
+                if words[w] | words[w + 1] | words[w + 2] == 0:
                     continue
-                counts[k] += 1
-                for side in range(2 * MOVED_PX + 1):
-                    step_there = steps[x + side - MOVED_PX]
-                    sums[k, side] += step_there
-                    squares[k, side] += step_there * step_there
+                for x in range(max(w // 3 * 8, MOVED_PX), min(w // 3 * 8 + 8, width - 1 - MOVED_PX)):
+                    if changes[3 * x] | changes[3 * x + 1] | changes[3 * x + 2] == 0:
+                        continue
+                    counts[k] += 1
+                    for side in range(2 * MOVED_PX + 1):
+                        step_there = steps[x + side - MOVED_PX]
+                        sums[k, side] += step_there
+                        squares[k, side] += step_there * step_there
     return sums, squares, counts
+
+
+@njit(cache=True, nogil=True)
+def outline_of(colours, instance, rows, begin, end):  # type: ignore[no-untyped-def]
+    """Look along some rows for the person's outline.
+
+    Args:
+        colours: (k, w, 3 or 4) uint8, those rows; instance: (h, w, 3) uint8; rows: (k,) int64; begin, end: columns between which is looked.
+    Returns:
+        the sum of the steps of colours from pixel to pixel there, grey levels of three channels, and how many they are.
+    """
+    total, num = np.int64(0), np.int64(0)
+    for j in range(len(rows)):
+        mask = instance[rows[j]]
+        for x in range(begin, end - 1):
+            is_here = mask[x, 1] == PERSON_ID & 255 and mask[x, 2] == PERSON_ID >> 8
+            is_next = mask[x + 1, 1] == PERSON_ID & 255 and mask[x + 1, 2] == PERSON_ID >> 8
+            if is_here == is_next:
+                continue
+            step = np.int64(0)
+            for c in range(3):
+                step += abs(np.int64(colours[j, x + 1, c]) - np.int64(colours[j, x, c]))
+            total += step if step < MOST_STEP else MOST_STEP
+            num += 1
+    return total, num
 
 
 @njit(cache=True, nogil=True)
