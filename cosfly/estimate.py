@@ -56,9 +56,9 @@ def _rate(seconds: float, size_mb: float, units: float) -> Rate:
 # 804 windows. Ends of a walk are 50 to 100 m apart; at 1.2 m/s and two frames a second 143 frames are 1.14 times the straight way.
 SHIPPED = Rates(
     {
-        "maps": _rate(0.5, 1.1, 1), "simplify": _rate(5.9, 1.2, 1), "pedestrians": _rate(5.0, 0.3, 3), "plan": _rate(2.5, 0.4, 3),
-        "render": _rate(65.7, 4383, 858 * 0.9216), "inspect": _rate(15.6, 0.7, 858 * 0.9216), "caption": _rate(4.9, 7.4, 804),
-        "release": _rate(10, 1842, 858 * 0.9216),
+        "maps": _rate(0.2, 1.1, 1), "simplify": _rate(5.6, 1.2, 1), "pedestrians": _rate(4.6, 0.3, 3), "plan": _rate(2.3, 0.4, 3),
+        "render": _rate(51.2, 4383, 858 * 0.9216), "inspect": _rate(8.3, 0.7, 858 * 0.9216), "caption": _rate(4.0, 7.4, 804),
+        "release": _rate(7.8, 1842, 858 * 0.9216),
     },
     1.14,
     {"rules": (0.0, 0.0)},
