@@ -131,7 +131,7 @@ def _carried(
     if colours is None or others_colours is None:
         colours = others_colours = NO_COLOURS
     return _carry(
-        one.depth, one.instance, colours, other.depth, other.instance, others_colours, _grid_row_at(len(one.depth)),
+        one.depth, one.instance, colours, other.depth, other.instance, others_colours, _grid_row_at(len(other.depth)),
         intrinsics, others, turn, shift, MOVING, FLAT, only_colours,
     )  # fmt: skip
 
@@ -223,6 +223,7 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
     """Counts (5,), errors (k,), colours (k, 6) of points here and there, where both are known; of points among nothing but their own thing
     its id, of those with its depth and of those that are farther; of points with its depth among nothing but one other thing their own id. only_colours: points that come out where there are none are left out of everything."""
     height, width = depth_a.shape
+    others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
     errors, num_errors = np.empty(COLUMNS * ROWS), 0
@@ -240,11 +241,11 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
             if not (d > 0.0 and d < FAR_M) or (has_ids and moving[inst_a[v, u, 0]]):
                 continue
             s, t, z = _carried_point(u, v, d, intrinsics, others, turn, shift)
-            if not (s > 1.5 and t > 1.5 and s < width - 2.5 and t < height - 2.5):
+            if not (s > 1.5 and t > 1.5 and s < others_width - 2.5 and t < others_height - 2.5):
                 continue
             column, row = int(s), int(t)
             k = grid_row_at[row]  # of the colours; a point that comes out between two of their rows has none
-            has_colours = k >= 0 and k < len(colours_b) and j < len(colours_a)
+            has_colours = 0 <= k < len(colours_b) and column < colours_b.shape[1] and j < len(colours_a)
             if only_colours and not has_colours:
                 continue
             best, least, is_through, is_same, is_free, is_whole, is_one = _around(

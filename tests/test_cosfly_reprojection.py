@@ -108,6 +108,17 @@ def test_way_between_two_pictures():
     assert way_px(building_at(1000.0), beside, CAMERA, CAMERA) == 0.0
 
 
+def test_points_come_out_in_a_picture_of_another_size():
+    """A wall at 20 m, seen from 20 m to the side by a camera of half as many pixels: what lies beyond its edges is not seen."""
+    wall = building_at(20.0)
+    halved = View(wall.depth[::2, ::2].copy(), wall.instance[::2, ::2].copy(), None, np.eye(3), np.array([-20.0, 0.0, 0.0]))  # fmt: skip
+    found = compare_views(wall, halved, CAMERA, CAMERA / 2.0)
+    columns, rows = ((np.arange(num) + 0.5) * size // num for num, size in ((COLUMNS, 160), (len(grid_rows(90)), 90)))
+    s, t = (columns + 0.5) / 2.0 + 40.0, (rows + 0.5) / 2.0
+    assert found.seen == ((s > 1.5) & (s < 77.5)).sum() * ((t > 1.5) & (t < 42.5)).sum()
+    assert (found.agree, found.through, found.same) == (found.seen, 0, found.seen)
+
+
 @pytest.mark.parametrize("rain", [0.0, 60.0])
 def test_colours_of_points_agree_as_numpy_says(rain):
     """A plane with a picture on it and a camera that moves 1 px to the side: by hand from the pictures' rows. Alone or with all else."""
