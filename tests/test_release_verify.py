@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import struct
@@ -388,6 +389,15 @@ def _zero_focal(rows):
         row["intrinsics"] = {"fx": 0.0, "fy": 0.0, "cx": 0.0, "cy": 0.0}
 
 
+def _zero_focal_at_the_end(rows):
+    rows[-1]["intrinsics"]["fx"] = 0.0
+
+
+def _infinitely_far(rows):
+    for row in rows:
+        row["target"]["x_m"] = math.inf
+
+
 def _palette(rows):
     rows[1]["instance"]["bytes"] = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))[:-30]
 
@@ -416,6 +426,8 @@ ODD_ROWS = {
     "hardly anything": _null_everything,
     "an empty window": _half_a_caption,
     "no focal length": _zero_focal,
+    "no focal length in the last frame": _zero_focal_at_the_end,
+    "people infinitely far away": _infinitely_far,
     "an instance cut short": _palette,
     "a flat depth": _flat_depth,
     "depth in double": _double_depth,

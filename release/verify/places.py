@@ -18,6 +18,7 @@ from release.verify.findings import Findings
 
 if TYPE_CHECKING:
     from release.verify.across import RowFiles, Summary
+    from release.verify.rows import FlightRows
 
 KEPT_FRAMES, KEPT_COLUMNS = 6, 160  # of a flight; pixels of a row of each, about
 OTHERS = 2  # frames of other walks that each is carried into: those whose person is nearest
@@ -25,15 +26,20 @@ LEAST_SEEN, LEAST_AGREE = 300, 300  # points of two walks, for a share to mean s
 # Points before what is drawn there: of two walks honest 0.001 at most, of one pair of frames 0.005; 0.013 where one walk is 3 m off.
 THROUGH_MOST = 0.006
 SAME_LEAST = 0.95  # of the instances, of ground the kinds, where the depth agrees; honest 0.984
-MEET_LEAST = (
-    0.5  # of the points that agree, for two frames to see one place: where most is hidden some depths agree by chance
-)
+# Of the points that agree, for two frames to see one place: where most is hidden some depths agree by chance.
+MEET_LEAST = 0.5
 Kept = tuple[View, np.ndarray]  # with its intrinsics, (4,) fx, fy, cx, cy
 
 
 def kept_rows(num_rows: int) -> set[int]:
     """Give the rows of a flight whose frames are kept, spread evenly."""
     return set(np.linspace(0, num_rows - 1, min(KEPT_FRAMES, num_rows)).astype(int).tolist())
+
+
+def can_be_kept(flight: FlightRows, i: int) -> bool:
+    """Tell whether a row knows where its person and its camera are, in numbers that points can be carried with."""
+    told = np.concatenate([flight.target_m[i], flight.pose[i], flight.intrinsics[i]])
+    return bool(np.isfinite(told).all() and (flight.intrinsics[i, :2] > 0.0).all())
 
 
 def thinned(view: View, intrinsics: np.ndarray) -> Kept:

@@ -29,7 +29,7 @@ from release.verify.findings import Findings
 from release.verify.person import check_shown
 from release.verify.pictures import check_picture, decode, least_step, view_of
 from release.verify.pixels import BLOCK_PX, NUM_IDS, look_of, new_kinds
-from release.verify.places import Kept, kept_rows, thinned
+from release.verify.places import Kept, can_be_kept, kept_rows, thinned
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
@@ -138,7 +138,7 @@ def check_pictures(
         view = view_of(flight, i, decoded)
         if decoded[0].size:
             _compare(flight, i, view, before, pairs)
-            if i in to_keep and view.instance.size and not np.isnan(flight.target_m[i]).any():
+            if i in to_keep and view.instance.size and can_be_kept(flight, i):
                 kept.append((i, thinned(view, flight.intrinsics[i])))
         before = [*before[-1:], (i, view)]
     _judge(flight, pairs, rounded_as, findings)
