@@ -28,6 +28,7 @@ from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
 from cosfly.settings import RunConfig
+from cosfly.store import write_bytes
 from release.columns import POSE
 from release.package import stage as package
 from release.package.config import ReleaseConfig
@@ -92,6 +93,20 @@ def test_a_file_that_no_record_knows_is_told_but_for_a_licence_and_what_the_hub_
     folder = shutil.copytree(honest, tmp_path / "release")
     (folder / name).write_text("words")
     assert errors_in(folder, "structure") == ({"unexpected": 1} if is_found else {})
+
+
+@pytest.mark.parametrize(
+    ("add", "expected"),
+    [
+        (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
+        (lambda place: write_bytes(place / "more.bin", b"anything"), {"unexpected": 1}),
+        (os.mkfifo, {"unreadable": 1}),
+    ],
+)
+def test_a_licence_is_a_file_of_the_folder(honest, tmp_path, add, expected):
+    folder = shutil.copytree(honest, tmp_path / "release")
+    add(folder / "LICENSE")
+    assert errors_in(folder, "structure") == expected
 
 
 def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):

@@ -15,8 +15,8 @@ from cosfly.reading.files import open_file, sha256_file
 from cosfly.store import CHECKSUMS, read_checksums
 from release.verify.findings import Findings
 
-# What the hub and its client put beside a data set, and the text of a licence.
-ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface", "LICENSE", "LICENSE.txt", "LICENSE.md")
+ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
+LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md")  # files that may lie there, with the text of one
 SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap checks
 
 
@@ -41,11 +41,11 @@ def check_names(folder: Path, expected: Mapping[str, int | None], findings: Find
     """
     found: dict[str, int] = {}
     for name in files_below(folder):
-        if name not in expected:
+        if name not in expected and name not in LICENCES:
             findings.error("unexpected", name, "a file", "nothing: no record knows it")
             continue
         size = _size(folder, name, findings)
-        if size is not None:
+        if size is not None and name in expected:
             found[name] = size
     for name in expected:
         if name not in found and not os.path.lexists(folder / name):

@@ -17,7 +17,7 @@ from release.export.manifest import ExportRecord
 from release.export.source import open_release
 from release.export.stage import run as export
 from release.verify.findings import Findings
-from release.verify.folder import files_below
+from release.verify.folder import LICENCES, files_below
 
 WRITTEN_ANEW = ("export.json", "README.md", CHECKSUMS)  # these name the version of cosfly
 
@@ -46,7 +46,7 @@ def check_made_again(
         except CosflyError as error:
             findings.error("source", source, f"{error.what}: {error.got}", "a release that can be exported")
             return
-        for name in sorted({*files_below(folder), *files_below(again)} - set(WRITTEN_ANEW)):
+        for name in sorted({*files_below(folder), *files_below(again)} - {*WRITTEN_ANEW, *LICENCES}):
             _compare(folder, again, name, findings)
         num_files = sum(1 for _ in files_below(again))
     findings.facts.append(f"{num_files:,} files made again of {record.release.name} by cosfly {cosfly.__version__}")
