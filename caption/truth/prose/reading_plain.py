@@ -30,7 +30,6 @@ _RECORD = {
         r"(?:五帧|四步|各帧|整段|全段|全程|整个窗口|窗口)(?:之中|之内|里面?|中|内|以来|来)?(?:数|的|它|他|她|现在|此刻|当前|都|属|是|算){0,3}最(?P<word>[高低矮大小远近快慢宽窄])(?![一两三几半后新的](?:帧|步|秒)|于)"
     ),
 }
-_OF_SPEED = ("speed",)
 _GOES = {
     "en": re.compile(
         r"\b(?:walk|head|mov|go|run|stroll|jog|march|ambl|wander|cross|cut|pass|com|step|sprint|rac|trot|hurr|strid)\w*\b(?: (?!and|then|but|nose|turn)[a-z]+){0,4}?"
