@@ -36,6 +36,9 @@ MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same 
 # Grey levels between twins, of red and blue and of brightness (honest 0.7 and 0.7), and how many times as colourful and as sharp the pictures of one may
 # be (honest 1.05); frames of a flight, for a mean to say something: of 36 honest ones twins were 1.3 grey levels and 1.08 times off.
 HUE_MOST, SHADE_MOST, TIMES_MOST, LEAST_FRAMES = 6.0, 3.0, 1.15, 40
+# How far a perturbed flight may be moved and turned for its pictures to be of one place with the clean one's: as far as the perturbation's
+# defaults go, in a ball or a cube. Honest twins of 6 m and 20 degrees were 5.7 grey levels and 1.24 times off.
+MOVED_MOST_M, TURNED_MOST_DEG = 5.2, 5.01
 SKY = ("weather", "time_of_day", "weather_params", "look")
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
 ROWS_AT_ONCE = 40_000
@@ -52,7 +55,8 @@ FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 class Summary:
     """What is kept of a flight to compare it with others. rows_file: of its rows. frames_digest: of the indices of its frames, the first three
     of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none. kinds, look: as Shown has
-    them; sky: what its first row says of weather and light; kept_places_m: where the person is in the frames that are kept (`places.py`)."""
+    them; strays: it is moved or turned farther from its plan than MOVED_MOST_M and TURNED_MOST_DEG; sky: what its first row says of weather
+    and light; kept_places_m: where the person is in the frames that are kept (`places.py`)."""
 
     name: str
     rows_file: str
@@ -68,6 +72,7 @@ class Summary:
     way_digest: str
     kinds: list[int]
     look: list[float]
+    strays: bool
     sky: str
     kept_places_m: list[list[float]]
 
@@ -101,9 +106,15 @@ def summary_of(flight: FlightRows, shown: Shown, rows: RowFiles, rows_file: str)
         track=first.get("track"), town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight),
         first_frames=flight.index[:3].tolist(), frames_digest=frames_digest(flight.index),
         way_digest=hashlib.sha256(way.tobytes()).hexdigest() if (way != way[0]).any() else "",
-        kinds=shown.kinds, look=shown.look, sky=json.dumps([flight.rows[0].get(name) for name in SKY]),
+        kinds=shown.kinds, look=shown.look, strays=_strays(flight), sky=json.dumps([flight.rows[0].get(name) for name in SKY]),
         kept_places_m=[flight.target_m[i, :2].tolist() for i, _ in shown.kept],
     )  # fmt: skip
+
+
+def _strays(flight: FlightRows) -> bool:
+    is_moved = np.linalg.norm(flight.drone_offset[:, :3], axis=1) > MOVED_MOST_M
+    is_turned = np.abs(flight.drone_offset[:, 3:]) > TURNED_MOST_DEG
+    return bool(is_moved.any() or is_turned.any())
 
 
 def frames_digest(indices: np.ndarray) -> str:
@@ -315,7 +326,7 @@ def _check_looks(flights: Mapping[str, Summary], findings: Findings) -> None:
     """Twins see one place under one sky, in about the same colours, as bright and as sharp."""
     for flight in flights.values():
         twin = flights.get(flight.pair or "")
-        if twin is None or flight.track == "clean" or not (flight.look and twin.look) or (flight.sky, flight.frames_digest) != (twin.sky, twin.frames_digest):  # fmt: skip
+        if twin is None or flight.track == "clean" or flight.strays or not (flight.look and twin.look) or (flight.sky, flight.frames_digest) != (twin.sky, twin.frames_digest):  # fmt: skip
             continue
         where = f"{flight.name} and {twin.name}"
         red, blue, shade = np.abs(np.subtract(flight.look, twin.look))[2:].tolist()
