@@ -174,6 +174,22 @@ def test_a_run_goes_on_by_its_folder_or_its_own_settings(base, tmp_path, monkeyp
     assert asked == [(2, run), (2, tmp_path / "new")]
 
 
+@pytest.mark.parametrize(
+    ("config", "begun"),
+    [("", ()), ("", ("one/maps",)), ("run.yaml", ("one/maps",))],
+    ids=["nothing", "town", "settings"],
+)
+def test_a_run_that_was_killed_goes_on_in_its_folder_whatever_is_begun(tmp_path, monkeypatch, config, begun):
+    """Before its first stage, or of towns before their release, no stage stands beside run.yaml."""
+    (tmp_path / "run.yaml").write_text("towns: {one: {}, two: {}}\n")
+    for stage in begun:
+        write_json(tmp_path / stage / "stage.json", {})
+    asked = []
+    monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append(out) or [])
+    assert CliRunner().invoke(app, ["run", str(tmp_path / config)]).exit_code == 0
+    assert asked == [tmp_path]
+
+
 def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_path):
     beside = base.parent / "other"
     rates = rates_near(beside)

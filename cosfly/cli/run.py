@@ -42,11 +42,12 @@ def run(
     """Make a data set from a configuration: all stages in order. Run it again, or with the run's folder, to continue."""
     from cosfly import pipeline
 
-    if (config / "run.yaml").is_file():
+    is_folder = (config / "run.yaml").is_file()
+    if is_folder:
         config = config / "run.yaml"
-    if out is None and config.name == "run.yaml" and any(config.parent.glob("*/stage.json")):
-        out = config.parent  # the settings of that run: it goes on
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
+    if out is None and (is_folder or _is_begun(config, cfg)):
+        out = config.parent  # the settings of that run: it goes on
     out = out or Path("runs") / cfg.name
     if dry_run:
         pipeline.check_out(out)
@@ -59,6 +60,12 @@ def run(
     results = pipeline.run(cfg, out, resume=resume)
     _closing_table(results, out)
     options.check_failures({r.stage.name: r.manifest.counts for r in results}, out, cfg)
+
+
+def _is_begun(config: Path, cfg: RunConfig) -> bool:
+    """Tell whether stages of a run, or of its towns, stand beside its settings."""
+    places = [config.parent, *(config.parent / town for town in cfg.towns)]
+    return config.name == "run.yaml" and any(any(place.glob("*/stage.json")) for place in places)
 
 
 def _tell_estimate(cfg: RunConfig, out: Path) -> None:
