@@ -339,9 +339,10 @@ def _taken_up(
     found = read_stage_record(out)
     # An attempt that ended before anything was finished binds nobody to its settings, unless it grew from what was.
     if not _holds_work(out) and not found.grown_from:
-        # stage.json last: without it a kill on the way would leave what looks like somebody else's files.
-        for name in reversed(BEGUN):
-            (out / name).unlink(missing_ok=True)
+        # stage.json stays until the new one is written: without it a kill would leave what looks like somebody else's files.
+        for name in BEGUN:
+            if name != "stage.json":
+                (out / name).unlink(missing_ok=True)
         return record
     differences, grown = _may_continue(out, record, config, resume, grows)
     before = list(found.grown_from)

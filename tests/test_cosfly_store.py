@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from cosfly import store
+from cosfly import stage_folder, store
 from cosfly.config import Config, MayDiffer
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.folder_lock import give_up
@@ -336,6 +336,23 @@ def test_a_lock_that_a_kill_left_in_a_finished_folder_goes(tmp_path):
     (out / ".lock").write_text("{}")
     assert _open(out).is_complete
     assert not (out / ".lock").exists()
+
+
+@pytest.mark.parametrize("left", [".preflight.json.1.partial", "answers"])
+def test_two_kills_before_anything_is_finished_leave_a_folder_to_go_on_with(tmp_path, monkeypatch, left):
+    """The first while a file was begun, or a folder made for some; the second before the record stood again."""
+    stage = _open(tmp_path / "out")
+    (stage.path / left).mkdir()
+    give_up(tmp_path)
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stage_folder, "write_model", killed)
+        with pytest.raises(KeyboardInterrupt):
+            _open(tmp_path / "out")
+    assert not _open(tmp_path / "out").is_complete
 
 
 def test_a_kill_while_an_attempt_without_work_is_cleared_away_leaves_a_folder_to_go_on_with(tmp_path, monkeypatch):
