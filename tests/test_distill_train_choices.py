@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -191,6 +192,15 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
     weights.write_bytes(weights.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
         run(place, out, **settings)
+
+
+def test_checkpoints_that_a_kill_after_the_last_one_left_are_dropped(place, tmp_path):
+    out, settings = tmp_path / "out", {"save_every_steps": 1, "keep_checkpoints": 1, "max_steps": 2}
+    run(place, out, **settings)
+    shutil.copytree(out / "checkpoints/step_00000002", out / "checkpoints/step_00000001")
+    (out / "manifest.json").unlink()
+    run(place, out, **settings)
+    assert [path.name for path in (out / "checkpoints").iterdir()] == ["step_00000002"]
 
 
 # --- before the first step --------------------------------------------------------------------------------------------

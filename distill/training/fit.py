@@ -166,6 +166,8 @@ def fit(lesson: Lesson, out: Path) -> Progress:
             log.info("%s: before the first step: %s", STAGE, found)
         if not progress.has_ended:
             progress = _run_steps(lesson, optimizer, progress, out, note)
+    # Once more: a kill may have come between the last checkpoint and the end of those before it.
+    ranks.first_does(partial(drop_old_checkpoints, folder, cfg.keep_checkpoints, progress.best_step))
     best = checkpoint_path(folder, progress.best_step)
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
         ranks.first_does(partial(check_whole, best))
