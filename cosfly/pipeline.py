@@ -125,14 +125,15 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
 @contextlib.contextmanager
 def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
     """Hold a run folder, and keep `run.yaml` in it: other settings replace it when every stage has taken them, not before."""
-    with hold_folder(out, nothing=("run.yaml",)):
+    stood = (out / "run.yaml").exists()
+    with hold_folder(out, nothing=() if stood else ("run.yaml",)):
         is_new = not (out / "run.yaml").exists()
         if is_new:
             _save_run(cfg, out)
         try:
             yield
         except BaseException:
-            give_up(out)  # so that a run that was refused before anything was done leaves nothing
+            give_up(out)  # so that a run that was refused before anything was done leaves nothing of its own
             raise
         if not is_new:
             _save_run(cfg, out)

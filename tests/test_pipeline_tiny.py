@@ -190,6 +190,12 @@ def test_a_run_that_was_killed_goes_on_in_its_folder_whatever_is_begun(tmp_path,
     assert asked == [tmp_path]
 
 
+def test_settings_that_stood_in_a_folder_stay_when_the_run_is_refused_before_anything_is_done(tmp_path):
+    (tmp_path / "run.yaml").write_text("maps: {source: boxes, boxes: {path: gone.csv, licence: mit}}\n")
+    assert CliRunner().invoke(app, ["run", str(tmp_path)]).exit_code == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run.yaml"]
+
+
 def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_path):
     beside = base.parent / "other"
     rates = rates_near(beside)
