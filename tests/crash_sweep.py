@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import pkgutil
 import shutil
 import tempfile
@@ -19,11 +20,16 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+from zlib import crc32
 
 from crashes import run, sweep
 
 from cosfly import ahead
 from cosfly.cli import app
+
+if TYPE_CHECKING:
+    from teacher_server import TeacherServer
 
 TINY = (
     "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1", "pedestrians.min_distance_m=8",
@@ -61,7 +67,8 @@ def command(words: list[str]) -> None:
         raise SystemExit(code)
 
 
-OF_STAGES = ("run", "run, more")  # whose steps in the folders of stages are those of the stages' own commands
+# Of runs the files that are swept, a pattern: steps in the folders of stages are those of the stages' own commands.
+OWN = {"run": r"[^/]*", "run, more": r"[^/]*", "run, towns": r"((one|two)/)?\.?\w+\.\w+|one|two|\.lock|process"}
 
 
 def load_all() -> None:
@@ -108,10 +115,27 @@ def _older(place: Place) -> Path:
     return make_older(make_playback_tree(place.root / "newer", num_flights=1, num_points=7), place.root / "older")
 
 
-def _teacher(place: Place) -> str:
+def _chat_server(place: Place) -> TeacherServer:
     from teacher_server import TeacherServer
 
-    return place.stack.enter_context(TeacherServer()).url
+    server = place.stack.enter_context(TeacherServer())
+    server._server.handle_error = lambda *_: None  # type: ignore[method-assign]  # of one that asked and was killed
+    return server
+
+
+def _teacher(place: Place) -> str:
+    return _chat_server(place).url
+
+
+def _judge(place: Place) -> str:
+    """A judge with all three verdicts, always the same one of a case."""
+    from caption.truth.judge import JUDGEMENTS
+
+    server = _chat_server(place)
+    server.text = lambda body: json.dumps(
+        {"verdict": JUDGEMENTS[crc32(json.dumps(body["messages"]).encode()) % len(JUDGEMENTS)], "reason": "because"}
+    )
+    return server.url
 
 
 def _served(place: Place) -> str:
@@ -123,7 +147,7 @@ def _served(place: Place) -> str:
 
 
 INPUTS: dict[str, Callable[[Place], object]] = {
-    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "older": _older, "teacher": _teacher, "served": _served,
+    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "older": _older, "teacher": _teacher, "judge": _judge, "served": _served,
 }  # fmt: skip
 
 TRAINING = [
@@ -136,6 +160,7 @@ MAPS, TRACES = "{base}/maps/boxes_3d.json", "{base}/plan/drone_trace.json"
 SIMPLE, WALKS, TREE = "{base}/simplify/step2_simplified.json", "{base}/pedestrians/path.json", "{base}/render"
 DATASET = "{base}/release/dataset"
 THREE = ["--map", MAPS, "--simplified", SIMPLE, "--traces", TRACES, *SETTINGS]
+TOWNS = "towns={one: {}, two: {maps: {synthetic: {parked_share: 0.0}}}}"
 FLIGHTS = "Town_SynthTown/trajectory_1593759126"  # of the walk that the seed gives
 
 
@@ -145,6 +170,12 @@ def copy_stage(place: Place, out: Path, stage: str, *, damaged: str | None = Non
     if damaged is not None:
         data = (out / damaged).read_bytes()
         (out / damaged).write_bytes(data[:-9] + b"?" + data[-8:])
+
+
+def lose_release(_: Place, out: Path) -> None:
+    """Make of a finished run of towns one of which only the release is left to do."""
+    shutil.rmtree(out / "release")
+    (out / "summary.json").unlink()
 
 
 # Commands by name; {out} is what is watched, other braces are INPUTS. Several: one after the other in the same folder; a function is what comes before.
@@ -178,6 +209,10 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
     "caption": [["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
     "caption, limited": [["caption", "--data", TREE, "--out", "{out}", "--limit", "2", *SETTINGS], ["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
     "caption, served": [["caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--set", "caption.endpoint.concurrency=1", "--no-check", *SETTINGS]],
+    "caption, judged": [[
+        "caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--judge", "{judge}", "--set", "caption.endpoint.concurrency=1",
+        "--set", "caption.judge.concurrency=1", "--no-check", *SETTINGS,
+    ]],
     "caption prompts": [["caption", "prompts", "--export", "{out}/prompts"]],
     "caption actions": [["caption", "actions", "--export", "{out}/actions.yaml"]],
     "compare-strategies": [["caption", "compare-strategies", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--conflicts", "2", *SETTINGS]],
@@ -206,6 +241,8 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
     "distill report": [["distill", "report", "{evaluated}", "--out", "{out}"]],
     "run": [["run", "quickstart", "--out", "{out}", *SETTINGS]],
     "run, more": [["run", "quickstart", "--out", "{out}", *SETTINGS], ["run", "{out}", "--set", "pedestrians.num_paths=2"]],
+    "run, towns": [["run", "quickstart", "--out", "{out}", *SETTINGS, "--set", TOWNS]],
+    "run, towns, release": [["run", "quickstart", "--out", "{out}", *SETTINGS, "--set", TOWNS], lose_release, ["run", "{out}"]],
 }  # fmt: skip
 
 
@@ -241,7 +278,7 @@ def main() -> None:
             begin_s = time.monotonic()
             try:
                 swept = sweep(
-                    works(name, place), place.root, few=asked.few, twice=asked.twice, inside=name not in OF_STAGES
+                    works(name, place), place.root, few=asked.few, twice=asked.twice, only=OWN.get(name, ".*")
                 )
             except AssertionError as error:
                 print(f"{name}: does not run undisturbed: {error}", flush=True)

@@ -292,14 +292,14 @@ class Swept:
 
 
 def sweep(
-    works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False, inside: bool = True
+    works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False, only: str = ".*"
 ) -> Swept:
     """Kill a command at its steps, run it again after each, and compare what it made with what an undisturbed run makes.
 
     Args:
         works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done their work.
         few: at some of the steps, see `chosen`. twice: also the run that goes on is killed, at some step.
-        inside: also at steps in folders of the folder.
+        only: a pattern of the paths at whose steps it is killed.
     """
     out, whole, begun, rng = root / "out", root / "whole", root / "begun", random.Random(0)
     for folder in (out, whole, begun):
@@ -312,7 +312,7 @@ def sweep(
     out.rename(whole)
     expected, swept = contents(whole), Swept(len(steps), 0, [])
     for moment in chosen(steps, few=few):
-        if not inside and "/" in moment.kind[1]:
+        if not re.fullmatch(only, moment.kind[1]):
             continue
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(begun, out)
