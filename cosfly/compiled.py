@@ -22,17 +22,17 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
-from numba import boolean, int64
+from numba import boolean, extending, int64, types
 from numba.core import event
 
 from cosfly.reading.files import read_bytes
 
-__all__ = ["boolean", "int64", "njit", "words_of"]
+__all__ = ["boolean", "int64", "njit", "put_word", "word_at"]
 
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).parent
+intrinsic: Any = extending.intrinsic  # of what it decorates, callers do not give the first argument
 UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
 
 
@@ -41,9 +41,28 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
     return numba.njit(no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
 
 
-def words_of(data: np.ndarray) -> np.ndarray:
-    """Give the eight bytes from each place of (n,) uint8 on as one number, least byte first, (n - 7,) uint64 in the same memory."""
-    return np.ndarray(max(len(data) - 7, 0), "<u8", data.data, strides=(1,))
+@intrinsic
+def word_at(typing: Any, address: Any) -> Any:
+    """In compiled code: the eight bytes from an address (`array.ctypes.data`) on as one uint64, least byte first. Nobody looks whether they are
+    the array's; and an array that is named no more after that may be gone."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.inttoptr(args[0], context.get_value_type(types.CPointer(types.uint64)))
+        return context.data_model_manager[types.uint64].load_from_data_pointer(builder, place, align=1)
+
+    return types.uint64(types.uint64), codegen
+
+
+@intrinsic
+def put_word(typing: Any, address: Any, word: Any) -> Any:
+    """In compiled code: write eight bytes from an address on, as `word_at` reads them."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.inttoptr(args[0], context.get_value_type(types.CPointer(types.uint64)))
+        builder.store(args[1], place, align=1)
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, types.uint64), codegen
 
 
 def sources_digest(package: Path) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import njit, words_of
+from cosfly.compiled import njit, put_word, word_at
 from cosfly.png.checksum import adler32
 from cosfly.png.huffman import (
     BASE_LENGTH,
@@ -59,7 +59,7 @@ def deflate(lines: np.ndarray, near: int, above: int, num_bands: int = 1) -> lis
     )
     out[:2] = 0x78, 0x01
     bounds = band_rows(len(lines), num_bands) * lines.shape[1]
-    ends = _pack(data, words_of(data), bounds, near, above if above < WINDOW else 0, words_of(out))
+    ends = _pack(data, bounds, near, above if above < WINDOW else 0, out)
     end = ends[-1] + 4
     out[end - 4 : end] = np.frombuffer(adler32(lines).to_bytes(4, "big"), np.uint8)
     ends[-1] = end
@@ -67,7 +67,7 @@ def deflate(lines: np.ndarray, near: int, above: int, num_bands: int = 1) -> lis
 
 
 @njit(cache=True, nogil=True)
-def _pack(data, words, bounds, near, above, out):  # type: ignore[no-untyped-def]
+def _pack(data, bounds, near, above, out):  # type: ignore[no-untyped-def]
     """Write the blocks of all bands, from the third byte of `out` on; gives 0 and where they end. data: the rows and eight bytes more."""
     repeats, counts = np.empty((BLOCK_SYMBOLS, 2), np.int64), np.zeros(MOST_LITERALS, np.int64)
     num_bands = len(bounds) - 1
@@ -85,21 +85,19 @@ def _pack(data, words, bounds, near, above, out):  # type: ignore[no-untyped-def
         at, size = bounds[band], bounds[band + 1]
         while at < size:
             begin = at
-            at, num = _find(data, words, begin, bounds[band], size, near, above, repeats, counts)
+            at, num = _find(data, begin, bounds[band], size, near, above, repeats, counts)
             counts[END] = 1
             lengths = code_lengths(counts, np.int64(LOOK_BITS))
             is_last = band == num_bands - 1 and at == size
             place, hold, held = _put(np.int64(is_last) | 2 << 1, np.int64(3), out, place, hold, held)
             place, hold, held = _write_lengths(lengths, ways, out, place, hold, held)
             codes = codes_of(lengths)
-            place, hold, held = _write_symbols(
-                data, words, begin, at, repeats[:num], codes, lengths, tails, out, place, hold, held
-            )
+            place, hold, held = _write_symbols(data, begin, at, repeats[:num], codes, lengths, tails, out, place, hold, held)  # fmt: skip
             place, hold, held = _put(codes[END], lengths[END], out, place, hold, held)
         if band < num_bands - 1:
             place, hold, held = _put(np.int64(0), np.int64(3), out, place, hold, held)
             place, hold, held = place + (held + 7 >> 3), np.uint64(0), np.int64(0)
-            out[place] = np.uint64(0xFFFF0000)
+            put_word(out.ctypes.data + np.uint64(place), np.uint64(0xFFFF0000))
             place += len(BAND_END)
         ends[band + 1] = place
     ends[num_bands] += held + 7 >> 3
@@ -116,12 +114,13 @@ def _way_of(back):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find(data, words, at, first, size, near, above, repeats, counts):  # type: ignore[no-untyped-def]
+def _find(data, at, first, size, near, above, repeats, counts):  # type: ignore[no-untyped-def]
     """Find the repetitions of a block and count its symbols: bytes that none of them holds stand for themselves. Gives how far it came, and how many they are.
 
     Of a repetition `repeats` gets its place and its length with its marks.
     """
     counts.fill(0)
+    data_at = np.int64(data.ctypes.data)
     n, num = np.int64(0), np.int64(0)  # of symbols, and of repetitions among them
     # Four literals together, each counted in a table of its own: an addition to what was written just now waits for it.
     kinds = np.zeros((4, 256), np.uint32)
@@ -132,8 +131,8 @@ def _find(data, words, at, first, size, near, above, repeats, counts):  # type: 
             # Where the fourth byte from here differs from its pixel before, none of these four begins a repetition, and rarely where it does not.
             here, end = np.uint64(at), np.uint64(max(min(size, at + BLOCK_SYMBOLS - n) - 4, 0))
             while here <= end:
-                word = words[here]
-                differs = word ^ words[here - back]
+                word = word_at(np.uint64(data_at) + here)
+                differs = word ^ word_at(np.uint64(data_at) + here - back)
                 if differs & FOURTH == 0:
                     # Of eight bytes each that is as before has its top bit here; four in a row make a repetition.
                     same = ~(((differs & LOW_BITS) + LOW_BITS) | differs | LOW_BITS)
@@ -149,10 +148,11 @@ def _find(data, words, at, first, size, near, above, repeats, counts):  # type: 
             if at == size or n == BLOCK_SYMBOLS:
                 break
         length, marks = np.int64(0), np.int64(0)
-        if at - first >= near and (words[at] ^ words[at - near]) & FIRST_FOUR == 0:
-            length = _num_same(data, words, at, near, size)
-        if above > 0 and at - first >= above and length < LONGEST and words[at] == words[at - above]:
-            other = _num_same(data, words, at, above, size)
+        if at - first >= near and (word_at(data_at + at) ^ word_at(data_at + at - near)) & FIRST_FOUR == 0:
+            length = _num_same(data, at, near, size)
+        is_above = above > 0 and at - first >= above and length < LONGEST
+        if is_above and word_at(data_at + at) == word_at(data_at + at - above):
+            other = _num_same(data, at, above, size)
             if other > length + 2:  # whose way back is so much longer
                 length, marks = other, IS_ABOVE
         if length >= SHORTEST:
@@ -170,11 +170,11 @@ def _find(data, words, at, first, size, near, above, repeats, counts):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _num_same(data, words, at, back, size):  # type: ignore[no-untyped-def]
+def _num_same(data, at, back, size):  # type: ignore[no-untyped-def]
     """How many bytes repeat those `back` before them."""
     most = min(np.int64(LONGEST), size - at)
-    n = np.int64(0)
-    while n + 8 <= most and words[at + n] == words[at + n - back]:
+    n, place = np.int64(0), np.int64(data.ctypes.data) + at
+    while n + 8 <= most and word_at(place + n) == word_at(place + n - back):
         n += 8
     while n < most and data[at + n] == data[at + n - back]:
         n += 1
@@ -186,7 +186,7 @@ def _put(value, num_bits, out, place, hold, held):  # type: ignore[no-untyped-de
     """Write up to 56 bits."""
     hold |= np.uint64(value) << np.uint64(held)
     held += num_bits
-    out[place] = hold
+    put_word(out.ctypes.data + np.uint64(place), hold)
     return place + (held >> 3), hold >> np.uint64(held & ~7), held & 7
 
 
@@ -210,10 +210,10 @@ def _write_lengths(lengths, ways, out, place, hold, held):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True)
-def _write_symbols(data, words, at, stop, repeats, codes, lengths, tails, out, place, hold, held):  # type: ignore[no-untyped-def]
+def _write_symbols(data, at, stop, repeats, codes, lengths, tails, out, place, hold, held):  # type: ignore[no-untyped-def]
     """Write the bytes from `at` to `stop`. tails: what follows the length of a repetition of the pixel before, its bits; the same of the one above."""
     near_tail, near_bits, above_tail, above_bits = tails
-    entries = np.empty(256, np.uint64)
+    data_at, entries = np.uint64(data.ctypes.data), np.empty(256, np.uint64)
     for s in range(256):
         entries[s] = codes[s] << 4 | lengths[s]
     four, low, byte = np.uint64(4), np.uint64(15), np.uint64(255)
@@ -222,7 +222,7 @@ def _write_symbols(data, words, at, stop, repeats, codes, lengths, tails, out, p
         end = repeats[k, 0] if k < len(repeats) else stop
         here, fours = np.uint64(at), np.uint64(at + (end - at) // 4 * 4)
         while here < fours:  # four literals together
-            word = words[here]
+            word = word_at(data_at + here)
             w, x = entries[word & byte], entries[word >> eight & byte]
             y, z = entries[word >> sixteen & byte], entries[word >> last & byte]
             first = w >> four | x >> four << (w & low)

@@ -151,7 +151,7 @@ def fill_fixed(tables, symbols, limits, rows, lengths):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def find_runs(table, runs):  # type: ignore[no-untyped-def]
-    """Of the next bits, the up to three literals that they begin with: bits, how many (16s), the bytes (256s); 0 where there is none."""
+    """Of the next bits, the up to three literals that they begin with: the bytes, bits (RUN_BITS), how many (64s of these); 0 where there is none."""
     for at in range(len(table)):
         word, used, num, rest = np.int64(0), np.int64(0), 0, np.int64(at)
         while num < MOST_AT_ONCE:
@@ -159,9 +159,9 @@ def find_runs(table, runs):  # type: ignore[no-untyped-def]
             width = entry & 15
             if entry == 0 or entry >> 4 >= END or used + width > LOOK_BITS:
                 break
-            word |= entry >> 4 << (8 + 8 * num)
+            word |= entry >> 4 << 8 * num
             used, num, rest = used + width, num + 1, rest >> width
-        runs[at] = word | num << 4 | used
+        runs[at] = word | (num << 6 | used) << 24
 
 
 @njit(cache=True, nogil=True, inline="always")
