@@ -171,10 +171,16 @@ def _undone(lines, channels):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _undone_alone(lines, first, wanted, channels):  # type: ignore[no-untyped-def]
-    """Undo some rows, (k, w * channels): of each those from its first on, as it leans on these."""
-    found = np.empty((len(wanted), lines.shape[1] - 1), np.uint8)
-    for k in range(len(wanted)):
-        found[k] = _undone(lines[first[k] : wanted[k] + 1], channels)[-1]
+    """Undo some rows, (k, w * channels): of each those from its first on, as it leans on these, and once for all that lean on one first."""
+    found, k = np.empty((len(wanted), lines.shape[1] - 1), np.uint8), 0
+    while k < len(wanted):
+        end = k + 1
+        while end < len(wanted) and first[end] == first[k]:
+            end += 1
+        undone = _undone(lines[first[k] : wanted[k:end].max() + 1], channels)
+        for i in range(k, end):
+            found[i] = undone[wanted[i] - first[k]]
+        k = end
     return found
 
 
