@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from caption.own_files import keep_own_files, own_files, package_files
@@ -17,7 +17,7 @@ from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quara
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
 from caption.run.report import write_page
-from caption.schema import CaptionConfig
+from caption.schema import CaptionConfig, Window
 from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
@@ -26,7 +26,7 @@ from caption.window_loop import caption_window
 from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, ResumeError, TeacherError
-from cosfly.products.captions import caption_lines, write_caption_lines, write_captions
+from cosfly.products.captions import caption_lines, line_of, write_caption_lines
 from cosfly.products.places import flight_of
 from cosfly.reading.files import read_lines
 from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
@@ -220,7 +220,7 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 
     def work(item: Item) -> Outcome:
         flight: Allotted = item.payload
-        num_windows = asyncio.run(_caption_in_order(flight, teacher, cfg, stage_path))
+        num_windows = asyncio.run(caption_in_order(flight.windows(cfg), teacher, cfg, flight.part(stage_path)))
         if num_windows == 0:
             return Outcome({}, drop_reason="too_short")
         return Outcome({"windows": num_windows})
@@ -228,14 +228,18 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
     return work
 
 
-async def _caption_in_order(flight: Allotted, teacher: Teacher, cfg: CaptionConfig, stage_path: Path) -> int:
-    captions = []
-    for window in flight.windows(cfg):
-        captions.append(await caption_window(window, teacher, cfg))
+async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, part: Path) -> int:
+    """Caption the windows of a flight, one after another, and write their part; gives how many there are.
+
+    A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and again.
+    """
+    lines = []
+    for window in windows:
+        lines.append(line_of(await caption_window(window, teacher, cfg)))
         advance()
-    if captions:
-        write_captions(flight.part(stage_path), captions)
-    return len(captions)
+    if lines:
+        write_caption_lines(part, lines)
+    return len(lines)
 
 
 # --- the product ------------------------------------------------------------------------------------------------------

@@ -234,16 +234,21 @@ class Caption(BaseModel):
         return states.count("proved") / len(states) if states else None
 
 
+def line_of(caption: Caption) -> bytes:
+    """Give a caption as its line of `captions.jsonl`, end included."""
+    return to_json(caption) + b"\n"
+
+
 def write_captions(path: Path, captions: Iterable[Caption]) -> int:
     """Write `captions.jsonl` (one line per caption, in the order given) under a temporary name, then rename.
 
     Streams, so memory stays flat. Returns the number of lines.
     """
-    return write_caption_lines(path, (to_json(caption) + b"\n" for caption in captions))
+    return write_caption_lines(path, map(line_of, captions))
 
 
 def write_caption_lines(path: Path, lines: Iterable[bytes]) -> int:
-    """The same for captions that are UTF-8 text already, ends of lines included."""
+    """The same for captions that are lines already (`line_of`)."""
     count = 0
     with atomic_file(path) as file:
         for line in lines:

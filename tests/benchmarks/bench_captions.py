@@ -20,12 +20,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from caption.run.stage import run
+from caption.run.stage import caption_in_order, run
 from caption.schema import CaptionConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
-from caption.window_loop import caption_window
 from caption.windows import cut_windows
-from cosfly.products.captions import Caption, write_captions
 from specimens import FIRST_SECOND, make_flight, make_playback_tree
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
@@ -51,17 +49,12 @@ def measure_loop(num_windows: int) -> dict[str, float]:
                 flights[number % NUM_FLIGHTS], trajectory=f"trajectory_{FIRST_SECOND + number}"
             )
             start_s, start_cpu_s = time.perf_counter(), time.process_time()
-            captions = asyncio.run(_caption(flight, RuleTeacher(0)))
-            write_captions(Path(folder) / "part.jsonl", captions)
+            windows = cut_windows(flight, CFG.window)
+            count += asyncio.run(caption_in_order(windows, RuleTeacher(0), CFG, Path(folder) / "part.jsonl"))
             spent_s += time.perf_counter() - start_s
             cpu_s += time.process_time() - start_cpu_s
-            count += len(captions)
             number += 1
     return {"windows": count, "per_s": count / spent_s, "per_cpu_s": count / cpu_s, "peak_mib": peak_mib()}
-
-
-async def _caption(flight, teacher: RuleTeacher) -> list[Caption]:
-    return [await caption_window(sample, teacher, CFG) for sample in cut_windows(flight, CFG.window)]
 
 
 def measure_stage(num_windows: int) -> dict[str, float]:

@@ -1,39 +1,28 @@
 """The caption loop of several checkouts, in turns. Run: python tests/benchmarks/bench_turns.py TURNS TREE TREE...
 
 On a machine where others work too a rate alone says little, but a neighbour slows all trees alike: each is a process of its own,
-and they take turns flight by flight. Given are the CPU time per window and the median of its ratio to the first tree's.
+and they take turns of a few flights. Given are the CPU time per window and the median of its ratio to the first tree's.
 """
 
 from __future__ import annotations
 
-import asyncio
-import dataclasses
+import functools
 import importlib
 import statistics
 import subprocess
 import sys
-import time
-from pathlib import Path
 
-NUM_FLIGHTS, NUM_POINTS, WARMING = 8, 40, 16  # flights that take turns, their frames, turns that are not counted
+NUM_WINDOWS, WARMING = 500, 2  # windows of a turn, turns that are not counted
 
 
 def work(tree: str) -> None:
-    """Caption a flight for each line of input, with the code of a tree, and print the CPU time per window in us."""
+    """Caption some flights for each line of input, with the code of a tree, and print the CPU time per window in us."""
     sys.path[:0] = [tree, f"{tree}/tests/benchmarks", f"{tree}/tests"]
     bench = importlib.import_module("bench_captions")
-    made = [bench.make_flight(NUM_POINTS, seed=seed, width_px=1280, height_px=720)[0] for seed in range(NUM_FLIGHTS)]
-    teacher = bench.RuleTeacher(0)
-    loop = asyncio.new_event_loop()  # one for all, as in the stage
+    bench.make_flight = functools.cache(bench.make_flight)  # once for all turns
     print("ready", flush=True)
-    for number, _ in enumerate(sys.stdin):
-        name = f"trajectory_{bench.FIRST_SECOND + number}"
-        flight = dataclasses.replace(made[number % NUM_FLIGHTS], folder=Path("nowhere"), trajectory=name)
-        start_s = time.process_time()
-        captions = loop.run_until_complete(bench._caption(flight, teacher))
-        text = "".join(caption.model_dump_json() for caption in captions)
-        assert text
-        print((time.process_time() - start_s) / len(captions) * 1e6, flush=True)
+    for _ in sys.stdin:
+        print(1e6 / bench.measure_loop(NUM_WINDOWS)["per_cpu_s"], flush=True)
 
 
 def main(num_turns: int, trees: list[str]) -> None:
