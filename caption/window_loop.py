@@ -60,7 +60,9 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
 
 def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
     """Give what is kept of a window. reason: to drop it."""
-    observed, pictures = window.observed, question.pictures
+    observed, pictures, answered = window.observed, question.pictures, teacher.record
+    if answered.structured != loop.structured:
+        answered = answered.model_copy(update={"structured": loop.structured})
     return Caption(
         sample_id=observed.sample_id,
         town=observed.town,
@@ -73,7 +75,7 @@ def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, r
         prompt_hash=prompt_hash(question),
         picture_px=pictures.size_px,
         depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
-        teacher=teacher.record.model_copy(update={"structured": loop.structured}),
+        teacher=answered,
         usage=loop.usage,
         attempts=loop.asks,
         **loop.drafts(),

@@ -63,7 +63,8 @@ class RuleTeacher:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.record = TeacherRecord(kind="rules", model=MODEL, settings=TeacherSettings(seed=seed))
+        settings = TeacherSettings(seed=seed)
+        self.record = TeacherRecord(kind="rules", model=MODEL, settings=settings, structured="native")
         self._last: tuple[str, tuple[dict[str, str], dict[str, str]]] | None = None
 
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:

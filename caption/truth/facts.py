@@ -90,14 +90,14 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         *[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True
     )
     box_width, box_height, offset_x, offset_y = seen
-    turns_deg, flown, speed, walked, walked_m, walking_mps, walking, course = zip(
+    steps_s, turns_deg, flown, speed, walked, walked_m, walking_mps, walking, course = zip(
         *[_measure_step(before, after) for before, after in pairwise(frames)], strict=True
     )
     start = frames[0].position_m
     return Facts(
         speed_mps=(None, *speed),
         altitude_m=altitude,
-        yaw_deg=tuple([round(a, 1) + 0.0 for a in accumulate(turns_deg, initial=0.0)]),
+        yaw_deg=(0.0, *[round(a, 1) + 0.0 for a in accumulate(turns_deg)]),
         pitch_deg=pitch,
         distance_m=distance,
         slant_m=slant,
@@ -110,13 +110,13 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         visibility=visibility,
         width_px=width_px,
         height_px=height_px,
-        step_s=round(sum([after.time_s - before.time_s for before, after in pairwise(frames)]) / len(flown), 3),
+        step_s=round(sum(steps_s) / len(steps_s), 3),
         heading_deg=heading,
-        travelled_m=tuple([round(way, 1) for way in accumulate(flown, initial=0.0)]),
+        travelled_m=(0.0, *[round(way, 1) for way in accumulate(flown)]),
         displacement_m=tuple([round(math.dist(start, frame.position_m), 1) for frame in frames]),
         target_speeds_mps=(None, *walking),
         target_headings_deg=(None, *course),
-        target_travelled_m=_rounded(accumulate(walked_m, initial=0.0), 1),
+        target_travelled_m=(0.0, *_rounded(accumulate(walked_m), 1)),
         height_over_target_m=height,
         bearing_deg=bearing,
         depression_deg=depression,
@@ -166,7 +166,7 @@ def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...
     """Measure what happened between two frames.
 
     Returns:
-        turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and as the facts have them speed
+        time in s, turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and as the facts have them speed
         and heading.
     """
     step_s = after.time_s - before.time_s
@@ -178,7 +178,7 @@ def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...
     # NaN is not larger either
     heading_deg = round(math.degrees(math.atan2(y, x)), 1) + 0.0 if walking_mps > STANDING_MPS else None
     speed, walking = _rounded((flown_m / step_s, walking_mps), 2)
-    return turn_deg, flown_m, speed, (x, y), way_m, walking_mps, walking, heading_deg
+    return step_s, turn_deg, flown_m, speed, (x, y), way_m, walking_mps, walking, heading_deg
 
 
 def wrapped(angle_deg: float) -> float:

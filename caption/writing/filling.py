@@ -26,7 +26,6 @@ class Filler:
     def __init__(self, facts: Facts, decision: str, language: Language) -> None:
         self.facts, self.decision, self.language = facts, decision, language
         self._found, self._units, self._forms = facts.found, units_behind(language), words_of(language)
-        self._printed: dict[str, str] = {}
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
         """Give the plain text of a sentence."""
@@ -37,18 +36,20 @@ class Filler:
             refused = self._check_decisions(sentence)
             if refused is not None:
                 return refused
-        filled_in, printed, found, facts = [], self._printed, self._found, self.facts
-        for key, fact_key, slot, read, frame, form, words in sentence.places:
+        filled_in, found, facts = [], self._found, self.facts
+        for fact_key, slot, read, frame, form, words in sentence.places:
             if read is not None:  # a plain value of a series, which most slots are
                 series = read(facts)
                 value = series[frame] if series and frame < len(series) else None
                 if value is not None:
                     filled_in.append(form % (abs(value) if slot.is_size else value))
                     continue
-            elif words and isinstance(fact := found.get(fact_key), Fact) and fact.value in words:
-                filled_in.append(words[fact.value])
-                continue
-            printed_word = printed.get(key) or self._print(slot)
+            elif words:
+                fact = found.get(fact_key) or self._look_up(slot)
+                if isinstance(fact, Fact) and fact.value in words:
+                    filled_in.append(words[fact.value])
+                    continue
+            printed_word = self._print(slot)
             if isinstance(printed_word, Refused):
                 return printed_word
             filled_in.append(printed_word)
@@ -86,10 +87,7 @@ class Filler:
         else:
             forms = self._forms[value]
             word = forms[min(slot.form, len(forms) - 1)]
-        if slot.article:
-            word = f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}"
-        self._printed[slot.key] = word
-        return word
+        return f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}" if slot.article else word
 
     def _look_up(self, slot: Slot) -> Fact | Missing:
         found = self._found.get(slot.fact_key)  # the other language has asked for it

@@ -61,11 +61,6 @@ class Slot:
     article: str = ""
 
     @cached_property
-    def key(self) -> str:
-        """What decides how it is printed."""
-        return f"{self.name} {self.form} {self.needs_side:d} {self.is_size:d} {self.article}"
-
-    @cached_property
     def fact_key(self) -> str:
         """Name its fact among those that were looked up: one that is written otherwise is another."""
         return f"shaped {self.name}" if self.is_shaped else self.name
@@ -115,12 +110,11 @@ def has_sides(quantity: str) -> bool:
 class Place(NamedTuple):
     """A slot where it stands, and what is needed to fill it at a glance.
 
-    key: what decides how it is printed; fact_key: what it is looked up by. read, frame, form: the series of which it is a plain value,
+    fact_key: what it is looked up by. read, frame, form: the series of which it is a plain value,
     its frame, and how that is written with its unit; None where it is something else. words: how each word that may be true is
     written, but for those that ask for a closer look.
     """
 
-    key: str
     fact_key: str
     slot: Slot
     read: Callable[[Facts], Series] | None = None
@@ -209,14 +203,14 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
 def _place(slot: Slot, language: Language) -> Place:
     quantity = slot.quantity
     if slot.article:
-        return Place(slot.key, slot.fact_key, slot)
+        return Place(slot.fact_key, slot)
     if quantity is None:
         words = _words_written(language, slot.form, not (slot.is_size or slot.needs_side)) if slot.is_word else {}
-        return Place(slot.key, slot.fact_key, slot, words=words)
+        return Place(slot.fact_key, slot, words=words)
     assert slot.reference is not None
     frame = -1 if slot.reference.first is None else slot.reference.first
     form = f"%.{quantity.digits}f{units_behind(language)[quantity.unit]}"
-    return Place(slot.key, slot.fact_key, slot, quantity.read, frame, form)
+    return Place(slot.fact_key, slot, quantity.read, frame, form)
 
 
 @in_place.kept()

@@ -229,7 +229,7 @@ def _object_of(member: Any) -> dict[str, Any] | None:
 
 def _named(value: dict[str, Any], text: str, names: Collection[str], mended: list[str], is_end: bool) -> Found:
     """Spell the keys of the object that was asked for as they are asked for."""
-    if not all(key in names for key in value):
+    if not all(map(names.__contains__, value)):
         names_by_plain = {_plain(name): name for name in names}
         inner = _unwrapped(value, names_by_plain.keys())
         if inner is None:

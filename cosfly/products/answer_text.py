@@ -109,12 +109,17 @@ def parse_answer(
 def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
     if len(value) != len(names) or not all(map(value.__contains__, names)):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
-    if not all(isinstance(value[name], str) for name in FIELDS):
-        return Parsed(None, "field_not_text")
-    if not all(value[name].isprintable() or not _CONTROL.search(value[name]) for name in FIELDS):
-        value = {name: _CONTROL.sub("", text) if name in FIELDS else text for name, text in value.items()}
+    cleaned: dict[str, str] = {}
+    has_control = False
+    for name in FIELDS:
+        text = value[name]
+        if not isinstance(text, str):
+            return Parsed(None, "field_not_text")
+        if not text.isprintable() and _CONTROL.search(text):
+            text, has_control = _CONTROL.sub("", text), True
+        cleaned[name] = text.strip()
+    if has_control:
         recovered.append("control_characters")
-    cleaned = {name: value[name].strip() for name in FIELDS}
     for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items():
         problem = _problem_of(cleaned[name], language, characters)
         if problem is not None:
@@ -126,7 +131,8 @@ def _checked(value: dict[str, Any], language: Language, names: Collection[str], 
     if therefore is None and "therefore" in names:
         return Parsed(None, "therefore_not_in_closed_set")
     others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}
-    return Parsed(Coc(**{**cleaned, "flight_decision": action}), therefore=therefore, more=others)
+    cleaned["flight_decision"] = action
+    return Parsed(Coc(**cleaned), therefore=therefore, more=others)
 
 
 def _problem_of(text: str, language: Language, min_characters: int) -> str | None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic_core import to_json
 
 from cosfly.chat.contract import Usage
 from cosfly.reading.documents import model_lines
@@ -236,7 +235,9 @@ class Caption(BaseModel):
 
 def line_of(caption: Caption) -> bytes:
     """Give a caption as its line of `captions.jsonl`, end included."""
-    return to_json(caption) + b"\n"
+    return (
+        Caption.__pydantic_serializer__.to_json(caption) + b"\n"
+    )  # three quarters of the time of pydantic_core.to_json
 
 
 def write_captions(path: Path, captions: Iterable[Caption]) -> int:
