@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from caption.prepared import Prepared, prepare
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.foreign import Terms
-from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.teacher import Teacher, terms_of
-from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
+from caption.teachers.prompts import Correction, Question
+from caption.teachers.teacher import Teacher
+from caption.truth.actions import Motion, verdict_of
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.judge import Case, Judge
@@ -35,13 +36,18 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
     """
-    observed = window.observed
-    motion = measure(window.future)
-    terms = terms_of(teacher, observed.sample_id, cfg)
-    question = make_question(observed, cfg.image, terms.writing)
-    loop = _Loop(teacher, cfg, terms, motion, label_of(motion, cfg.label), judge)
+    [prepared] = prepare([window], teacher, cfg)
+    return await caption_prepared(prepared, teacher, cfg, judge)
+
+
+async def caption_prepared(
+    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
+) -> Caption:
+    """Caption a window that is prepared; as `caption_window`."""
+    window, terms, question = prepared.window, prepared.terms, prepared.question
+    loop = _Loop(teacher, cfg, terms, prepared.motion, prepared.label, judge)
     loop.checks["keyframe"] = window.keyframe
-    loop.checks["contradicted"] = contradicted_by(motion, cfg.label, loop.label)
+    loop.checks["contradicted"] = prepared.contradicted
     reason = window.problem
     if reason is None:
         try:
@@ -55,11 +61,12 @@ async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, j
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unreadable_frame"
             loop.checks["frame"] = error.what
-    return _record(window, question, teacher, loop, reason)
+    return _record(prepared, teacher, loop, reason)
 
 
-def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
+def _record(prepared: Prepared, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
     """Give what is kept of a window. reason: to drop it."""
+    window, question = prepared.window, prepared.question
     observed, pictures, answered = window.observed, question.pictures, teacher.record
     if answered.structured != loop.structured:
         answered = answered.model_copy(update={"structured": loop.structured})
@@ -72,7 +79,7 @@ def _record(window: Window, question: Question, teacher: Teacher, loop: _Loop, r
         window=list(observed.indices),
         future=list(window.future.indices),
         prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
-        prompt_hash=prompt_hash(question),
+        prompt_hash=prepared.prompt_hash,
         picture_px=pictures.size_px,
         depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
         teacher=answered,
@@ -107,11 +114,10 @@ async def try_strategy(window: Window, teacher: Teacher, cfg: CaptionConfig, str
     Raises:
         NoAnswer: the teacher gave none.
     """
-    motion = measure(window.future)
     repair = cfg.repair.model_copy(update={"strategy": strategy})
-    terms = terms_of(teacher, window.observed.sample_id, cfg)
-    loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), terms, motion, label_of(motion, cfg.label))
-    question = make_question(window.observed, cfg.image, terms.writing)
+    [prepared] = prepare([window], teacher, cfg)
+    question = prepared.question
+    loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), prepared.terms, prepared.motion, prepared.label)
     if await loop.ask_freely(question) is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:
         return None
     assert loop.english is not None

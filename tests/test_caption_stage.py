@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 from collections import Counter
@@ -9,8 +10,10 @@ from collections import Counter
 import pytest
 
 from caption.run import stage
+from caption.run.flights import allot, named_flights
 from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.teachers.teacher import RuleTeacher
 from caption.truth.actions import label_of, measure
 from caption.windows import cut_windows
 from cosfly.errors import InputError, NothingKept, ResumeError
@@ -28,6 +31,16 @@ def tree(tmp_path_factory):
 @pytest.fixture(scope="module")
 def done(tree, tmp_path_factory):
     return run(CaptionConfig(), tree, tmp_path_factory.mktemp("done") / "caption").parent
+
+
+def test_windows_prepared_a_few_at_a_time_give_the_same_bytes(tree, done, tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "WINDOWS_AT_ONCE", 4)  # of nine
+    cfg, found = CaptionConfig(), b""
+    for flight in allot(named_flights(tree), cfg)[0]:
+        part = tmp_path / flight.name
+        asyncio.run(stage.caption_in_order(flight.windows(cfg), RuleTeacher(0), cfg, part))
+        found += part.read_bytes()
+    assert found == (done / "captions.jsonl").read_bytes()
 
 
 def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):

@@ -10,9 +10,11 @@ import asyncio
 import logging
 import shutil
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 from caption.own_files import keep_own_files, own_files, package_files
+from caption.prepared import prepare
 from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
@@ -22,7 +24,7 @@ from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
-from caption.window_loop import caption_window
+from caption.window_loop import caption_prepared
 from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, ResumeError, TeacherError
@@ -39,6 +41,7 @@ log = logging.getLogger(__name__)
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
 # One folder never holds captions of two glossaries, nor of two prompts or sets of actions (own_files.py).
 PACKAGE_FILES = {"glossary": GLOSSARY_FILE}
+WINDOWS_AT_ONCE = 128  # that are prepared for a teacher that asks nobody
 
 
 def run(
@@ -229,14 +232,16 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 
 
 async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, part: Path) -> int:
-    """Caption the windows of a flight, one after another, and write their part; gives how many there are.
+    """Caption the windows of a flight in order, and write their part; gives how many there are.
 
     A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and again.
     """
-    lines = []
-    for window in windows:
-        lines.append(line_of(await caption_window(window, teacher, cfg)))
-        advance()
+    lines: list[bytes] = []
+    rest = iter(windows)
+    while some := list(islice(rest, WINDOWS_AT_ONCE)):
+        for prepared in prepare(some, teacher, cfg):
+            lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
+            advance()
     if lines:
         write_caption_lines(part, lines)
     return len(lines)

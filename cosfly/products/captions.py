@@ -235,9 +235,8 @@ class Caption(BaseModel):
 
 def line_of(caption: Caption) -> bytes:
     """Give a caption as its line of `captions.jsonl`, end included."""
-    return (
-        Caption.__pydantic_serializer__.to_json(caption) + b"\n"
-    )  # three quarters of the time of pydantic_core.to_json
+    # Three quarters of the time of pydantic_core.to_json.
+    return Caption.__pydantic_serializer__.to_json(caption) + b"\n"
 
 
 def write_captions(path: Path, captions: Iterable[Caption]) -> int:
