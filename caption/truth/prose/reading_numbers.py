@@ -12,12 +12,12 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     OVERALL,
     Context,
-    is_wide,
     times_of,
 )
 from caption.truth.prose.naming import Naming
 from caption.truth.prose.numerals import EVERY_SECOND, WAY, Numeral
 from caption.truth.prose.reading_ratios import ratio_statement
+from caption.truth.prose.rows import Rows
 from caption.truth.prose.statements import NOW, Mode, Statement
 from caption.truth.prose.sureness import Sureness
 from caption.truth.prose.timing import MEASURED, Timing
@@ -26,7 +26,6 @@ from caption.truth.prose.versus import owners_behind
 from caption.truth.prose.ways import WAYS, Ways
 
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
-_EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最")
 # A turn that is told from the window's start: its sum.
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
@@ -55,6 +54,7 @@ class NumberReader:
         self.beside = Beside(sentence, clause, context, in_scene=in_scene)
         self.sureness = Sureness(sentence, clause, context)
         self.ways, self.units = Ways(sentence, clause, self.sureness), Units(sentence, clause, context)
+        self.rows = Rows(sentence, clause, context, self.beside, self.sureness, in_scene=in_scene)
 
     def read(self) -> None:
         groups: dict[int, list[int]] = {}
@@ -122,7 +122,7 @@ class NumberReader:
             self.left_out = True
         elif "x" in joins or (joins[:1] in (["*"], ["by"], ["乘"]) and first.unit == "px"):
             in_pairs = len(members) if "x" in joins[1:] else 2
-            self._pairs(members[:in_pairs])
+            self._add_pairs(members[:in_pairs])
             for i in members[in_pairs:]:  # "21x44 px, 4 px left, 7 px up"
                 self._single([i], "number")
         elif first.unit == "percent":
@@ -137,7 +137,7 @@ class NumberReader:
         elif first.unit not in MEASURED or self._is_none(first):
             self.left_out = self.left_out or any(n.whole is not None for n in numerals)
         elif len(members) >= 3 and not {"-", "~"} & set(joins):
-            self._list(members)
+            self._add(self.rows.series(members))
         elif (
             len(members) == 2
             and joins[0] in ("-", "~", "to", "至", "到", "or", "或")
@@ -152,7 +152,7 @@ class NumberReader:
         ):
             self._single(members, "range", None)
         elif len(members) == 2 and (joins[0] == "→" or self._is_way(first, numerals[1])):
-            self._course(members[0], members[1])
+            self._add(self.rows.course(members[0], members[1]))
         else:
             for i in members:
                 self._single([i], "number")
@@ -294,6 +294,20 @@ class NumberReader:
     def _frames(self, numeral: Numeral, mode: Mode) -> tuple[int, ...] | None:
         return self.timing.frames(numeral, mode, is_extreme=bool(self.beside.aggregate(numeral)))
 
+    def _add(self, found: Statement | None) -> None:
+        """Take a row as it was read; None of one that is left out."""
+        if found is None:
+            self.left_out = True
+        else:
+            self.statements.append(found)
+
+    def _add_pairs(self, members: list[int]) -> None:
+        before = self.statements[-1] if self.statements else None
+        if before is not None and before.kind == "pair" and self.clause.has("trend"):
+            self.statements.pop()
+            members = [*before.numbers, *members]
+        self.statements.append(self.rows.pairs(members))
+
     # --- several numbers ---------------------------------------------------------------------------------------------
 
     def _join_courses(self) -> None:
@@ -305,13 +319,13 @@ class NumberReader:
             a, b = self.sentence.numerals[early.numbers[0]], self.sentence.numerals[late.numbers[0]]
             if a.unit == b.unit and self.changing.is_from_to(a, b):
                 self.statements = [s for s in self.statements if s is not early and s is not late]
-                self._course(early.numbers[0], late.numbers[0])
+                self._add(self.rows.course(early.numbers[0], late.numbers[0]))
                 continue
             if early.mode != "value" or late.mode != "value":
                 continue
             if a.unit == b.unit and self.changing.comes_after(a, b):
                 self.statements = [s for s in self.statements if s is not early and s is not late]
-                self._course(late.numbers[0], early.numbers[0])
+                self._add(self.rows.course(late.numbers[0], early.numbers[0]))
                 return
             if a.unit != b.unit or not self.timing.goes_to(b) or AFTERWARDS.search(self.text, a.end, b.start):
                 continue
@@ -320,96 +334,8 @@ class NumberReader:
                 and any(t.value.endswith(("up", "down")) for t in self.clause.of("trend") if t.start < b.start)
             ):
                 self.statements = [s for s in self.statements if s is not early and s is not late]
-                self._course(early.numbers[0], late.numbers[0])
+                self._add(self.rows.course(early.numbers[0], late.numbers[0]))
                 return
-
-    def _course(self, early: int, late: int) -> None:
-        numeral = self.sentence.numerals[late]
-        names, is_cued = self.naming.names(self.sentence.numerals[early])
-        if not is_cued:
-            names, is_cued = self.naming.names(numeral)
-        if not is_cued and self.in_scene:
-            self.left_out = True
-            return
-        others = ("dist", "alt") if numeral.unit == "mps" else ()  # "the speed has dropped back to 3.5 m/s"
-        trends = [t for t in self.clause.of("trend") if t.value.endswith(("up", "down"))]
-        trends = [t for t in trends if not t.value.startswith(others)] if others else trends
-        signs = {1 if t.value.endswith("up") else -1 for t in trends if not self.sentence.is_negated(self.clause, t)}
-        start = self.timing.adjacent_frames(self.sentence.numerals[early])
-        frames = self.timing.adjacent_frames(numeral)
-        if frames is None:
-            loose = [t for t in times_of(self.clause) if t[1] not in (start, (NOW,))]
-            is_past = self.clause.has("time", "past", "until", "max", "min") or self.context.has_past
-            later = any(t.value == "now" and t.start > numeral.end for c in self.sentence.clauses for t in c.of("time"))
-            frames = None if later or loose or (is_past and not self.clause.has("time", "now")) else (NOW,)
-        side, vertical = self.beside.side(numeral)
-        first = self.sentence.numerals[early]
-        told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
-        is_owned = names == ("speed",) or set(names) == {"target_speed", "target_mean"}
-        if is_cued and not told and (numeral.unit != "mps" or is_owned):
-            told = {names}
-        self.statements.append(
-            Statement(
-                kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral), sure_mode="value" if self.sureness.moments.beside(numeral) == NOW else "either",
-                clause=(self.clause.start, self.clause.end), names=names, numbers=(early, late), frames=frames,
-                hedge=self.beside.hedge(numeral) or self.beside.hedge(self.sentence.numerals[early]), side=side or vertical,
-                trend=signs.pop() if len(signs) == 1 else 0,
-                span=(start[0], NOW) if start is not None and len(start) == 1 else None,
-            )
-        )  # fmt: skip
-
-    def _list(self, members: list[int]) -> None:
-        names, is_cued = self.naming.names(self.sentence.numerals[members[0]])
-        if not is_cued:
-            names, is_cued = self.naming.names(self.sentence.numerals[members[-1]])
-        if not is_cued and self.in_scene:
-            self.left_out = True
-            return
-        trends = {t.value for t in self.clause.of("trend") if t.value.endswith(("up", "down"))}
-        signs = {1 if value.endswith("up") else -1 for value in trends}
-        self.statements.append(
-            Statement(
-                "list", (self.clause.start, self.clause.end), names, tuple(members), None, trend=signs.pop() if len(signs) == 1 else 0,
-                hedge=self.beside.hedge(self.sentence.numerals[members[0]]), side=self.beside.side(self.sentence.numerals[members[0 if self.language == "zh" else -1]])[0],
-            )
-        )  # fmt: skip
-
-    def _pairs(self, members: list[int]) -> None:
-        """Read "w x h", once or from one to the other."""
-        before = self.statements[-1] if self.statements else None
-        if before is not None and before.kind == "pair" and self.clause.has("trend"):
-            self.statements.pop()
-            members = [*before.numbers, *members]
-        trends = {
-            1 if t.value.endswith("up") else -1 for t in self.clause.of("trend") if t.value.endswith(("up", "down"))
-        }
-        times = times_of(self.clause)
-        is_past = self.clause.has("time", "past", "start") or self.context.has_past or is_wide(self.clause)
-        frames: tuple[int, ...] | None = None if is_past and not self.clause.has("time", "now") else (NOW,)
-        if len(members) == 2 and len(times) == 1:
-            frames = times[0][1]
-        elif (
-            self._is_beside_now()
-            or self.clause.has("time", "max", "min")
-            or _EXTREME.search(self.text, self.clause.start, self.clause.end)
-        ):
-            frames = None
-        self.statements.append(
-            Statement(
-                "pair",
-                (self.clause.start, self.clause.end),
-                numbers=tuple(members),
-                frames=frames,
-                hedge=self.beside.hedge(self.sentence.numerals[members[0]]),
-                trend=trends.pop() if len(trends) == 1 else 0,
-            )
-        )
-
-    def _is_beside_now(self) -> bool:
-        """Tell whether a clause in brackets stands beside one that tells of now: "27x59 px now (21x58 px when it came back)"."""
-        before = [c for c in self.sentence.clauses if c.end <= self.clause.start]
-        in_brackets = self.text[: self.clause.start].endswith("(")
-        return in_brackets and bool(before) and before[-1].has("time", "now") and not self.clause.has("time", "now")
 
     def _percent(self, index: int) -> None:
         numeral = self.sentence.numerals[index]
