@@ -172,12 +172,13 @@ def state_of(text: str, language: Language) -> str:
 def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_only_by_a_number_of_nothing(
     language, known, unmet, monkeypatch
 ):
-    assert state_of(known.format("18.9"), language) == "contradicted"
-    assert state_of(unmet.format("18.9"), language) == "unread"  # that of another frame
+    assert state_of(known.format("27.7"), language) == "contradicted"
+    assert state_of(unmet.format("27.7"), language) == "unread"  # the slant range
+    assert state_of(unmet.format("18.9"), language) == "contradicted"  # of another frame, and of nothing in this one
     assert state_of(unmet.format("35.0"), language) == "contradicted"
     monkeypatch.setattr(judging, "is_met", lambda *_, **__: True)
     assert (
-        state_of(unmet.format("18.9"), language) == "contradicted"
+        state_of(unmet.format("27.7"), language) == "contradicted"
     )  # it is for its wording alone that it is left unread
 
 

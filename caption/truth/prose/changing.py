@@ -29,6 +29,13 @@ _IN_LAST_STEP = {
     "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
     "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
 }  # fmt: skip
+_PER_STEP = {  # before a number, and after it
+    "en": (
+        re.compile(r"\b(?:each|every) (?:half second|step|frame) (?:(?!at |in |of |is |was |to |on )\w+ ){1,3}?(?:(?:about|roughly|around|some|almost|nearly|by) )*$"),
+        re.compile(r"\s*(?:to the )?(?:left |right |clockwise )?(?:(?:per|each|every|a|with every|with each) (?:single )?(?:half second |frame |0\.5 s )?(?:frame|step|interval|half second)\b(?! (?:ago|earlier|before|back|later))|from (?:one )?(?:frame|step) to (?:the next|frame|step)\b)"),
+    ),
+    "zh": (re.compile(r"(?:每帧|每步|每一步|每一帧|逐帧|每半秒|每0\.5\s?秒|每隔半秒)[^#,;是为在]{0,8}$"), None),
+}  # fmt: skip
 _FROM_TO = {  # what stands before the first number and between the two
     "en": (
         re.compile(r"\bfrom (?:(?:about|around|roughly|some|almost|nearly|only|just|over|under|a mere|an initial) )*$"),
@@ -91,7 +98,7 @@ class Changing:
             return "either", sign if numeral.unit != "deg" else 0
         if numeral.sign > 0 and numeral.unit in ("m", "mps"):
             return ("change", 1) if numeral.unit == "m" else ("either", 0)
-        if self._is_per_frame(numeral):
+        if self.is_per_step(numeral):
             return "change", sign if numeral.unit != "deg" else 0
         if numeral.unit == "mps" and trends and self.clause.has("quantity", "distance", "slant", "altitude", "height"):
             return "value", 0  # "the gap grows by 1 m every second"
@@ -141,19 +148,14 @@ class Changing:
             return pattern.match(self.text, numeral.end) is not None
         return pattern.search(self.text, self.clause.start, numeral.start) is not None
 
-    def _is_per_frame(self, numeral: Numeral) -> bool:
-        if self.language == "zh":
-            return (
-                re.search(r"(?:每帧|每步|每一步|每一帧|逐帧)[^#]{0,8}$", self.text[self.clause.start : numeral.start])
-                is not None
-            )
-        return (
-            re.match(
-                r"\s*(?:per|each|every|a|in each|in every) (?:single )?(?:frame|step|interval)\b",
-                self.text[numeral.end :],
-            )
-            is not None
-        )
+    def is_per_step(self, numeral: Numeral) -> bool:
+        """Tell whether a number is told of each step: "0.5 m per step", "每半秒多 0.5 米", "every half second adds 1.8 m"."""
+        if numeral.unit == "mps":
+            return False  # "1.1 m/s in every step"
+        before, after = _PER_STEP[self.language]
+        if after is not None and after.match(self.text, numeral.end):
+            return True
+        return before.search(self.text, self.clause.start, numeral.start) is not None
 
     def _is_done(self, numeral: Numeral) -> bool:
         """ "掉了 5 米", "varies by no more than 0.3 m": a change, whatever the verb."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations
 
 from caption.schema import EvidenceConfig
 from caption.truth.prose.cues import ANY
@@ -204,9 +204,12 @@ class NumberComparison:
                 is_unknown = is_unknown or (bool(s.names) and not name.startswith("rate:"))
                 continue
             ends = set(self._frames(s, name))
+            known = [(i, v) for i, v in enumerate(series) if v is not None]
+            if ends == {len(series) - 1} and series[-1] is None:
+                ends = {known[-1][0]}  # as it was last seen
             slack_first = self.slack(numeral.unit, first, step, s.hedge)
             slack_last = self.slack(numeral.unit, last, step_last, s.hedge)
-            for (i, a), (j, b) in combinations([(i, v) for i, v in enumerate(series) if v is not None], 2):
+            for (i, a), (j, b) in combinations(known, 2):
                 if s.span is not None and s.span[0] >= 0 and i != s.span[0]:
                     continue
                 if not self._are_sides(name, (a, b), replace(s, side=0)):
@@ -241,7 +244,11 @@ class NumberComparison:
             if not series:
                 is_unknown = is_unknown or bool(s.names)
                 continue
-            for values in (series, [v for v in series if v is not None], self._steps(name, series)):
+            for values in (
+                series,
+                [v for v in series if v is not None],
+                self.measured.steps(name.removeprefix("rate:")),
+            ):
                 for start in range(len(values) - count + 1):
                     part = values[start : start + count]
                     if all(v is not None and abs(abs(v) - value) <= self.slack(unit, value, step, s.hedge) * 0.5 for v, (_, value, step) in zip(part, read, strict=True)):  # fmt: skip
@@ -262,11 +269,6 @@ class NumberComparison:
         return not any(
             sign * side * (v or 0.0) < -RESOLUTION["px"] * (name[0] == "o") for side, v in zip(sides, part, strict=True)
         )
-
-    @staticmethod
-    def _steps(name: str, series: tuple[float | None, ...]) -> list[float | None]:
-        pairs = pairwise(series)
-        return [None if a is None or b is None else change(name, a, b) for a, b in pairs]
 
     def _pairs(self, s: Statement) -> bool | None:
         f = self.measured.facts

@@ -178,18 +178,17 @@ def cues_of(sentence: Sentence, clause: Clause, numeral: Numeral, owner: str) ->
     return [token for cost, token in ranked if cost <= ranked[0][0] + reach]
 
 
-_AT_SOME_STEP = ("last_step", "prev1", "prev2", "f1", "f2", "f3")
+_AT_SOME_STEP = ("now", "last_step", "prev1", "prev2", "f1", "f2", "f3")
 
 
-def without_mean(names: tuple[str, ...], sentence: Sentence, clause: Clause) -> tuple[str, ...]:
-    """Leave out the mean of the window where a number is told of one step: "in the final half second they fell back to 1.2 m/s"."""
+def tells_step(sentence: Sentence, clause: Clause) -> bool:
+    """Tell whether a clause tells of one step: "in the final half second they fell back to 1.2 m/s"."""
     at = sentence.clauses.index(clause)
     near = [
         clause,
         *(c for c in sentence.clauses[max(0, at - 1) : at] if not c.numerals and len(c.tokens) == len(c.of("time"))),
     ]
-    is_step = any(c.has("time", *_AT_SOME_STEP) for c in near) and not clause.has("time", "mean", "window")
-    return tuple([name for name in names if name != "target_mean"]) if is_step else names
+    return any(c.has("time", *_AT_SOME_STEP) for c in near) and not clause.has("time", "mean", "window")
 
 
 _STEPS = {

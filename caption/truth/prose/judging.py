@@ -118,7 +118,7 @@ def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: 
     )
     is_plain_trend = s.kind == "trend" and s.is_sure and s.is_named
     is_length = s.is_single and form.numerals[s.numbers[0]].unit == "m"
-    if is_nothing or is_speed or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
+    if is_nothing or s.is_per_step or is_speed or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
         return not cites(form.text)
     if s.kind in _NUMBERS and (numbers.is_on_wrong_side(s) or numbers.is_in_wrong_unit(s)):
         return not cites(form.text)

@@ -33,6 +33,9 @@ class NumberJudge(NumberComparison):
     def holds(self, s: Statement) -> bool | None:
         if self.is_in_wrong_unit(s):
             return False
+        if s.is_per_step:
+            return self._is_of_steps(s)
+        s = self._as_recorded(s)
         found = self.compare(s)
         if s.kind == "number" and not self._is_possible(s, is_meant=found is True):
             return None if self._is_others_turn(s) else False
@@ -61,6 +64,28 @@ class NumberJudge(NumberComparison):
         numeral = self.form.numerals[s.numbers[0]]
         is_turn = numeral.unit == "deg" and not numeral.sign and s.is_single
         return is_turn or (numeral.unit == "px" and self._is_mirrored(s))
+
+    def _as_recorded(self, s: Statement) -> Statement:
+        """A record without the target's steps tells its speed over the window for that of a step."""
+        if "target_speed" not in s.names or self._is_known("target_speed"):
+            return s
+        names, sure = (
+            tuple("target_mean" if name == "target_speed" else name for name in told)
+            for told in (s.names, s.sure_names)
+        )
+        return replace(s, names=names, sure_names=sure)
+
+    def _is_of_steps(self, s: Statement) -> bool:
+        """Tell whether a change of each step lies between the least and the largest step of a series, of any where none is named."""
+        numeral, value, step = self.read(s.numbers[0])
+        slack = max(step, RESOLUTION[numeral.unit]) + ABOUT * value * bool(s.hedge)
+        for name in s.sure_names or ANY[numeral.unit]:
+            sign = s.side * SIGNED.get(name, 0)
+            steps = [v for v in self.measured.steps(name.removeprefix("rate:")) if v is not None]
+            sizes = [abs(v) for v in steps if v * sign >= 0]
+            if sizes and min(sizes) - slack <= value <= max(sizes) + slack:
+                return True
+        return False
 
     def _is_reached_otherwise(self, s: Statement) -> bool:
         """Tell whether a value that a rise or fall ends at is one of its series, but nowhere after a lower or higher one."""
@@ -158,7 +183,8 @@ class NumberJudge(NumberComparison):
             return self._list(replace(s, names=(), trend=0)) is not False
         for numeral, value, step in map(self.read, s.numbers):
             slack = step + _ROUGHLY * value * bool(s.hedge)
-            if not self.pool.holds(value, numeral.unit, (slack, slack)):
+            frames = s.sure_frames if s.kind == "number" else None
+            if not self.pool.holds(value, numeral.unit, (slack, slack), frames=frames):
                 return False
         return True
 

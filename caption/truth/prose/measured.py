@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from itertools import combinations
+from itertools import combinations, pairwise
 
 from caption.truth.facts import Facts
 from caption.truth.references import QUANTITIES
@@ -40,6 +40,10 @@ class Measured:
             for (i, a), (j, b) in combinations(known, 2)
             if not wanted or (j in wanted if len(wanted) == 1 else i in wanted and j in wanted)
         ]
+
+    def steps(self, name: str) -> list[float | None]:
+        """Give the change of a series in each step."""
+        return [None if a is None or b is None else change(name, a, b) for a, b in pairwise(self.series(name))]
 
     def known(self, name: str) -> list[float]:
         return [v for v in self.series(name) if v is not None]

@@ -13,7 +13,7 @@ from caption.truth.prose.statements import NOW
 # Of another moment, or of a part of the window.
 _ELSEWHERE = {
     "en": re.compile(
-        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since(?! the (?!start|first|last|begin)| its?\b| we\b| they\b| he\b| she\b| our\b| both\b)|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|early|used to|did|against|versus|vs)\b|\|"
+        r"\b(?:was|were|had|from|before|earlier|after|first|then|start\w*|began|opened|previous\w*|last|until|since(?! the (?!start|first|last|begin)| its?\b| we\b| they\b| he\b| she\b| our\b| both\b)|once|peak\w*|mean|average|maximum|minimum|ago|step|steps|frames?|per|each|more|less|than|by|formerly|instead|rather|not|initial\w*|early|used to|did|against|versus|vs|as (?:high|low|fast|slow) as|for (?:an?|one|most|half))\b|\|"
     ),
     "zh": re.compile(
         r"不是|而非|先|曾|初|原|从|自(?!身|己)|由|起|回|步(?![速行伐频])|前(?!方|面)|后(?!方|面)|帧|峰|均|最|每(?!秒)|比|较|差|再|随|还|(?<![到至])了|(?<![已现])(?:升到|降到)(?!了)|增|减|\|"
@@ -21,7 +21,7 @@ _ELSEWHERE = {
 }
 _LATER = {
     "en": re.compile(
-        r"\b(?:earlier|before|ago|previously|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since|steps|frames)\b|\|"
+        r"\b(?:earlier|before|ago|previously|become|became|turned into|at first|initial\w*|in the|at the|was|were|had|per|each|less|more|than|then|later|until|since|steps|frames)\b|\|"
     ),
     "zh": re.compile(r"先|曾|初|原|前(?!方|面)|后(?!方|面)|帧|峰|均|每(?!秒)|比|较|差|再|随|起|\|"),
 }
@@ -30,6 +30,12 @@ _THEN = {
     "en": re.compile(r"[\s,;]*(?:and |but |only )?(?:then|before|afterwards?|later|until|followed)\b"),
     "zh": re.compile(r"[\s,;]*(?:然后|随后|接着|后来|之后|再)"),
 }
+# What goes on with a later moment, however far on: "the drone moved at 1.8 m/s, 7 m away; then it shot up".
+_THEN_LATER = {
+    "en": re.compile(r"(?:[,;]|\band|\bbut) then\b"),
+    "zh": re.compile(r"[,;](?:然后|随后|接着|后来|最后[^,;#]{0,3}又)"),
+}
+_NEXT = re.compile(r"\bthen\b|再|又")
 _PAST = re.compile(
     r"(?<!has )(?<!have )(?<!been )(?<!is )(?<!are )\b(?!cent(?:re|ere)d|occluded|\w*speed|need|indeed|exceed)\w{2,}ed\b|\b(?:went|came|rose|fell|flew|ran|shot|made|took)\b|了"
 )
@@ -62,6 +68,8 @@ class Moments:
             return None
         if _LATER[self.language].search(self.text, numeral.end, after) or _THEN[self.language].match(self.text, after):
             return None
+        if self.goes_on_after(numeral):
+            return None
         for time in self.clause.of("time"):
             if _is_reached(time, numeral) or _AFTER_CHANGE.search(self.text, self.clause.start, time.end + 1):
                 continue
@@ -71,6 +79,10 @@ class Moments:
             if time.start < after and not is_next and time.value not in self._todays(numeral):
                 return None
         return (NOW,) if self._is_told_of_now(numeral, is_value=is_value) else None
+
+    def goes_on_after(self, numeral: Numeral) -> bool:
+        """Tell whether the sentence tells of a later moment behind a number."""
+        return _THEN_LATER[self.language].search(self.text, numeral.end) is not None
 
     def _without_todays(self, numeral: Numeral) -> str:
         """Give what stands before a number in its clause, without the words for its own moment."""
@@ -127,6 +139,8 @@ class Moments:
         if len(times) != 1 or len(times[0][1]) != 1 or len(self._measured()) != 1:
             return None
         number = self._measured()[0]
+        if _NEXT.search(self.text, times[0][0].end, number.start):
+            return None  # "at t3, then recovered to 3.2 m/s"
         spanning = [t for t in self.clause.of("time", *_SPANNING) if not _is_reached(t, number)]
         if spanning or self.clause.has("link", "than", "from", "between"):
             return None

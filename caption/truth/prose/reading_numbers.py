@@ -180,6 +180,8 @@ class NumberReader:
             self.left_out = True
             return
         names, mode, trend = self._change(numeral, names)
+        if numeral.unit == "mps" and self.sureness.is_of_one_step(numeral):
+            names = tuple([name for name in names if name != "target_mean"])
         side, vertical = self.beside.side(numeral)
         sure_names = self.sureness.names(numeral, self.naming.told_after(numeral))
         sure_frames = self.sureness.frames(numeral)
@@ -203,6 +205,7 @@ class NumberReader:
             sure_frames=sure_frames,
             sure_mode=self.sureness.mode(numeral),
             reached=self.changing.reached(numeral),
+            is_per_step=self.changing.is_per_step(numeral),
         )
         if self.naming.is_from_origin(numeral):
             found = replace(found, names=("displacement", "target_travelled"), sure_names=())

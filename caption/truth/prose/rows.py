@@ -6,7 +6,7 @@ import re
 
 from caption.truth.prose.beside import Beside
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import Context, is_wide, times_of
+from caption.truth.prose.cues import Context, is_wide, names_of, times_of
 from caption.truth.prose.naming import Naming
 from caption.truth.prose.statements import NOW, Statement
 from caption.truth.prose.sureness import Sureness
@@ -55,11 +55,16 @@ class Rows:
         side, vertical = self.beside.side(numeral)
         first = self.sentence.numerals[early]
         told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
-        is_owned = names == ("speed",) or set(names) == {"target_speed", "target_mean"}
+        people = {*self.context.people, *(t.value for t in self.clause.of("who", "drone", "target"))}
+        goes_on = numeral.unit == "mps" and len(people) == 1 and not self.sureness.closes()
+        if goes_on and self.clause.has("quantity"):
+            names = names_of("speed", "mps", "")  # "the speed fell from 3.9 to 3.3 m/s"
+        ends_now = (bool(told) or goes_on) and frames == (NOW,) and not self.sureness.moments.goes_on_after(numeral)
+        is_owned = goes_on or names == ("speed",) or set(names) == {"target_speed", "target_mean"}
         if is_cued and not told and (numeral.unit != "mps" or is_owned):
             told = {names}
         return Statement(
-            kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral), sure_mode="value" if self.sureness.moments.beside(numeral) == NOW else "either",
+            kind="course", sure_names=told.pop() if len(told) == 1 else (), sure_frames=self.sureness.ends_of_course(first, numeral), sure_mode="value" if ends_now or self.sureness.moments.beside(numeral) == NOW else "either",
             clause=(self.clause.start, self.clause.end), names=names, numbers=(early, late), frames=frames,
             hedge=self.beside.hedge(numeral) or self.beside.hedge(self.sentence.numerals[early]), side=side or vertical,
             trend=signs.pop() if len(signs) == 1 else 0,

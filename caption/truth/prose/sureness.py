@@ -10,7 +10,7 @@ from functools import cached_property
 
 from caption.truth.prose.changing import MORE_BY, MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import GOES_TO, Context, names_of, without_mean
+from caption.truth.prose.cues import GOES_TO, Context, names_of, tells_step
 from caption.truth.prose.moments import Moments
 from caption.truth.prose.naming import OFF_CENTRE, OVER_OTHER
 from caption.truth.prose.numerals import Numeral
@@ -126,14 +126,19 @@ class Sureness:
         return derived is not None or (numeral.unit == "m" and _ALONG.match(self.text, numeral.end) is not None)
 
     def _speeds(self, numeral: Numeral) -> tuple[str, ...]:
-        if self._closes():
+        if self.closes():
             return ()
         owner, link = self.owners.owner(numeral), LINK[self.language]
         beside = any(
             t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)
             for t in self.clause.of("quantity", "speed")
         )
-        return without_mean(names_of("speed", "mps", owner), self.sentence, self.clause) if owner or beside else ()
+        names = names_of("speed", "mps", owner) if owner or beside else ()
+        return tuple([n for n in names if n != "target_mean"]) if self.is_of_one_step(numeral) else names
+
+    def is_of_one_step(self, numeral: Numeral) -> bool:
+        """Tell whether a speed is told of one step and not of the window: "1.2 m/s now", "in the final half second they fell back to 1.2 m/s"."""
+        return tells_step(self.sentence, self.clause) or self.moments.beside(numeral) is not None
 
     def _gone_on_about(self, numeral: Numeral) -> set[str]:
         """Give the one quantity of the clauses before, where this one only goes on about it: "..., now 20.3 m"."""
@@ -221,7 +226,7 @@ class Sureness:
             return ("displacement",)
         return names_of("turn" if numeral.unit == "deg" else cue, numeral.unit, owner) if owner else ()
 
-    def _closes(self) -> bool:
+    def closes(self) -> bool:
         """Tell whether a speed may be that of a climb, of an approach or a difference."""
         if _CLOSING.search(self.text, self.clause.start, self.clause.end):
             return True
@@ -234,7 +239,8 @@ class Sureness:
         if self.differs_by(numeral):
             return (NOW,)
         if self.is_in_group(numeral):
-            return None
+            beside = self.moments.beside(numeral)
+            return None if beside is None else (beside,)
         mode = self.mode(numeral)
         return self.moments.span() if mode == "change" else self.moments.frames(numeral, is_value=mode == "value")
 
