@@ -23,12 +23,18 @@ _UP_TO = {  # a word of change with what leads to its number
     ),
     "zh": re.compile(r"[^#,]{1,4}[到至](?:了)?(?:约|大约|近|将近)?\s*"),
 }
+EITHER_WAY = 2
+_GOES_TO = {  # other words that end at their number
+    "en": re.compile(r"\b(?:jump|leap|leapt|burst|shot|surge|spr[iau]ng|dash|rush|swing|swung|went|gone|move|ease|settle|relax|brake|dawdle|c[ao]me)(?:s|ed|d|ped|ing)? (?:(?:back|up|down|away|out) )*to (?:(?:about|around|roughly|some|almost|nearly|only|just|a mere|now) )*$"),
+    "zh": re.compile(r"[跳窜冲蹿飙走跑飞慢快提涨缩拉退追落回弹变开收减加](?:高|低|近|远|大|小|慢|快|速)?[到至](?:了)?(?:约|大约|近|将近)?\s*$"),
+}  # fmt: skip
 AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
 _AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _IN_LAST_STEP = {
     "en": re.compile(r"\s*(?:to the )?(?:left|right|anticlockwise|counterclockwise|clockwise)?\s*(?:in|during|over|within) (?:the |this )?(?:last|final|latest|most recent)\b"),
     "zh": re.compile(r"(?:转|偏|摆|扭|拨)(?:过|动)?了?\s*$"),
 }  # fmt: skip
+_COMES_BY = re.compile(r"\bby (?:(?:about|around|roughly|some|almost|nearly|only|just|another) )*$")
 _PER_STEP = {  # before a number, and after it
     "en": (
         re.compile(r"\b(?:each|every) (?:half second|step|frame) (?:(?!at |in |of |is |was |to |on )\w+ ){1,3}?(?:(?:about|roughly|around|some|almost|nearly|by) )*$"),
@@ -118,12 +124,12 @@ class Changing:
         return "value", 0
 
     def reached(self, numeral: Numeral) -> int:
-        """Say which way a value was reached: "slowed to 1.2 m/s", "提速到 2.4 米/秒"; 0 where that is not told."""
+        """Say which way a value was reached: "slowed to 1.2 m/s", "提速到 2.4 米/秒", EITHER_WAY for "leapt to"; 0 where that is not told."""
         if numeral.unit not in ("m", "mps", "px"):
             return 0
         trends = [t for t in self.clause.of("trend") if t.value.endswith(("up", "down")) and t.end <= numeral.start]
         if not trends or self.sentence.is_negated(self.clause, trends[-1]):
-            return 0
+            return EITHER_WAY if _GOES_TO[self.language].search(self.text, self.clause.start, numeral.start) else 0
         last = trends[-1]
         ends = _UP_TO[self.language].fullmatch(self.text, last.start, numeral.start)
         return 0 if ends is None else 1 if last.value.endswith("up") else -1
@@ -131,6 +137,10 @@ class Changing:
     def is_from_to(self, a: Numeral, b: Numeral) -> bool:
         """Tell whether two numbers stand as the ends of one way, whatever else their clause holds: "从 0.7 米/秒增到 1.1 米/秒"."""
         return self.goes_from(a) and _FROM_TO[self.language][1].fullmatch(self.text, a.end, b.start) is not None
+
+    def comes_by(self, numeral: Numeral) -> bool:
+        """Tell whether a number is the change that leads to the next: "by 1.6 m to 17.7 m"."""
+        return _COMES_BY.search(self.text, self.clause.start, numeral.start) is not None
 
     def goes_from(self, numeral: Numeral) -> bool:
         return _FROM_TO[self.language][0].search(self.text, self.clause.start, numeral.start) is not None

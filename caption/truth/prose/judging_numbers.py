@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 
 from caption.schema import EvidenceConfig
+from caption.truth.prose.changing import EITHER_WAY
 from caption.truth.prose.comparing_numbers import ABOUT, RESOLUTION, SIGNED, NumberComparison
 from caption.truth.prose.cues import ANY
 from caption.truth.prose.measured import Measured
@@ -19,6 +20,7 @@ _EXTREME = re.compile(
 _AT_FIRST = re.compile(r"\b(?:first|initially|start\w*|beg[ai]n\w*)\b|一开始|起初|最初|开头|第一步|首步")
 _TURNS = ("yaw", "target_turn", "bearing")
 _OF_TURNS = frozenset([*_TURNS, "heading", "target_heading"])
+_SPEEDS = ("speed", "target_speed", "target_mean", "speed_difference", "difference_mean")
 _WHOLE = 4  # numbers of a list that runs over the window
 _ROUGHLY = 0.04  # share of a hedged number by which it may lie from another value of the window
 
@@ -100,9 +102,25 @@ class NumberJudge(NumberComparison):
             for i, v in enumerate(known)
             if abs(v - value) <= near
         ]
+        if not places:
+            return False
         if any(i == 0 for _, i in places) and _AT_FIRST.search(self.form.text, *s.clause):
             return False  # nothing is known of before
+        if s.is_last:  # told of no other moment: it goes on no further
+            places = [(known, i) for known, i in places if not self._goes_through(known, i, s.reached, near)]
+            if not places:
+                return True
+        if s.reached == EITHER_WAY:
+            return False
         return bool(places) and not any(s.reached * (known[i] - v) > 0 for known, i in places for v in known[:i])
+
+    @staticmethod
+    def _goes_through(known: list[float], i: int, reached: int, near: float) -> bool:
+        """Tell whether a series goes on past its value at i the way that it came."""
+        if i == len(known) - 1:
+            return False
+        way = (known[i] - known[i - 1] if i else 0.0) if reached == EITHER_WAY else float(reached)
+        return (known[i + 1] - known[i]) * (1 if way > 0 else -1 if way < 0 else 0) > near
 
     def _is_others_turn(self, s: Statement) -> bool:
         """Tell whether an angle is exactly the other's turn or where the other stands, now: whose it is is often told sentences before."""
@@ -184,7 +202,8 @@ class NumberJudge(NumberComparison):
         for numeral, value, step in map(self.read, s.numbers):
             slack = step + _ROUGHLY * value * bool(s.hedge)
             frames = s.sure_frames if s.kind == "number" else None
-            if not self.pool.holds(value, numeral.unit, (slack, slack), frames=frames):
+            names = _SPEEDS if frames is not None and s.is_named and s.names and set(s.names) <= set(_SPEEDS) else ()
+            if not self.pool.holds(value, numeral.unit, (slack, slack), names, frames):
                 return False
         return True
 

@@ -126,12 +126,25 @@ class Moments:
         match = match or _MOMENT_BEFORE[self.language].search(self.text, max(0, numeral.start - _REACH), numeral.start)
         if match is not None and _IS_OF_ANOTHER.search(self.text, 0, match.start()):
             match = None
+        if match is None and (frame := self._told_after(numeral)) is not None:
+            return frame
         if match is None:
             is_now = _IS_AT[self.language].search(self.text, self.clause.start, numeral.start)
             return NOW if is_now and all(t.value == "now" for t in self.clause.of("time")) else None
         if self.language == "zh" and match.groupdict().get("first"):
             return 1 if numeral.unit == "mps" else 0
         return NOW if match["frame"] is None else int(match["frame"])
+
+    def _told_after(self, numeral: Numeral) -> int | None:
+        """Give the frame whose name follows a number: "8.0 m at the start", "3.8 m/s in the step before"."""
+        if self.language == "zh":
+            return None
+        times = times_of(self.clause)
+        near = [(t, frames) for t, frames in times if _BEHIND.fullmatch(self.text, numeral.end, t.start)]
+        if len(near) != 1 or self.clause.has("link", "than"):
+            return None
+        frames = near[0][1]
+        return frames[numeral.unit == "mps"] if len(frames) == 2 else frames[0]
 
     def _only_moment(self) -> int | None:
         """Give the one frame of a clause with one number: "at t1 the range still read 21.2 m"."""
@@ -203,8 +216,8 @@ _NTH_AFTER = re.compile(
 )
 _IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $")  # "after 1.3 m/s at t2 only 0.19 is left"
 _IS_AT = {  # what a value has come to
-    "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$"),
-    "zh": re.compile(r"已(?:经)?(?:提速?|升|降|减速?|放慢|加速|回落|收|缩|变|压)(?:到|至|为)(?:约)?\s*$"),
+    "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$|\b(?:is|are) (?:(?:\w+ly|now|already|still|just|merely) )?\w+ing (?:again |along |on |away )?at (?:(?:only|just|about|roughly|some|a mere) )*$"),
+    "zh": re.compile(r"已(?:经)?(?:提速?|升|降|减速?|放慢|加速|回落|收|缩|变|压|拉|涨|飞|走|跑|转)?(?:到|至|为|达)(?:了)?(?:约)?\s*$"),
 }  # fmt: skip
 _CAME_FROM = re.compile(r"\b(?:from|after|before|against)\b|从|自|由")
 _FROM_THEN_ON = re.compile(r"[从自]\s*t\d\s*(?:起|开始|以后|之后)|\b(?:from|since) t\d\b")
@@ -214,11 +227,12 @@ _TODAY = ("now", "window", "last_step", "last_second", "last", "last_s", "mean")
 _SPANS = {"last_step": (-2, NOW), "last_second": (-3, NOW)}
 _MOMENT_BEFORE = {
     "en": re.compile(r"(?:\bt(?P<frame>\d)|\b(?P<now>now|currently))\s*(?::|=|at|is|was|of|stands at|stood at|reads|read|about|only|just|a)*\s*$"),
-    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|现|末帧|最后一帧)|(?P<first>首帧|第一帧|起初|最初|开始时|窗口开始时))(?:的|之|所处|:|=|为|是|达到|达|约|只有|仅|曾|一度|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|\s)*$"),
+    "zh": re.compile(r"(?:t(?P<frame>\d)\s*(?:时|帧|时刻|处)?|(?P<now>现在|当前|目前|如今|此刻|眼下|这会儿|现|末帧|末步|这一步|最近一步|最后一步|最后一帧)|(?P<first>首帧|第一帧|起初|最初|开始时|窗口开始时))(?:的|之|所处|:|=|为|是|达到|达|约|只有|仅|曾|一度|还有|仍有|有|已|升到|升至|降到|降至|俯仰|高度|速度|相机|航向|又|分别|回到|落回|落到|回落到|回升到|的左偏|的右偏|剩|剩下|竟|\s)*$"),
 }  # fmt: skip
 _MOMENT_AFTER = {
     "en": re.compile(r"\s*(?:(?:to the |to )?(?:left|right|high|low|up|down)\s+(?=at t|in t))?(?:(?:\(|at |in |, at )?t(?P<frame>\d)(?!\s*(?:-|~|→|,? ?t\d|(?:to|and)\b\s*(?:at )?t\d))|(?P<now>now|at present|currently)\b(?! than))"),
     "zh": re.compile(r"\s*\(\s*t(?P<frame>\d)\s*时?\s*\)"),
 }  # fmt: skip
+_BEHIND = re.compile(r"\s*(?:(?:in|at|on|the|one|its|only|still)\s+)*")
 _REACH = 30  # letters before a number in which its frame stands
 _SPANNING = ("since", "until", "window", "last_step", "last_second", "max", "min", "mean")

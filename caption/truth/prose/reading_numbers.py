@@ -30,6 +30,10 @@ _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|acc
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
+# The same, where nothing tells of a part of the window.
+_SO_FAR = re.compile(
+    r"\b(?:so far|two seconds|(?:over|within|in|across) the (?:whole |entire )?window|has (?:now |already |itself )?(?:turned|swung|come round|come around|rotated|drifted|veered|yawed|panned))\b|两秒|窗口内|全程|迄今|已向?[左右]?(?:转|偏|摆)"
+)
 # Shares of the picture: "one per cent of the image width", "图像宽度的百分之一".
 _OF_PICTURE = {
     "en": re.compile(r"\s*of (?:the |a )?(?:image|picture|frame)(?:'s)?(?: (?:width|height))?\b"),
@@ -37,6 +41,7 @@ _OF_PICTURE = {
         r"[^#]*(?:图像|画面|图片|画幅)(?:的)?(?:宽度|高度|宽|高)的?约?[^#]{0,5}$|[^#]*(?:图像|画面)(?:宽度|高度)"
     ),
 }
+_NEAR = 14  # letters behind a number in which its moment stands
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 
 
@@ -141,6 +146,7 @@ class NumberReader:
         elif (
             len(members) == 2
             and joins[0] in ("-", "~", "to", "至", "到", "or", "或")
+            and not self.changing.comes_by(first)
             and not self.timing.comes_from(first)
             and not self._is_way(first, numerals[1])
         ):
@@ -205,6 +211,7 @@ class NumberReader:
             sure_frames=sure_frames,
             sure_mode=self.sureness.mode(numeral),
             reached=self.changing.reached(numeral),
+            is_last=not any(t.start < numeral.end + _NEAR for t, moment in times_of(self.clause) if moment != (NOW,)),
             is_per_step=self.changing.is_per_step(numeral),
         )
         if self.naming.is_from_origin(numeral):
@@ -257,11 +264,17 @@ class NumberReader:
             s = replace(s, names=("target_turn",), sure_names=("target_turn",))
         is_theirs = self.clause.has("who", "target") or self.clause.has("quantity", "target_heading")
         is_total = (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not is_theirs
-        if not is_total or not _FROM_START.search(self.text, self.clause.start, self.clause.end):
+        if not is_total or not self._is_from_start():
             return s
         named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]
         frames = (NOW,) if not named else named[0] if len(named) == 1 else None
         return replace(s, names=("yaw",), mode="value", frames=frames, sure_names=("yaw",), sure_frames=frames, sure_mode="value")  # fmt: skip
+
+    def _is_from_start(self) -> bool:
+        """Tell whether a clause tells of turns from the window's start on."""
+        if _FROM_START.search(self.text, self.clause.start, self.clause.end):
+            return True
+        return _SO_FAR.search(self.text, self.clause.start, self.clause.end) is not None and self.ways.tells_all()
 
     def _surely(self, s: Statement, numeral: Numeral) -> Statement:
         """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""

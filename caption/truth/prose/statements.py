@@ -39,7 +39,7 @@ class Statement:
     side: +1 left (or above), -1 right (or below). trend: +1 up, -1 down. word: of a visibility, state, comparison or an aggregate.
     is_sure: False for a word that may not contradict, because it is not plain. is_asserted: that it is said of some moment, whichever, is plain.
     sure_names, sure_frames, sure_mode: of a number, what the words leave no doubt of (sureness.py); empty where they leave it open.
-    operands: the numbers whose ratio is told; is_ordered: that of the first to the second, else either way. span: frames between which a change is told. reached: +1 of a value that a rise ends at, -1 a fall. negated: the opposite is stated. is_named: that its clause names what goes up or down. is_single: of a number of which the words say surely what it is, the only one of its unit in its clause. is_per_step: of a change that is told of each step. clause: for the message.
+    operands: the numbers whose ratio is told; is_ordered: that of the first to the second, else either way. span: frames between which a change is told. reached: +1 of a value that a rise ends at, -1 a fall, EITHER_WAY (changing.py) where the way is not told. negated: the opposite is stated. is_named: that its clause names what goes up or down. is_single: of a number of which the words say surely what it is, the only one of its unit in its clause. is_per_step: of a change that is told of each step. is_last: of a value that was reached and of which no moment but now is told. clause: for the message.
     """
 
     kind: Kind
@@ -66,6 +66,7 @@ class Statement:
     is_named: bool = False
     is_single: bool = False
     is_per_step: bool = False
+    is_last: bool = False
 
 
 @dataclass(frozen=True, slots=True)

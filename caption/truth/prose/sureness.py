@@ -247,6 +247,8 @@ class Sureness:
     def ends_of_course(self, first: Numeral, last: Numeral) -> tuple[int, ...] | None:
         """Give the frames of "from A at t1 to B now" or "from A to B in the last step", where both are told."""
         found = [self.moments.beside(n) for n in (first, last)]
+        if found[1] is None and _LATER.search(self.text, last.end, self.clause.end):
+            return None  # "dipping to 18.3 m at the middle frame and back up to 22.2 m half a second later"
         if found[0] is not None:
             return None if found[0] == found[1] else (found[0], NOW if found[1] is None else found[1])
         told = self.clause
@@ -317,6 +319,7 @@ class Sureness:
         return self._follows_trend(numeral)
 
 
+_LATER = re.compile(r"\blater\b|之后|以后")
 _SIDED = re.compile(r"[左右上下](?:方|侧|边|偏|移)?\s*$")
 _DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|[,;(]\s*that is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
 _ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")

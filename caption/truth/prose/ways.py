@@ -59,7 +59,7 @@ class Ways:
         """Tell whether the sentence names the last step or the last second."""
         return any(clause.has("time", "last_step", "last_second", "last_s") for clause in self.sentence.clauses)
 
-    def _tells_all(self) -> bool:
+    def tells_all(self) -> bool:
         """Tell whether a sentence names no part of the window and no other moment than now: its ways are those of the whole."""
         told = _IN_ALL[self.language].sub("", self.text)
         return not _IN_PART[self.language].search(told) and not any(
@@ -76,7 +76,7 @@ class Ways:
         is_told = set(names) <= WAYS if names else _GOES[self.language].search(self.text[: numeral.start])
         if not is_told or numeral.unit != "m":
             return ()
-        if self.sureness.is_in_group(numeral) or not self._tells_all():
+        if self.sureness.is_in_group(numeral) or not self.tells_all():
             return ()
         people = self.clause.of("who", "drone", "target")
         named = {self.text[t.start : t.end] for t in people} - _PRONOUNS
