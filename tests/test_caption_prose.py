@@ -165,20 +165,20 @@ def state_of(text: str, language: Language) -> str:
 @pytest.mark.parametrize(
     ("language", "known", "unmet"),
     [
-        ("en", "Altitude {} m and distance 19.7 m.", "Matinee altitude {} m and tombola distance 19.7 m."),
-        ("zh", "高度{}米和距离19.7米。", "戏台高度{}米和锣鼓距离19.7米。"),
+        ("en", "Box width {} px and altitude 20.4 m.", "Matinee box width {} px and tombola altitude 20.4 m."),
+        ("zh", "框宽{}像素和高度20.4米。", "戏台框宽{}像素和锣鼓高度20.4米。"),
     ],
 )
 def test_a_clause_that_is_worded_as_none_that_was_met_contradicts_only_by_a_number_of_nothing(
     language, known, unmet, monkeypatch
 ):
-    assert state_of(known.format("27.7"), language) == "contradicted"
-    assert state_of(unmet.format("27.7"), language) == "unread"  # the slant range
-    assert state_of(unmet.format("18.9"), language) == "contradicted"  # of another frame, and of nothing in this one
-    assert state_of(unmet.format("35.0"), language) == "contradicted"
+    assert state_of(known.format("58"), language) == "contradicted"
+    assert state_of(unmet.format("58"), language) == "unread"  # its height
+    assert state_of(unmet.format("20"), language) == "contradicted"  # of another frame, and of nothing in this one
+    assert state_of(unmet.format("90"), language) == "contradicted"
     monkeypatch.setattr(judging, "is_met", lambda *_, **__: True)
     assert (
-        state_of(unmet.format("27.7"), language) == "contradicted"
+        state_of(unmet.format("58"), language) == "contradicted"
     )  # it is for its wording alone that it is left unread
 
 

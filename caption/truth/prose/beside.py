@@ -23,6 +23,7 @@ _EXTREME = {
         r",?(?:也|正|恰|又)?(?:是|为|系)(?:这)?(?:整个|全)?(?:窗口|五帧|四步|序列|全程|两秒|期间|段)*(?:里|中|内|以来|的|之)*最(?:(?P<most>[远大宽高快长])|[近小窄低慢短])的?(?:一次|一帧|一步|值|时刻|数)"
     ),
 }  # fmt: skip
+_IS = re.compile(r"\b(?:is|are|was|were)\b")
 _ZH_AFTER = 2  # letters between a number and its side: "3 度(左)"
 
 
@@ -97,6 +98,8 @@ class Beside:
                 continue  # "earlier up to 22 m", "as low as 18 m" is an extreme
             if any(token.end <= t.start and t.end <= numeral.start for t in self.clause.of("who")):
                 continue  # "slightly above the target's 1.2 m/s"
+            if token.end <= numeral.start and _IS.search(self.text, token.end, numeral.start):
+                continue  # "the walker below is only 24 m off"
             if -1 <= distance <= reach and not crossing(self.sentence, self.clause, token, numeral.start, numeral.end):
                 return token.value  # type: ignore[return-value]
         return ""

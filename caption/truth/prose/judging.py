@@ -8,6 +8,7 @@ from functools import lru_cache
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.prose.against_itself import compares_wrongly, goes_wrongly
+from caption.truth.prose.changing import MORE_THAN
 from caption.truth.prose.deciding import argues_against
 from caption.truth.prose.judging_numbers import NumberJudge
 from caption.truth.prose.judging_words import WordJudge
@@ -21,7 +22,7 @@ from caption.truth.sentences import Judged
 from cosfly.products.captions import Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
 
-_NUMBERS = ("number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds", "extreme")
+_NUMBERS = ("number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds", "extreme", "unit")
 _PROBLEM = {
     "pair": "box",
     "list": "number",
@@ -33,6 +34,7 @@ _PROBLEM = {
     "percent": "number",
     "speeds": "number",
     "extreme": "number",
+    "unit": "number",
     "record": "comparison",
     "course_side": "side",
 }
@@ -116,9 +118,13 @@ def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: 
         and s.is_named
         and form.numerals[s.numbers[0]].unit == "mps"
     )
+    is_change = s.kind == "number" and s.sure_mode == "change" and bool(s.sure_names) and s.is_named
+    if is_change:
+        numeral = form.numerals[s.numbers[0]]  # "25.5 m higher" may be than somebody
+        is_change = numeral.unit == "m" and not MORE_THAN.match(form.text, numeral.end)
     is_plain_trend = s.kind == "trend" and s.is_sure and s.is_named
     is_length = s.is_single and form.numerals[s.numbers[0]].unit == "m"
-    if is_nothing or s.is_per_step or is_speed or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
+    if is_nothing or s.is_per_step or is_speed or is_change or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
         return not cites(form.text)
     if s.kind in _NUMBERS and (numbers.is_on_wrong_side(s) or numbers.is_in_wrong_unit(s)):
         return not cites(form.text)

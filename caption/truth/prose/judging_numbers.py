@@ -35,6 +35,8 @@ class NumberJudge(NumberComparison):
     def holds(self, s: Statement) -> bool | None:
         if self.is_in_wrong_unit(s):
             return False
+        if s.kind == "unit":
+            return None
         if s.is_per_step:
             return self._is_of_steps(s)
         s = self._as_recorded(s)
@@ -49,9 +51,11 @@ class NumberJudge(NumberComparison):
 
     def is_in_wrong_unit(self, s: Statement) -> bool:
         """Tell whether numbers of a foreign unit are nothing that their words may mean, but would be in ours: "12.5 ft" of 12.5 m."""
-        if s.kind not in ("number", "course", "list", "range"):
+        if s.kind not in ("number", "course", "list", "range", "unit"):
             return False
         read = [self.read(i) for i in s.numbers]
+        if s.kind == "unit" and s.names:
+            return all(self.pool.holds(value, "px", (step, step), s.names, None, "value") for _, value, step in read)
         return all(
             numeral.factor != 1.0
             and self.pool.holds(value / numeral.factor, numeral.unit, (step / numeral.factor,) * 2, s.names)

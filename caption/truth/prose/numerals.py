@@ -177,6 +177,7 @@ EVERY_SECOND = re.compile(
     r"\s*(?:of \w+ |in (?!half)\w+ |in )?(?:every|each|a|per) second(?! (?:ago|earlier|before|later|back|and|or|into))"
 )
 _PER_HOUR = re.compile(r"(?:每小时|时速)(?:约|大约|近|将近|可达)?\s*$")
+_PER_MINUTE = re.compile(r"每分钟?(?:约|大约|近|将近)?\s*$")
 _PER_SECOND = re.compile(r"(?:每秒|一秒钟?(?=[能可]?[走飞跑移挪]))[^,#;。]*$")
 
 
@@ -189,6 +190,8 @@ def _said_apart(numeral: Numeral, text: str) -> Numeral:
         numeral = replace(numeral, unit=rate)
     if numeral.unit == "m" and _PER_HOUR.search(text, 0, numeral.start):
         numeral = replace(numeral, unit="mps", factor=numeral.factor / 3600.0)
+    if rate and _PER_MINUTE.search(text, 0, numeral.start):
+        return replace(numeral, unit=rate, factor=numeral.factor / 60.0)
     if rate and _PER_SECOND.search(text[max(0, numeral.start - 14) : numeral.start]):
         numeral = replace(numeral, unit=rate)
     return numeral

@@ -25,8 +25,8 @@ _GENITIVE = re.compile(
 )
 # What a clause without a subject begins with when it goes on about the last one: "but is back to 3.2 m/s", "当前 2.3 米/秒".
 GOES_ON = {
-    "en": re.compile(r"(?:[\s,=:]|and|but|yet|now|currently|still|is|has|at|about|roughly|only|just|back|down|up|to|doing|making|going|moving|flying|walking|slowed|dropped|fallen|risen|settled|presently|today|then|holding|steady|on|which|that|speed|minimum|maximum|low|high|peak|trough|of|a|mere|lazy|it|earlier|before|previously|once|at first|initially|having|been|as low as|as high as)*"),
-    "zh": re.compile(r"(?:[\s,=:]|却|现在?|当前|目前|如今|此刻|已|仍|还|只|有|仅|达|约|为|是|回|升|降|落|减|增|到|至|速度|步速|了|起初|先前|之前|此前|原先|一开始|开头|曾|其间|期间|最[高低大小快慢远近]|首帧|首步|末帧|末步|起点|前一步|前一帧|上一步|上一帧|在|报)*"),
+    "en": re.compile(r"(?:[\s,=:]|and|but|yet|now|currently|still|is|has|at|about|roughly|only|just|back|down|up|to|doing|making|going|moving|flying|walking|slowed|dropped|fallen|risen|settled|presently|today|then|holding|steady|stands|stayed|stays|remains|remained|reads|on|which|that|speed|minimum|maximum|low|high|peak|trough|of|a|mere|lazy|it|earlier|before|previously|once|at first|initially|having|been|as low as|as high as)*"),
+    "zh": re.compile(r"(?:[\s,=:]|却|现在?|当前|目前|如今|此刻|已|仍|还|只|有|仅|达|约|为|是|回|升|降|落|减|增|到|至|速度|步速|了|起初|先前|之前|此前|原先|一开始|开头|曾|其间|期间|最[高低大小快慢远近]|首帧|首步|末帧|末步|起点|前一步|前一帧|上一步|上一帧|在|报|一直|始终|全程|停|稳|锁|定|维持|保持|都)*"),
 }  # fmt: skip
 _ITS_OWN = re.compile(r"\s*(?:for|by|of) (?:the |our )?|\s*\((?:the )?")  # "1.1 m/s for us", "1.2 m/s (walker)"
 _OWNS = re.compile(r"[^,;)]{0,12}#")  # "(the walker 1.3 m/s)" is about another number

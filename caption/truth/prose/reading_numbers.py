@@ -42,6 +42,9 @@ _OF_PICTURE = {
     ),
 }
 _NEAR = 14  # letters behind a number in which its moment stands
+_TIMES = re.compile(r"\s*[x*×]\s*(?=[#\d])")
+_AS_BOX = re.compile(r"\s*(?:wide|tall)\b|宽|高(?!度)")
+_ASIDE = re.compile(r"偏[左右]约?\s*$")
 _PER = re.compile(r"\b(?:per|each|every)\b|每")
 
 
@@ -74,6 +77,7 @@ class NumberReader:
             self._read_group(members)
         self._join_courses()
         self._speeds()
+        self._units()
 
     def _share_unit(self, members: list[int]) -> None:
         """Give the unit of the first number of a row to those of it that have none."""
@@ -88,6 +92,26 @@ class NumberReader:
             first, last = self.sentence.numerals[i], self.sentence.numerals[j]
             if not first.unit and last.unit and self.changing.is_from_to(first, last):
                 self.sentence.numerals[i] = replace(first, unit=last.unit, factor=last.factor)
+
+    def _units(self) -> None:
+        """Keep the unit of a foreign one that nothing else was read of: "hold the range at 16.7 km"."""
+        told = {i for s in self.statements for i in s.numbers}
+        for i in () if self.in_scene else self.clause.numerals:
+            numeral = self.sentence.numerals[i]
+            if i not in told and numeral.factor != 1.0 and numeral.unit in MEASURED:
+                self.statements.append(Statement("unit", (self.clause.start, self.clause.end), numbers=(i,)))
+            elif numeral.unit == "m" and numeral.fraction is None and (names := self._of_box(numeral)):
+                row = [j for j in self.clause.numerals if self.sentence.numerals[j].group == numeral.group]
+                self.statements.append(Statement("unit", (self.clause.start, self.clause.end), names, tuple(row)))
+
+    def _of_box(self, numeral: Numeral) -> tuple[str, ...]:
+        """Give the series of the box that a length would be if it were in pixels: "12 m wide", "a speck of 5 x 6 m"."""
+        if numeral.joined in ("x", "*") or _TIMES.match(self.text, numeral.end):
+            return ("box_width", "box_height")
+        if (found := _AS_BOX.match(self.text, numeral.end)) and not self.clause.has("who", "scene"):
+            return ("box_width",) if found[0].strip()[0] in "w宽" else ("box_height",)
+        is_aside = self.language == "zh" and _ASIDE.search(self.text, self.clause.start, numeral.start)
+        return ("offset_x",) if is_aside and self.clause.has("quantity", "box", "centre") else ()
 
     def _speeds(self) -> None:
         """Read two speeds that are set against each other: one is the drone's, the other the target's."""
@@ -237,7 +261,8 @@ class NumberReader:
             found = replace(found, names=names or found.names)
         found = self._surely(found, numeral)
         units = [self.sentence.numerals[i].unit for i in self.clause.numerals]
-        is_single = bool(found.sure_names) and not trend and units.count(numeral.unit) == 1
+        is_alone = units.count(numeral.unit) == 1 or self.sureness.has_own_word(numeral)
+        is_single = bool(found.sure_names) and not trend and is_alone
         is_named = self.clause.has("who", "drone", "target") or self.clause.has("quantity")
         self.statements.append(replace(found, is_single=is_single, is_named=is_named))
         if (end := self.beside.extreme(numeral)) and names:

@@ -152,14 +152,22 @@ class Sureness:
         told |= {_TOLD[t.value] for c in before for t in c.of("trend") if numeral.unit == "m" and t.value in _TOLD}
         if "yaw" in told and any(c.has("who", "target") for c in before):
             return set()  # "the person is left of the nose, 3 degrees"
-        return told if len(told) == 1 and not self.text[: self.clause.start].endswith(("(", ":")) else set()
+        if self.text[: self.clause.start].endswith(("(", ":")) and numeral.unit != "m":
+            return set()
+        if self.text[: self.clause.start].endswith(("(", ":")):
+            last = before[-1].of("quantity") if before else []
+            mark = self.clause.start - 1
+            return told & {
+                t.value for t in last if mark - t.end <= 1 or t.start == before[-1].start
+            }  # "altitude (18.5 m)"
+        return told if len(told) == 1 else set()
 
     def is_in_group(self, numeral: Numeral) -> bool:
         """Tell whether numbers stand in a row, whose quantities may stand in one too: "height and range: 20 m and 21 m"."""
         row = [n for n in self.sentence.numerals if n.group == numeral.group]
         if numeral.unit == "px" and all(_SIDED.search(self.text, 0, n.start) for n in row):
             return False  # "偏右 12 像素、偏下 19 像素"
-        if len(row) > 1 and (all(self._has_own_word(n) for n in row) or self._is_named_in(row, numeral)):
+        if len(row) > 1 and (all(self.has_own_word(n) for n in row) or self._is_named_in(row, numeral)):
             return False  # "12.0 m up, 9.5 m away", "斜距 28.0 米、水平距离 20.5 米"
         after = MORE_THAN.match(self.text, row[-1].end) if self.language == "en" and len(row) == 2 else None
         if after and after["than"]:
@@ -175,10 +183,14 @@ class Sureness:
             for t in self.clause.of("quantity")
         )
 
-    def _has_own_word(self, numeral: Numeral) -> bool:
+    def has_own_word(self, numeral: Numeral) -> bool:
         quantities = [t for c in self.sentence.clauses for t in c.of("quantity")]
         behind = any(
-            numeral.start < t.start <= numeral.end + 1 + self.text.startswith("的", numeral.end) and t.end > numeral.end
+            (
+                numeral.start < t.start <= numeral.end + 1 + self.text.startswith("的", numeral.end)
+                and t.end > numeral.end
+            )
+            or (numeral.unit == "m" and t.start >= numeral.end and BEHIND.fullmatch(self.text, numeral.end, t.start))
             for t in quantities
         )
         before = [t for t in self.clause.of("quantity") if t.end <= numeral.start]
