@@ -6,6 +6,7 @@ import re
 
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import TREND_SERIES, Context, times_of
+from caption.truth.prose.lexicon import Token
 from caption.truth.prose.statements import NOW, Hedge, Statement
 
 _SPEED = re.compile(r"fast|quick|slow|pace|speed|swift|rapid|velocit|速|快|慢")
@@ -60,6 +61,25 @@ def ratio_statement(
         is_ordered=is_ordered,
         span=told.since(),
     )
+
+
+_AS_HIGH = re.compile(r"\s*(?:as )?(?:high|far|long|wide|tall|deep)\b")  # of two lengths
+_OF_TIME = re.compile(r"\s*(?:at|in|during|within|over)\b")  # "twice at 5 m/s"
+_OF_THING = re.compile(
+    r"\s*(?:a |an )?(?:met(?:re|er)|second|frame|step|of the (?:window|picture|frame|image)|way|visible|hidden|turn|the (?:window|picture|frame|image)|of an? )|\s*秒|侧|边|帧|步"
+)
+
+
+def ratio_word(
+    sentence: Sentence, clause: Clause, context: Context, token: Token, *, in_scene: bool
+) -> list[Statement]:
+    """Read a word for a multiple or a part; nothing where it counts something else: "a second and a half", "half the frame"."""
+    text, start, end = sentence.text, token.start, token.end
+    if in_scene or _AS_HIGH.match(text, end) or text[:start].endswith("and a "):
+        return []
+    if _OF_TIME.match(text[: end + 12], end) or _OF_THING.match(text[: end + 12], end):
+        return []
+    return [ratio_statement(sentence, clause, context, start, end, (), float(token.value))]
 
 
 class _Multiple:

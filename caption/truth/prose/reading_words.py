@@ -8,7 +8,7 @@ from caption.truth.prose.clause_words import ClauseWords
 from caption.truth.prose.cues import OVERALL, TREND_SERIES, crossing, gap, times_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.reading_comparisons import compared_speeds
-from caption.truth.prose.reading_ratios import ratio_statement
+from caption.truth.prose.reading_ratios import ratio_word
 from caption.truth.prose.statements import NOW
 
 _HARDLY = re.compile(r"\b(?:hardly|barely|scarcely) (?:\w+ )?$|几乎(?:没有|没|不|未)?(?:怎么)?$")
@@ -24,12 +24,9 @@ _MUCH = {
 _VERTICAL = {"alt_up": 1, "alt_down": -1}
 _PACE = {"pace_up": 1, "pace_down": -1}
 _APART = {"dist_up": 1, "dist_down": -1}
-
-
 _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between a word of change and its number
 
 
-_AS_HIGH = re.compile(r"\s*(?:as )?(?:high|far|long|wide|tall|deep)\b")  # of two lengths
 _FURTHER = re.compile(r"(?:further|farther) (?:under|below|beneath|above|down|up|left|right|along|into|to the)\b")
 _BESIDE = re.compile(r"[侧方]")
 _NO_CHANGE = re.compile(
@@ -52,7 +49,7 @@ class WordReader(ClauseWords):
             elif token.kind == "side" and token not in used_sides:
                 self._side(token)
             elif token.kind == "ratio" and not self.clause.is_blocked(token.start):
-                self._ratio(token)
+                self.statements += ratio_word(self.sentence, self.clause, self.context, token, in_scene=self.in_scene)
 
     def _is_hedge(self, token: Token) -> bool:
         """ "接近三倍", "down to about 3 m": the word belongs to the number after it."""
@@ -399,23 +396,3 @@ class WordReader(ClauseWords):
             )
             if names and not self.clause.of("time") and not self.clause.numerals and not self.clause.has("ratio"):
                 self._add(token, kind="trend", names=names, trend=sign, frames=self._trend_frames(token))
-
-    def _ratio(self, token: Token) -> None:
-        text = self.text[token.end : token.end + 12]
-        if (
-            _AS_HIGH.match(self.text, token.end)
-            or self.text[: token.start].endswith("and a ")
-            or re.match(r"\s*(?:at|in|during|within|over)\b", text)
-        ):
-            return  # "a second and a half", "twice at 5 m/s"
-        if (
-            re.match(
-                r"\s*(?:a |an )?(?:met(?:re|er)|second|frame|step|of the (?:window|picture|frame|image)|way|visible|hidden|turn|the (?:window|picture|frame|image)|of an? )|\s*秒|侧|边|帧|步",
-                text,
-            )
-            or self.in_scene
-        ):
-            return
-        self.statements.append(
-            ratio_statement(self.sentence, self.clause, self.context, token.start, token.end, (), float(token.value))
-        )
