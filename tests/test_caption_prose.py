@@ -27,6 +27,7 @@ from specimens_prose import (
     HOLD,
     NINTH_SET,
     SECOND_SET,
+    SET_WORDS,
     SEVENTH_SET,
     SIXTH_SET,
     TENTH_SET,
@@ -100,22 +101,22 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
 @pytest.mark.parametrize(
     ("path", "flagged_at_most", "of_all", "numbers", "sides"),
     [
-        (GOLD_PROSE, 0, 0.845, 0.95, 0.87),
-        (SECOND_SET, 0, 0.82, 0.91, 0.8),
-        (THIRD_SET, 0, 0.67, 0.75, 0.66),
+        (GOLD_PROSE, 0, 0.855, 0.95, 0.875),
+        (SECOND_SET, 0, 0.825, 0.91, 0.82),
+        (THIRD_SET, 0, 0.70, 0.75, 0.66),
         (FOURTH_SET, 0, 0.815, 0.81, 0.89),
-        (FIFTH_SET, 0, 0.67, 0.66, 0.79),
-        (SEVENTH_SET, 1, 0.73, 0.86, 0.83),
-        (EIGHTH_SET, 0, 0.77, 0.84, 0.63),
-        (ELEVENTH_SET, 0, 0.78, 0.83, 0.69),
+        (FIFTH_SET, 0, 0.67, 0.66, 0.82),
+        (SEVENTH_SET, 1, 0.74, 0.86, 0.9),
+        (EIGHTH_SET, 0, 0.80, 0.84, 0.76),
+        (ELEVENTH_SET, 0, 0.79, 0.83, 0.77),
         # Of these the wordings are not met: hard styles and common ones. What they gave before they were read stands in docs/captions.md.
-        (SIXTH_SET, 1, 0.57, 0.68, 0.51),
-        (NINTH_SET, 0, 0.74, 0.86, 0.69),
-        (TENTH_SET, 3, 0.64, 0.83, 0.64),
-        (TWELFTH_SET, 0, 0.715, 0.82, 0.65),
-        (THIRTEENTH_SET, 0, 0.735, 0.895, 0.66),
-        (FOURTEENTH_SET, 0, 0.645, 0.815, 0.57),
-        (FIFTEENTH_SET, 0, 0.695, 0.825, 0.69),
+        (SIXTH_SET, 1, 0.60, 0.68, 0.53),
+        (NINTH_SET, 0, 0.75, 0.86, 0.76),
+        (TENTH_SET, 3, 0.70, 0.83, 0.82),
+        (TWELFTH_SET, 0, 0.77, 0.82, 0.77),
+        (THIRTEENTH_SET, 0, 0.76, 0.895, 0.78),
+        (FOURTEENTH_SET, 0, 0.735, 0.815, 0.8),
+        (FIFTEENTH_SET, 0, 0.71, 0.825, 0.72),
     ],
     ids=[
         "gold",
@@ -225,6 +226,15 @@ def test_a_true_sentence_passes_and_a_false_one_does_not(case):
         assert problems_of(case, case.text.replace(old, new, 1)) == [], (
             f"now read, move it to the errors: {old} -> {new}"
         )
+
+
+@pytest.mark.parametrize("case", SET_WORDS, ids=lambda case: case.text[:40])
+def test_set_words_contradict_in_any_wording(case, monkeypatch):
+    monkeypatch.setattr(judging, "is_met", lambda *_, **__: False)
+    assert problems_of(case, case.text) == []
+    for old, new in case.errors:
+        assert case.text.count(old) == 1
+        assert problems_of(case, case.text.replace(old, new)), f"{old} -> {new}"
 
 
 @pytest.mark.parametrize("case", CASES[::7], ids=lambda case: case.text[:40])

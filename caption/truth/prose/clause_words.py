@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 from caption.truth.prose.clauses import Clause, Sentence
@@ -9,6 +10,11 @@ from caption.truth.prose.cues import Context, gap, owner_of, times_of
 from caption.truth.prose.lexicon import Token
 from caption.truth.prose.plainness import is_asserted, is_plain
 from caption.truth.prose.statements import NOW, Statement
+
+# What may tell of another moment than now.
+_IN_PASSING = re.compile(
+    r"\b(?:after|before|once|until|till|when|had|at first|first|then|began|earlier|from|momentar\w+|brief\w*)\b|先(?!生)|曾|此前|之前|起初|开头|一度|刚|后|又|原来|从|次帧"
+)
 
 
 class ClauseWords:
@@ -51,6 +57,12 @@ class ClauseWords:
         ):
             return None
         return (NOW,)
+
+    def _told_moment(self, token: Token) -> tuple[int, ...] | None:
+        """Give the frames of a word that means one moment: those told, else now; any where another moment is told of."""
+        if times_of(self.clause) or not _IN_PASSING.search(self.text, self.clause.start, self.clause.end):
+            return self._frames(token)
+        return None
 
     def _add(self, token: Token, **fields: object) -> None:
         found = Statement(clause=self.span, **fields)  # type: ignore[arg-type]

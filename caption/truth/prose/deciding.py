@@ -28,6 +28,13 @@ _OPPOSITE = {
     "search_to_reacquire_target": ("straight", "hover", "fast"), "circle_left": ("straight", "hover"), "circle_right": ("straight", "hover"),
     "strafe_left": ("hover",), "strafe_right": ("hover",),
 }  # fmt: skip
+_PLAIN_OPPOSITES = {
+    ("ascend", "descend"), ("descend", "ascend"), ("fast", "slow_down"), ("slow", "speed_up"), ("forward", "move_backward"), ("backward", "move_forward"),
+    *(("hover", one) for one in ("speed_up", "move_forward", "circle_left", "circle_right", "strafe_left", "strafe_right", "yaw_left_to_follow", "yaw_right_to_follow", "track_straight", "return_to_home")),
+    *(("search", one) for one in ("track_straight", "move_forward", "hover", "ascend", "descend", "speed_up", "slow_down")),
+    *(("straight", one) for one in ("search_to_reacquire_target", "break_off", "hover", "move_backward")),
+    ("fast", "hover"), ("ascend", "hover"), ("descend", "hover"), ("backward", "speed_up"), ("backward", "hover"), ("forward", "hover"), ("backward", "track_straight"),
+}  # fmt: skip
 # "a search is not warranted": refused after it is named.
 _REFUSED = {
     "en": re.compile(
@@ -47,7 +54,7 @@ _INSTEAD = {
 }
 _LATER = {
     "en": re.compile(r"\b(?:before|until|till|after|once|later)\b"),
-    "zh": re.compile(r"(?<!那就)(?<!因此)(?<!所以)(?<!不妨)(?<!可以)再|之后|以后"),
+    "zh": re.compile(r"(?<!那就)(?<!因此)(?<!所以)(?<!不妨)(?<!可以)再(?![往向靠升降左右高低]|推|稍|略)|之后|以后"),
 }
 
 
@@ -57,6 +64,12 @@ def actions_of(sentence: Sentence, clause: Clause, *, is_plan: bool) -> list[Sai
     for token in clause.of("action"):
         if token.value == "fast" and _SHEDS.search(sentence.text, 0, token.start):
             continue  # "bleeds off yet more speed"
+        if (
+            token.value == "hover"
+            and sentence.text[token.start : token.end] == "不动"
+            and not clause.has("who", "drone")
+        ):
+            continue  # "航向不动": of what was named, not of the drone
         if _RULED_OUT[sentence.language].search(sentence.text, 0, token.start):
             continue
         if not _is_refused(sentence, clause, token) and not _IS_ATTRIBUTE.match(sentence.text, token.end):
@@ -160,6 +173,8 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Sa
     plainly.
     """
     decision = kin_of(decision)
+    if (final := _final(last)) is not None and _is_plainly_opposite(decision, final):
+        return [final]
     asked = [one for one in said if one.force == "directive"] or [one for one in said if one.force == "aim"]
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
     named = {one.action for one in asked if one.side}  # "turning the nose to the left": one turn, not two
@@ -172,6 +187,18 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Sa
     beside = [one for one in said if one.side or one.action not in named]
     rest += [one for one in beside if any(one.clause == other.clause and one != other for other in opposites)]
     return [] if decision in _allowed(rest) else opposites
+
+
+def _final(last: list[Said]) -> Said | None:
+    """Give what the last sentence asks for in the end, whatever was asked for before."""
+    asked = [one for one in last if one.force == "directive" and (one.side or one.action not in _SIDED)]
+    return asked[-1] if asked else None
+
+
+def _is_plainly_opposite(decision: str, said: Said) -> bool:
+    if said.action in _SIDED:
+        return said.side != 0 and decision == _SIDED[said.action].format("right" if said.side > 0 else "left")
+    return (said.action, decision) in _PLAIN_OPPOSITES
 
 
 def _is_opposite(decision: str, said: Said) -> bool:

@@ -11,6 +11,7 @@ from caption.truth.prose.against_itself import compares_wrongly, goes_wrongly
 from caption.truth.prose.changing import MORE_THAN
 from caption.truth.prose.deciding import argues_against
 from caption.truth.prose.judging_numbers import NumberJudge
+from caption.truth.prose.judging_strong import StrongJudge
 from caption.truth.prose.judging_words import WordJudge
 from caption.truth.prose.measured import Measured
 from caption.truth.prose.numerals import masked
@@ -37,8 +38,16 @@ _PROBLEM = {
     "unit": "number",
     "record": "comparison",
     "course_side": "side",
+    "motion": "state",
+    "extent": "trend",
+    "framing": "centre",
+    "lies": "side",
+    "sight": "visibility",
+    "faster": "comparison",
 }
-_NEVER_MISREAD = ("state", "course", "pair", "centre", "record", "course_side")
+_STRONG = ("motion", "extent", "framing", "lies", "sight", "faster")
+_SAID_OUTRIGHT = (*_NUMBERS, "lies", "sight", "faster")  # of which no word beside them makes another sense
+_NEVER_MISREAD = (*_STRONG, "state", "course", "pair", "centre", "record", "course_side")
 _SELDOM_MISREAD = ("comparison", "visibility", "clock", "list", "range", "extreme")
 _SHOWN = 120  # characters of a sentence in a message
 
@@ -59,7 +68,7 @@ def judge_sentences(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langu
     The decision against its own text is a problem of the last sentence that argues for another one.
     """
     measured = _measured(facts)
-    pool, words = Pool(measured), WordJudge(measured)
+    pool, words, strong = Pool(measured), WordJudge(measured), StrongJudge(measured)
     judged: list[Judged] = []
     forms: list[Form] = []
     subject, letter = "", ""
@@ -73,7 +82,7 @@ def judge_sentences(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langu
         subject = form.subject
         forms.append(form)
         numbers = NumberJudge(measured, pool, cfg, form, runs)
-        judged.append(_judge(name, text, language, form, numbers, words))
+        judged.append(_judge(name, text, language, form, numbers, words, strong))
     return _against_decision(judged, forms, coc.flight_decision, language)
 
 
@@ -83,16 +92,22 @@ def _after_answer(statements: tuple[Statement, ...]) -> tuple[Statement, ...]:
     return tuple([s for s in statements if s.clause != first])
 
 
-def _judge(name: str, text: str, language: Language, form: Form, numbers: NumberJudge, words: WordJudge) -> Judged:
+def _judge(
+    name: str, text: str, language: Language, form: Form, numbers: NumberJudge, words: WordJudge, strong: StrongJudge
+) -> Judged:
     problems: list[str] = []
     is_proved, is_open = False, form.left_out
     for statement in form.statements:
-        holds = numbers.holds(statement) if statement.kind in _NUMBERS else words.holds(statement)
+        judge = numbers if statement.kind in _NUMBERS else strong if statement.kind in _STRONG else words
+        holds = judge.holds(statement)
         if compares_wrongly(statement, form, numbers) or goes_wrongly(statement, form, numbers):
             holds = False
-        elif holds is False and statement.kind not in _NUMBERS and not statement.is_sure:
+        elif holds is False and statement.kind not in _SAID_OUTRIGHT and not statement.is_sure:
             holds = False if statement.is_asserted and words.is_never(statement) else None
-        if holds is False and not _is_worded_as_met(statement, form, numbers, language):
+        if holds is False and not (
+            (statement.is_sure and words.is_ever_against(statement))
+            or _is_worded_as_met(statement, form, numbers, language)
+        ):
             holds = None
         if holds is None:
             is_open = True

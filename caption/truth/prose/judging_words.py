@@ -57,11 +57,6 @@ class WordJudge:
                 return self._course_side(s)
         return self._comparison(s)
 
-    def _frames(self, s: Statement) -> list[int]:
-        count = len(self.facts)
-        frames = range(count) if s.frames is None else s.frames
-        return [i for i in ((f + count if f < 0 else f) for f in frames) if 0 <= i < count]
-
     def _over(self, s: Statement, test) -> bool | None:
         """Take the kindest answer of the series that are meant."""
         answers = [test(name, values) for name in s.names if len(values := self.measured.known(name)) >= 2]
@@ -82,6 +77,25 @@ class WordJudge:
             "turning": abs(facts.yaw_deg[-1] - facts.yaw_deg[0]) >= 3.0,
         }
         return not ours.get(s.word, max(drone, default=1.0) >= STANDING_MPS) and self._state(free) is False
+
+    def is_ever_against(self, s: Statement) -> bool:
+        """Tell whether a trend's series never goes its way between any two frames, and goes the other way by far, or the other one is the faster by far."""
+        if s.kind == "comparison" and not s.negated:
+            pairs = self._pairs_of_speeds(replace(s, frames=None))
+            match s.word:
+                case "faster":
+                    return bool(pairs) and all(ours < 0.8 * theirs - 0.1 for ours, theirs in pairs)
+                case "slower":
+                    return bool(pairs) and all(theirs < 0.8 * ours - 0.1 for ours, theirs in pairs)
+            return False
+        if s.kind != "trend" or s.negated or not s.names:
+            return False
+        for name in s.names:
+            known = self.measured.known(name)
+            changes = [s.trend * change(name, a, b) for i, a in enumerate(known) for b in known[i + 1 :]]
+            if not changes or max(changes) > 0.0 or min(changes) > -2.0 * band_of(name, known):
+                return False
+        return True
 
     # --- trends ------------------------------------------------------------------------------------------------------
 
@@ -172,7 +186,7 @@ class WordJudge:
             return self._bends(s)
         sign = s.side if name == "bearing" else -s.side
         series = self.measured.series(name)
-        known = [series[i] for i in self._frames(s) if series and series[i] is not None]
+        known = [series[i] for i in self.measured.frames(s.frames) if series and series[i] is not None]
         if not known:
             return None
         least = 2.0 if name == "offset_x" else 0.5
@@ -215,7 +229,7 @@ class WordJudge:
 
     def _centre(self, s: Statement) -> bool | None:
         f = self.facts
-        pairs = [(f.offset_x_px[i], f.offset_y_px[i]) for i in self._frames(s)]
+        pairs = [(f.offset_x_px[i], f.offset_y_px[i]) for i in self.measured.frames(s.frames)]
         known = [(abs(x) / f.width_px, abs(y or 0) / f.height_px) for x, y in pairs if x is not None]
         if not known:
             return None
@@ -237,13 +251,13 @@ class WordJudge:
     # --- seen, moving, faster ----------------------------------------------------------------------------------------
 
     def _visibility(self, s: Statement) -> bool | None:
-        answers = [self._is_seen(s.word, self.facts.visibility[i]) for i in self._frames(s)]
+        answers = [self._is_seen(s.word, self.facts.visibility[i]) for i in self.measured.frames(s.frames)]
         if not answers:
             return None
         if s.negated:
             answers = [None if a is None else not a for a in answers]
             if s.word == "full":
-                answers = [self.facts.visibility[i] != "visible" for i in self._frames(s)]
+                answers = [self.facts.visibility[i] != "visible" for i in self.measured.frames(s.frames)]
         if s.frames is None or s.frames == (0, 1):
             return True if True in answers else False if None not in answers else None
         return False if False in answers else None if None in answers else True
@@ -266,7 +280,9 @@ class WordJudge:
             return self._bending(s)
         target = s.word in ("standing", "walking", "running")
         series = self.measured.series("target_speed" if target else "speed")
-        known = [series[i] for i in self._frames(s) if series and i < len(series) and series[i] is not None]
+        known = [
+            series[i] for i in self.measured.frames(s.frames) if series and i < len(series) and series[i] is not None
+        ]
         mean = self.facts.target_speed_mps
         if target and mean is not None and (not known or s.frames is None):
             known.append(mean)
@@ -319,7 +335,7 @@ class WordJudge:
         ours, theirs = self.measured.series("speed"), self.measured.series("target_speed")
         mean = self.facts.target_speed_mps
         pairs = []
-        for i in self._frames(s):
+        for i in self.measured.frames(s.frames):
             if not ours or ours[i] is None:
                 continue
             if theirs and theirs[i] is not None:

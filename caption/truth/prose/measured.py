@@ -45,6 +45,11 @@ class Measured:
         """Give the change of a series in each step."""
         return [None if a is None or b is None else change(name, a, b) for a, b in pairwise(self.series(name))]
 
+    def frames(self, told: tuple[int, ...] | None) -> list[int]:
+        """Give the frames of a statement, counted from the oldest; all for None."""
+        frames = range(self.num_frames) if told is None else told
+        return [i for i in ((f + self.num_frames if f < 0 else f) for f in frames) if 0 <= i < self.num_frames]
+
     def known(self, name: str) -> list[float]:
         return [v for v in self.series(name) if v is not None]
 

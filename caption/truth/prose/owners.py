@@ -118,9 +118,9 @@ class Owners:
             return ""
         if len(set(self.context.people)) == 1:
             return self.context.subject
-        return self._named_alone_before()
+        return self.named_alone_before()
 
-    def _named_alone_before(self) -> str:
+    def named_alone_before(self) -> str:
         """Give the only one whom the clause before names, where this one goes on: "而行人几乎在挪步,只有 0.62 米/秒"."""
         before = [c for c in self.sentence.clauses if c.end <= self.clause.start]
         if not before or self.text[before[-1].end] != ",":

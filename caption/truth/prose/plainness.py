@@ -18,12 +18,12 @@ _BLOCKED = {
         r"\b(?:instead|rather|same|as if|lost and found|further|let|if|unless|should|would|could|might|than|without|instead of|apart from"
         r"|except|despite|although|though|even|neither|nor|not|no|never|nothing|nobody|hardly|barely|anything|too|enough|almost|nearly|lack\w*|missing is)\b|n't\b|\?"
     ),
-    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|虽|尽管|再|免|而非|反而|身后|旁|用(?=上升|下降|爬升|加速|减速|后退|前进)"),
+    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先(?!生)|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|虽|尽管|再|免|而非|反而|身后|旁|用(?=上升|下降|爬升|加速|减速|后退|前进)"),
 }  # fmt: skip
 # The same without what only concedes: "though half hidden" tells that it is.
 _DENIED = {
     "en": re.compile(r"\b(?:instead|rather|same|as if|lost and found|let|if|unless|should|would|could|might|than|without|instead of|apart from|except|neither|nor|not|no|never|nothing|nobody|hardly|barely|anything|too|enough|almost|nearly)\b|n't\b|\?"),
-    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|再|免|而非|反而|身后|旁"),
+    "zh": re.compile(r"不(?!断)|没|无(?!人机)|未|别|若|如果|刚|先(?!生)|此前|之前|曾|谁|近乎|几乎|同样|一样|相同|似|像是|再|免|而非|反而|身后|旁"),
 }  # fmt: skip
 _ADVERB = re.compile(
     r"\s*(?:in|on|at|now|away|after|before|here|there|behind|through|along|up|down|where|as|about|then|once)\b"

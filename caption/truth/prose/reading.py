@@ -9,12 +9,18 @@ from functools import lru_cache
 from caption.truth.prose.clauses import Clause, parse
 from caption.truth.prose.cues import Context, times_of
 from caption.truth.prose.deciding import actions_of
+from caption.truth.prose.reading_faster import FasterReader
 from caption.truth.prose.reading_numbers import NumberReader
 from caption.truth.prose.reading_plain import PlainReader
+from caption.truth.prose.reading_sides import SideReader
+from caption.truth.prose.reading_sight import SightReader
 from caption.truth.prose.reading_states import StateReader
+from caption.truth.prose.reading_strong import StrongReader
 from caption.truth.prose.reading_words import WordReader
 from caption.truth.prose.statements import NOW, Form, Said, Statement
 from cosfly.products.captions import Language
+
+_READERS = (StateReader, PlainReader, StrongReader, SideReader, SightReader, FasterReader)
 
 
 @lru_cache(maxsize=65536)  # by the sentence without its digits: neighbouring windows share most
@@ -34,14 +40,16 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
         in_scene = clause.has("who", "scene") and not clause.has("who", "drone", "target")
         numbers = NumberReader(sentence, clause, context, in_scene)
         numbers.read()
-        words = WordReader(sentence, clause, context, in_scene=in_scene, is_plan=is_plan, is_reasoning=is_reasoning)
+        plain = {"in_scene": in_scene, "is_plan": is_plan, "is_reasoning": is_reasoning}
+        words = WordReader(sentence, clause, context, **plain)
         words.read(numbers.beside.used_sides)
-        states = StateReader(sentence, clause, context, in_scene=in_scene, is_plan=is_plan, is_reasoning=is_reasoning)
-        states.read()
-        plain = PlainReader(sentence, clause, context, in_scene=in_scene, is_plan=is_plan, is_reasoning=is_reasoning)
-        plain.read()
-        statements += numbers.statements + words.statements + states.statements + plain.statements
-        left_out = left_out or numbers.left_out or words.left_out or states.left_out
+        statements += numbers.statements + words.statements
+        for reader in _READERS:
+            one = reader(sentence, clause, context, **plain)
+            one.read()
+            statements += one.statements
+            left_out = left_out or one.left_out
+        left_out = left_out or numbers.left_out or words.left_out
         if is_reasoning or is_plan:
             actions += actions_of(sentence, clause, is_plan=is_plan)
         _carry(clause, context)

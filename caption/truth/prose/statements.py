@@ -10,7 +10,7 @@ from caption.truth.prose.numerals import Numeral
 Kind = Literal[
     "number", "list", "range", "course", "pair", "percent", "ratio", "clock", "speeds", "extreme",
     "trend", "steady", "mixed", "changing", "side", "centre", "visibility", "state", "comparison",
-    "record", "course_side", "unit",
+    "record", "course_side", "unit", "motion", "extent", "framing", "lies", "sight", "faster",
 ]  # fmt: skip
 Mode = Literal["value", "change", "either"]
 Hedge = Literal["", "about", "more", "less"]
