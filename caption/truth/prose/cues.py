@@ -91,8 +91,10 @@ class Context:
     latest: str = ""  # who was named last
     cue: str = ""
     told: str = ""  # what a verb told of since: "climbs"
+    told_way: int = 0  # +1 of what went up there, -1 down
     people: tuple[str, ...] = ()  # named in the sentence so far
     has_past: bool = False
+    has_frame: bool = False  # a frame before now was named
 
 
 def gap(token: Token, start: int, end: int) -> int:

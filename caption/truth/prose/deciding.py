@@ -173,7 +173,8 @@ def argues_against(decision: str, said: list[Said], last: list[Said]) -> list[Sa
     plainly.
     """
     decision = kin_of(decision)
-    if (final := _final(last)) is not None and _is_plainly_opposite(decision, final):
+    final = _final(last)
+    if final is not None and _is_plainly_opposite(decision, final) and decision not in _allowed(_beside(final, last)):
         return [final]
     asked = [one for one in said if one.force == "directive"] or [one for one in said if one.force == "aim"]
     asked = asked or [one for one in last if one.force == "open" and (one.side or one.action not in _SIDED)]
@@ -193,6 +194,13 @@ def _final(last: list[Said]) -> Said | None:
     """Give what the last sentence asks for in the end, whatever was asked for before."""
     asked = [one for one in last if one.force == "directive" and (one.side or one.action not in _SIDED)]
     return asked[-1] if asked else None
+
+
+def _beside(final: Said, last: list[Said]) -> list[Said]:
+    """Give what else its own clause asks for, or leaves open in words of a side: "a small turn to the left keeps him centred; it can go on hovering"."""
+    return [
+        one for one in last if one != final and (one.clause == final.clause or (one.side and one.force == "option"))
+    ]
 
 
 def _is_plainly_opposite(decision: str, said: Said) -> bool:

@@ -170,7 +170,13 @@ class Moments:
         """Give the frame under which a sentence stands: "t4 log: height 18.3 m, range 22.5 m"."""
         head = self.sentence.clauses[0]
         times = times_of(head)
-        if head.numerals or len(times) != 1 or len(times[0][1]) != 1 or not self.text.startswith(":", head.end):
+        if (
+            head.numerals
+            or len(head.of("time")) != 1
+            or len(times) != 1
+            or len(times[0][1]) != 1
+            or not self.text.startswith(":", head.end)
+        ):
             return None
         return times[0][1][0]
 
@@ -214,7 +220,8 @@ _ORDER = ("first", "second", "third", "fourth")
 _NTH_AFTER = re.compile(
     r"\s*(?:in|at|during|over) the (?P<nth>first|second|third|fourth|last|final|latest) (?P<of>step|frame)\b"
 )
-_IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $")  # "after 1.3 m/s at t2 only 0.19 is left"
+# "after 1.3 m/s at t2 only 0.19 is left", "t0 to t4: 0.19"
+_IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $|\bt\d\s*(?:至|到|to|→|-|~)\s*$")
 _IS_AT = {  # what a value has come to
     "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$|\b(?:is|are) (?:(?:\w+ly|now|already|still|just|merely) )?\w+ing (?:again |along |on |away )?at (?:(?:only|just|about|roughly|some|a mere) )*$"),
     "zh": re.compile(r"已(?:经)?(?:提速?|升|降|减速?|放慢|加速|回落|收|缩|变|压|拉|涨|飞|走|跑|转)?(?:到|至|为|达)(?:了)?(?:约)?\s*$"),

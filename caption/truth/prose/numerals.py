@@ -68,6 +68,7 @@ def masked(sentence: str, language: Language) -> tuple[str, tuple[str, ...]]:
         text = _OF_TIME.sub(r"\1 \2 ", _GLOSSED.sub(r"\1", text))
     if "-" in text or "→" in text or "=" in text:
         text = _EQUALS.sub(" = ", _ARROW.sub(" → ", _HYPHEN.sub(" ", text)))
+    text = _QUOTED.sub(r" \1 ", text)
     if language == "en":
         text = _LAST_FEW.sub(r"\1 frames", text).replace(" decimal ", " point ")
         text = _SIDE_LETTER.sub(lambda match: " left" if match[1] in ("l", "left") else " right", text)
@@ -84,6 +85,7 @@ def masked(sentence: str, language: Language) -> tuple[str, tuple[str, ...]]:
 
 
 _SIDE_LETTER = re.compile(r"(?<=[\dx°g])\s*\(?\b(left|right|l|r)\b\)?(?![/'])")  # "33 px L", "+21.4° (left)"
+_QUOTED = re.compile(r"[\"“](\w+)[\"”]")  # a word in scare quotes begins no clause
 _KEEPS = re.compile(rf"\s?(?:{_KEPT})")
 
 

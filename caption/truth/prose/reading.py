@@ -130,8 +130,10 @@ def _carry(clause: Clause, context: Context) -> None:
         context.told = ""
         context.cue = cues[-1].value if clause.numerals or len(cues) == 1 else cues[0].value
     else:
-        trends = [_TOLD_BY[t.value] for t in clause.of("trend") if t.value in _TOLD_BY]
-        context.told = trends[0] if trends else context.told
+        trends = [t.value for t in clause.of("trend") if t.value in _TOLD_BY]
+        if trends:
+            context.told, context.told_way = _TOLD_BY[trends[0]], 1 if trends[0].endswith("up") else -1
     if context.cue == "height" and clause.has("quantity", "box"):
         context.cue = "tall"
     context.has_past = context.has_past or clause.has("time", "past", "start", "prev1", "prev2")
+    context.has_frame = context.has_frame or any(frames != (NOW,) for _, frames in times_of(clause))

@@ -26,6 +26,7 @@ _EARLIER = re.compile(
 )
 _AGAINST = re.compile(r"\b(?:against|versus|vs)\b|对(?!方)|比")
 _OBJECT = re.compile(r"[比是为于及达到]")
+_OF_OTHER = re.compile(r"的\s*(?:约|近|将近|大约|差不多)?\s*")  # "接近目标的五倍"
 
 
 def ratio_statement(
@@ -110,7 +111,7 @@ class _Multiple:
         if speeds and not self.is_earlier and (is_behind or self._compares_two()):
             first = 1 if context.people and context.people[0] == "drone" else -1
             return ("speed_ratio",), first if is_behind else _direction(
-                self.sentence, self.before, self.after, context, self.end
+                self.sentence, self.before, self.after, context, self.start, self.end
             )
         only_differs = all(t.value == "difference" for t in self.clause.of("quantity"))
         if speeds and self.people and len(self.owners) == 2 and only_differs:
@@ -276,12 +277,15 @@ def _is_object(sentence: Sentence, before: list, after: list) -> bool:
 _AS_FAST = re.compile(r"\s*(?:as (?:fast|quick|quickly)|(?:the|that) (?:speed|pace))\b(?! (?:of|as))")
 
 
-def _direction(sentence: Sentence, before: list, after: list, context: Context, end: int) -> int:
+def _direction(sentence: Sentence, before: list, after: list, context: Context, start: int, end: int) -> int:
     """Say whose speed is the multiple of the other's: +1 the drone's."""
     if sentence.language == "zh":
         if len(before) >= 2 and before[0].value != before[-1].value:
             return 1 if before[0].value == "drone" else -1
-        is_object = before and _OBJECT.search(sentence.text[max(0, before[-1].start - 4) : before[-1].start])
+        is_object = before and (
+            _OBJECT.search(sentence.text[max(0, before[-1].start - 4) : before[-1].start])
+            or _OF_OTHER.fullmatch(sentence.text, before[-1].end, start)
+        )
         if before and not is_object:
             return 1 if before[-1].value == "drone" else -1
         if before and not context.subject:

@@ -30,7 +30,7 @@ _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between 
 _FURTHER = re.compile(r"(?:further|farther) (?:under|below|beneath|above|down|up|left|right|along|into|to the)\b")
 _BESIDE = re.compile(r"[侧方]")
 _NO_CHANGE = re.compile(
-    r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
+    r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|slid(?:es?|ing)? (?:along|over|across|beside)\b|jump\w* (?:back )?from (?:\w+ )?#(?:\.#)? px|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
 )
 _GOES = re.compile(r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行")
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
@@ -213,6 +213,8 @@ class WordReader(ClauseWords):
             return ""
         if token.start - self.clause.start > (30 if self.language == "en" else 10):
             return ""
+        if self.context.told and token.value == ("down" if self.context.told_way > 0 else "up"):
+            return ""  # "is gathering speed and dropping": goes the other way, so it is something else
         return self.context.told or self.context.cue
 
     def _trend_span(self) -> tuple[int, int] | None:
@@ -239,7 +241,9 @@ class WordReader(ClauseWords):
         ):
             return (NOW,)
         is_past = (
-            self.clause.has("time", "past", "until", "start", "prev1", "prev2", "max", "min") or self.context.has_past
+            self.clause.has("time", "past", "until", "start", "prev1", "prev2", "max", "min")
+            or self.context.has_past
+            or (self.language == "zh" and self.context.has_frame)  # no tense tells that it is still that frame's
         )
         return None if is_past or times_of(self.clause) else (NOW,)
 

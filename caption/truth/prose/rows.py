@@ -54,6 +54,8 @@ class Rows:
             frames = None if later or loose or (is_past and not self.clause.has("time", "now")) else (NOW,)
         side, vertical = self.beside.side(numeral)
         first = self.sentence.numerals[early]
+        if numeral.unit == "px" and (side or vertical):
+            names, is_cued = ("offset_x",) if side else ("offset_y",), True
         told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
         people = {*self.context.people, *(t.value for t in self.clause.of("who", "drone", "target"))}
         goes_on = numeral.unit == "mps" and len(people) == 1 and not self.sureness.closes()

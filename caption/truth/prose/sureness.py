@@ -11,6 +11,7 @@ from functools import cached_property
 from caption.truth.prose.changing import MORE_BY, MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import GOES_TO, Context, names_of, tells_step
+from caption.truth.prose.lexicon import Token
 from caption.truth.prose.moments import Moments
 from caption.truth.prose.naming import OFF_CENTRE, OVER_OTHER
 from caption.truth.prose.numerals import Numeral
@@ -206,7 +207,8 @@ class Sureness:
         tokens = [t for t in tokens if t.start not in at]  # "flew at 20 m"
         link = LINK[self.language]
         near = [t for t in tokens if t.end <= numeral.start and link.fullmatch(self.text, t.end, numeral.start)]
-        near += [t for t in tokens if t.start >= numeral.end and BEHIND.fullmatch(self.text, numeral.end, t.start)]
+        behind = [t for t in tokens if t.start >= numeral.end and BEHIND.fullmatch(self.text, numeral.end, t.start)]
+        near += [t for t in behind if not self.is_before_number(t)]
         near += [t for t in tokens if numeral.start < t.start < numeral.end < t.end]  # "17 px high"
         if near:
             found = {t.value for t in near}
@@ -220,6 +222,11 @@ class Sureness:
         ]
         found = {t.value if t.kind == "quantity" else _TOLD[t.value] for t in told}
         return found if len({named[cue] for cue in found}) == 1 and any(t.end <= numeral.start for t in told) else set()
+
+    def is_before_number(self, token: Token) -> bool:
+        """Tell whether a number of its own stands right behind a quantity: "飞了5.1米却只位移0.4米"."""
+        after = [n.start for n in self.sentence.numerals if n.start >= token.end]
+        return self.language == "zh" and bool(after) and not self.text[token.end : after[0]].strip()
 
     def _owned(self, cue: str, numeral: Numeral) -> tuple[str, ...]:
         if self.clause.has("quantity", "bearing") or (self.clause.has("side") and len(self.people) > 1):

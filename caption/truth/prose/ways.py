@@ -90,7 +90,11 @@ class Ways:
         elif len(owners) > 1 or not named:
             owners = {"drone", "target"}  # of somebody who may not be known
         ways = ["target_travelled"] if "target" in owners else []
-        straight = [gap(t, numeral.start, numeral.end) for t in self.clause.of("quantity", "displacement")]
+        straight = [
+            gap(t, numeral.start, numeral.end)
+            for t in self.clause.of("quantity", "displacement")
+            if t.start < numeral.start or not self.sureness.is_before_number(t)
+        ]
         if "drone" in owners and min(straight, default=99) > _BESIDE:
             ways.append("travelled")
         if "drone" in owners and (straight or not _PATH.search(self.text, self.clause.start, self.clause.end)):
