@@ -237,6 +237,14 @@ def test_set_words_contradict_in_any_wording(case, monkeypatch):
         assert problems_of(case, case.text.replace(old, new)), f"{old} -> {new}"
 
 
+@pytest.mark.parametrize(
+    ("language", "text"), [("en", "the drone is left of the walker at 3 m "), ("zh", "无人机比行人在左")]
+)
+def test_a_sentence_without_an_end_is_left_unread(language, text):
+    """As a model writes that repeats itself; read, ten thousand words of it would take hours."""
+    assert state_of(text * 10_000, language) == "unread"
+
+
 @pytest.mark.parametrize("case", CASES[::7], ids=lambda case: case.text[:40])
 def test_what_is_not_read_is_not_proved(case):
     """A sentence with a number that nothing is known of, or nothing to compare, is unread."""

@@ -50,6 +50,7 @@ _SAID_OUTRIGHT = (*_NUMBERS, "lies", "sight", "faster")  # of which no word besi
 _NEVER_MISREAD = (*_STRONG, "state", "course", "pair", "centre", "record", "course_side")
 _SELDOM_MISREAD = ("comparison", "visibility", "clock", "list", "range", "extreme")
 _SHOWN = 120  # characters of a sentence in a message
+_LONGEST = 500  # characters of a sentence that is read; the longest of 6,000 in free prose has 325, and a model that repeats itself ends none
 
 
 def check_evidence(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[str]:
@@ -75,6 +76,11 @@ def judge_sentences(coc: Coc, facts: Facts, cfg: EvidenceConfig, language: Langu
     for name, text in sentences_of(coc):
         if name[0] != letter:
             letter, subject = name[0], ""
+        if len(text) > _LONGEST:
+            subject = ""
+            forms.append(Form("", (), (), True, ""))
+            judged.append(Judged(name, text, "unread", ()))
+            continue
         hidden, runs = masked(text, language)
         form = read_form(hidden, language, subject, letter == "R")
         if forms and forms[-1].asks_of_past:
