@@ -28,6 +28,9 @@ _GOES_TO = {  # other words that end at their number
     "en": re.compile(r"\b(?:jump|leap|leapt|burst|shot|surge|spr[iau]ng|dash|rush|swing|swung|went|gone|move|ease|settle|relax|brake|dawdle|c[ao]me)(?:s|ed|d|ped|ing)? (?:(?:back|up|down|away|out) )*to (?:(?:about|around|roughly|some|almost|nearly|only|just|a mere|now) )*$"),
     "zh": re.compile(r"[跳窜冲蹿飙走跑飞慢快提涨缩拉退追落回弹变开收减加](?:高|低|近|远|大|小|慢|快|速)?[到至](?:了)?(?:约|大约|近|将近)?\s*$"),
 }  # fmt: skip
+_ASIDE_OF = re.compile(
+    r"\s*(?:to the )?(?:left|right|above|below) (?:of )?(?:the )?(?:\w+ )?(?:cent(?:re|er)|middle|axis)\b"
+)
 AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
 _AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _IN_LAST_STEP = {
@@ -38,7 +41,7 @@ _COMES_BY = re.compile(r"\bby (?:(?:about|around|roughly|some|almost|nearly|only
 _PER_STEP = {  # before a number, and after it
     "en": (
         re.compile(r"\b(?:each|every) (?:half second|step|frame) (?:(?!at |in |of |is |was |to |on )\w+ ){1,3}?(?:(?:about|roughly|around|some|almost|nearly|by) )*$"),
-        re.compile(r"\s*(?:to the )?(?:left |right |clockwise )?(?:(?:per|each|every|a|with every|with each) (?:single )?(?:half second |frame |0\.5 s )?(?:frame|step|interval|half second)\b(?! (?:ago|earlier|before|back|later))|from (?:one )?(?:frame|step) to (?:the next|frame|step)\b)"),
+        re.compile(r"\s*(?:to the )?(?:left |right |clockwise )?(?:(?:in each(?= interval)|per|each|every|a|with every|with each) (?:single )?(?:half second |frame |0\.5 s )?(?:frame|step|interval|half second)\b(?! (?:ago|earlier|before|back|later))|from (?:one )?(?:frame|step) to (?:the next|frame|step)\b)"),
     ),
     "zh": (re.compile(r"(?:每帧|每步|每一步|每一帧|逐帧|每半秒|每0\.5\s?秒|每隔半秒)[^#,;是为在]{0,8}$"), None),
 }  # fmt: skip
@@ -66,6 +69,8 @@ class Changing:
 
     def change(self, numeral: Numeral) -> tuple[Mode, int]:
         """Say whether a number is a change, and which way."""
+        if numeral.unit == "px" and _ASIDE_OF.match(self.text, numeral.end):
+            return "value", 0  # "had jumped 26 px to the right of the centre"
         before = [t for t in self.clause.tokens if t.kind in ("trend", "link") and t.end <= numeral.start]
         before = [t for t in before if not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)]
         ratios = {t.start for t in self.clause.of("ratio")}
@@ -160,8 +165,8 @@ class Changing:
 
     def is_per_step(self, numeral: Numeral) -> bool:
         """Tell whether a number is told of each step: "0.5 m per step", "每半秒多 0.5 米", "every half second adds 1.8 m"."""
-        if numeral.unit == "mps":
-            return False  # "1.1 m/s in every step"
+        if numeral.unit == "mps" or (self.language == "zh" and self.reached(numeral)):
+            return False  # "1.1 m/s in every step", "逐帧回升到 21.6 米"
         before, after = _PER_STEP[self.language]
         if after is not None and after.match(self.text, numeral.end):
             return True

@@ -118,7 +118,9 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
             t.value,
         )
         for t in clause.of("who", "drone", "target")
-        if sentence.text[t.start : t.end] not in OBJECTS and not is_aimed_at(sentence, clause, t)
+        if sentence.text[t.start : t.end] not in OBJECTS
+        and not is_aimed_at(sentence, clause, t)
+        and not _is_verb_of_other(clause, t)
     )
     if not ranked and _ITS.search(sentence.text, clause.start, clause.end):
         return ""
@@ -133,6 +135,11 @@ def owner_of(sentence: Sentence, clause: Clause, start: int, end: int, context: 
     if others and others[0] - best < (5 if sentence.language == "en" else 2):
         return ""
     return owner
+
+
+def _is_verb_of_other(clause: Clause, token: Token) -> bool:
+    """Tell whether what tells of one is said of the other, who stands right before it: "the drone dawdles"."""
+    return any(t.value != token.value and 0 <= token.start - t.end <= 1 for t in clause.of("who", "drone", "target"))
 
 
 _TOWARDS = re.compile(r"\b(?:towards?|away from|after|past|behind|around|round) (?:the |our )?$|(?:朝着?|朝向|远离)$")

@@ -36,7 +36,7 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
     left_out = any_plan = False
     for clause in sentence.clauses:
         is_plan = _is_plan(masked, clause, is_reasoning, any_plan)
-        any_plan = any_plan or is_plan
+        any_plan = any_plan or is_plan or (is_reasoning and clause.has("modality", "future"))
         in_scene = clause.has("who", "scene") and not clause.has("who", "drone", "target")
         numbers = NumberReader(sentence, clause, context, in_scene)
         numbers.read()
@@ -52,7 +52,7 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
         left_out = left_out or numbers.left_out or words.left_out
         if is_reasoning or is_plan:
             actions += actions_of(sentence, clause, is_plan=is_plan)
-        _carry(clause, context)
+        _carry(masked, clause, context)
     statements = _per_frame(statements)
     return Form(
         masked,
@@ -120,7 +120,7 @@ _TOLD_BY = {
 }  # fmt: skip
 
 
-def _carry(clause: Clause, context: Context) -> None:
+def _carry(text: str, clause: Clause, context: Context) -> None:
     people = clause.of("who", "drone", "target")
     if people:
         context.people += tuple(t.value for t in people)
@@ -136,4 +136,6 @@ def _carry(clause: Clause, context: Context) -> None:
     if context.cue == "height" and clause.has("quantity", "box"):
         context.cue = "tall"
     context.has_past = context.has_past or clause.has("time", "past", "start", "prev1", "prev2")
-    context.has_frame = context.has_frame or any(frames != (NOW,) for _, frames in times_of(clause))
+    if any(frames != (NOW,) for _, frames in times_of(clause)):
+        context.has_frame = True
+        context.has_past = context.has_past or text.startswith(":", clause.end)  # "t0 and t1: target partly hidden"

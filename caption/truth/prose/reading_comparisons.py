@@ -58,6 +58,8 @@ def compared_speeds(sentence: Sentence, clause: Clause, context: Context, token:
     cue: the quantity nearest to the word.
     """
     text = sentence.text[token.start : token.end]
+    if sentence.text[: token.start].endswith(("或", "或者", " or ")):
+        return None  # "3 m/s or faster"
     near = any(
         sentence.numerals[i].unit == "mps" and abs(sentence.numerals[i].start - token.end) < 30 for i in clause.numerals
     )

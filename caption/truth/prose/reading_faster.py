@@ -35,7 +35,7 @@ _NO_SPEED = {
         r"\b(?:ever|each|every|before|earlier|than (?:before|at|in|it was|that)|getting|chang\w*|direction|grow\w*|did|was|were|distance|gap|range|height|altitude|high|tall|wide|width|box|turns?|turning|yaw\w*|climb\w*|descen\w*|degrees|metres|covered|as much ground|ground as|initially|at first|had|if|would|could|should|must|need\w*|not|n't|no|never|nor|neither|rather|let|first|needed|window|start|frame|step ago|second ago)\b|°|px"
     ),
     "zh": re.compile(
-        r"越|原来|前者|后者|比(?:刚才|之前|先前|最初|起初|上一|前一|t\d|开始|开头|第|半秒|一秒|窗口|原来|自己)|距离|高度|画面|框|宽|高|路|俯|角|度(?!不)|像素|时快时慢|不(?!及|到|如)|没|若|如果|应|要(?!慢|快)|需|可以|再|刚|曾|先(?!生)|起初|最|步比|帧比|变|加|减|放慢|得更|愈|忽|尽快|赶|走了|飞了|挪"
+        r"[前上]一[步帧]|越|原来|前者|后者|比(?:刚才|之前|先前|最初|起初|上一|前一|t\d|开始|开头|第|半秒|一秒|窗口|原来|自己)|距离|高度|画面|框|宽|高|路|俯|角|度(?!不)|像素|时快时慢|不(?!及|到|如)|没|若|如果|应|要(?!慢|快)|需|可以|再|刚|曾|先(?!生)|起初|最|步比|帧比|变|加|减|放慢|得更|愈|忽|尽快|赶|走了|飞了|挪"
     ),
 }
 _AGAINST = re.compile(r"\b(?:against|versus|vs|than|to)\b|对|比")

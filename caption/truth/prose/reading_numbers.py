@@ -12,6 +12,7 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     OVERALL,
     Context,
+    crossing,
     times_of,
 )
 from caption.truth.prose.naming import Naming
@@ -27,6 +28,8 @@ from caption.truth.prose.ways import WAYS, Ways
 
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
 # A turn that is told from the window's start: its sum.
+_OF_FIRST = re.compile(r"(?:首帧|起始|初始|最初|t0时?)[^,;#]{0,4}[左右]侧$")  # "首帧航向左侧 10°": of the turn since
+_OF_SOME_MOMENT = re.compile(r"\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消")
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )
@@ -212,7 +215,10 @@ class NumberReader:
         names, mode, trend = self._change(numeral, names)
         if numeral.unit == "mps" and self.sureness.is_of_one_step(numeral):
             names = tuple([name for name in names if name != "target_mean"])
+        if mode == "change" and numeral.unit == "m" and self._is_of_height():
+            names = ("altitude",)
         side, vertical = self.beside.side(numeral)
+        side = 0 if numeral.sign and numeral.unit == "deg" else side  # "to the left of our own -147.4 degrees"
         sure_names = self.sureness.names(numeral, self.naming.told_after(numeral))
         sure_frames = self.sureness.frames(numeral)
         if frames == "":
@@ -220,6 +226,8 @@ class NumberReader:
         boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
         if numeral.unit == "px" and (side or vertical) and not boxed:
             names = ("offset_x",) if side else ("offset_y",)
+        if numeral.unit == "px" and sure_names and not set(names) & set(sure_names):
+            names = sure_names
         found = Statement(
             kind="range" if kind == "range" else "number",
             clause=(self.clause.start, self.clause.end),
@@ -235,7 +243,8 @@ class NumberReader:
             sure_frames=sure_frames,
             sure_mode=self.sureness.mode(numeral),
             reached=self.changing.reached(numeral),
-            is_last=not any(t.start < numeral.end + _NEAR for t, moment in times_of(self.clause) if moment != (NOW,)),
+            is_last=not self.sureness.moments.goes_on_after(numeral)
+            and not any(t.start < numeral.end + _NEAR for t, moment in times_of(self.clause) if moment != (NOW,)),
             is_per_step=self.changing.is_per_step(numeral),
         )
         if self.naming.is_from_origin(numeral):
@@ -255,6 +264,8 @@ class NumberReader:
             )
         found = self._angle(found) if numeral.unit == "deg" else found
         if self.changing.goes_from(numeral):
+            found = replace(found, frames=None, sure_frames=None)
+        if _OF_SOME_MOMENT.search(self.text, self.clause.start, self.clause.end):
             found = replace(found, frames=None, sure_frames=None)
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
@@ -280,6 +291,8 @@ class NumberReader:
     def _angle(self, s: Statement) -> Statement:
         """Read an angle with a side as a turn: the target's, or the drone's from the window's start."""
         numeral = self.sentence.numerals[s.numbers[0]]
+        if _OF_FIRST.search(self.text, self.clause.start, numeral.start):
+            return replace(s, names=("yaw",), sure_names=(), frames=None, sure_frames=None)
         if s.side and self.naming.is_of_nose(numeral):
             s = replace(s, names=("bearing", "relative_course"), mode="value", sure_mode="value")
             return replace(s, sure_names=s.names, frames=s.sure_frames or s.frames)
@@ -301,13 +314,27 @@ class NumberReader:
             return True
         return _SO_FAR.search(self.text, self.clause.start, self.clause.end) is not None and self.ways.tells_all()
 
+    def _is_of_height(self) -> bool:
+        """Tell whether a clause without a quantity tells of a climb or descent: "the drone climbs about half a metre"."""
+        vertical, apart = ("alt_up", "alt_down"), ("dist_up", "dist_down")
+        clause = self.clause
+        return not clause.has("quantity") and clause.has("trend", *vertical) and not clause.has("trend", *apart)
+
+    def _is_by_a_word(self, numeral: Numeral) -> bool:
+        """Tell whether a quantity stands before a number, or behind it and no other: not "at 13.4 m with 5.9 m between us"."""
+        cues = self.clause.of("quantity")
+        return any(
+            t.start < numeral.end or not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)
+            for t in cues
+        )
+
     def _surely(self, s: Statement, numeral: Numeral) -> Statement:
         """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""
         more = MORE_THAN.match(self.text, numeral.end)
         is_bare = not (self.clause.has("link", "than") or _PER.search(self.text, self.clause.start, self.clause.end))
         is_bare = is_bare and not (more and more["than"])
         is_length = (
-            numeral.unit == "m" and is_bare and self.clause.has("quantity") and not self.sureness.is_in_group(numeral)
+            numeral.unit == "m" and is_bare and self._is_by_a_word(numeral) and not self.sureness.is_in_group(numeral)
         )
         if set(s.names) <= WAYS and not self.sureness.owners.owner(numeral):
             is_length = False  # of somebody who is not known to have been named

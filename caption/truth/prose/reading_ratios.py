@@ -26,6 +26,7 @@ _EARLIER = re.compile(
 )
 _AGAINST = re.compile(r"\b(?:against|versus|vs)\b|对(?!方)|比")
 _OBJECT = re.compile(r"[比是为于及达到]")
+_HALVES = re.compile(r"(?:halv|doubl|tripl|trebl)\w+|减半|翻[了一两]?[倍番]")  # seldom exact
 _OF_OTHER = re.compile(r"的\s*(?:约|近|将近|大约|差不多)?\s*")  # "接近目标的五倍"
 
 
@@ -318,4 +319,4 @@ def _hedge(sentence: Sentence, clause: Clause, start: int, end: int) -> Hedge:
             sentence.language == "zh" and -1 <= distance <= 12 and token.end <= start
         ):
             found = token.value  # type: ignore[assignment]
-    return found
+    return "about" if not found and _HALVES.match(text, start) else found

@@ -90,6 +90,10 @@ class SideReader(ClauseWords):
                 self.text, self.clause.start, self.clause.end
             ):
                 continue
+            if word == "box" and self.text.endswith(("向", "往", "朝"), 0, match.start()):
+                continue  # "向画面左边横穿过去"
+            if word == "bend" and self.text.endswith(("the ", "this ", "a "), 0, match.start()):
+                continue  # "the swing to the left must not stop": whose is not told
             is_noun = match.groupdict().get("adj")  # "1.4° of left yaw": asked for or done
             if is_noun and not _SO_FAR.search(self.text, self.clause.start, self.clause.end):
                 continue

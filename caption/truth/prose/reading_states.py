@@ -15,6 +15,14 @@ _UNSURE = {
     "zh": re.compile(r"后|短暂|曾|直到|自|起|一度|之前|此前|先|又"),
 }
 _RUNNING = re.compile(r"\b(?:run|running|jog|jogs|jogging|sprint|sprinting|sprints|sprinted|rushing)\b|跑|奔")
+_NONE_OF = re.compile(
+    r"\b(?:none|not one) of the\b|\bnothing in the (?:picture|frame|image|view) (?:is|has|calls|needs|moves|changes)\b"
+)
+_FRAMES_OF = re.compile(
+    r"\b(?:one|two|three|four|#) frames? of (?!the\b)\w+, "
+)  # "two frames of occlusion, one of partial cover"
+_OF_A_THING = re.compile(r"(?:方向|高度|航向|机头|距离|位置|角度)[^,;]{0,3}$")  # "方向也没动"
+_AFTER_A_MOMENT = re.compile(r"\bafter (?:the |that )?(?:first|second|third|fourth|t\d)\b")
 _IDIOM = re.compile(
     r"\s+(?:out of|out|low|late|short|high|hot|parallel|in parallel|smoothly)\b"
 )  # "running out of room"
@@ -76,6 +84,9 @@ class StateReader(ClauseWords):
             return
         if text == "可见" and token.start == self.clause.start and self.clause.end - token.end >= 4:
             return  # "it can be seen that"
+        if _NONE_OF.search(self.text, self.clause.start, self.clause.end):
+            self.left_out = True
+            return
         if self.is_plan or ((self.in_scene and not self.clause.has("who", "target")) and not self._is_sight()):
             self.left_out = self.left_out or self.is_plan
             return
@@ -106,7 +117,11 @@ class StateReader(ClauseWords):
         numerals = [self.sentence.numerals[i] for i in self.clause.numerals]
         named = [t for t, _ in times_of(self.clause)]  # "第二帧" is no count
         counted = any(n.unit == "frames" and not any(t.start <= n.start < t.end for t in named) for n in numerals)
-        counted = counted or "连续第" in self.text[self.clause.start : self.clause.end]
+        counted = (
+            counted
+            or _FRAMES_OF.search(self.text) is not None
+            or "连续第" in self.text[self.clause.start : self.clause.end]
+        )
         spans = [t for t in self.clause.of("time") if t.value.startswith(("last:", "first:"))]
         part = self.text[self.clause.start : self.clause.end]
         spans += [t for t in self.clause.of("time", "since") if times_of(self.clause)]
@@ -172,10 +187,11 @@ class StateReader(ClauseWords):
         )
         if barely:
             return
-        if _IDIOM.match(self.text, token.end):
+        if _IDIOM.match(self.text, token.end) or _OF_A_THING.search(self.text, self.clause.start, token.start):
             return
         running = _RUNNING.search(text) is not None
-        frames = None if told and token.value == "standing" else self._frames(token)
+        is_after = _AFTER_A_MOMENT.search(self.text, self.clause.start, self.clause.end)
+        frames = None if is_after or (told and token.value == "standing") else self._frames(token)
         word = "running" if running else token.value
         self._add(token, kind="state", word=word, negated=self.sentence.is_negated(self.clause, token), frames=frames)
 

@@ -32,7 +32,12 @@ _BESIDE = re.compile(r"[侧方]")
 _NO_CHANGE = re.compile(
     r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|slid(?:es?|ing)? (?:along|over|across|beside)\b|jump\w* (?:back )?from (?:\w+ )?#(?:\.#)? px|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
 )
-_GOES = re.compile(r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行")
+_GOES = re.compile(
+    r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行|横穿|穿过|移动|横过|跑去"
+)
+_AT_A_SPEED = re.compile(
+    r"\s*at (?:(?:about|roughly|some|just|only) )?#"
+)  # "he approaches at 1.2 m/s": the way that he goes
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
 
 
@@ -143,6 +148,7 @@ class WordReader(ClauseWords):
                 _FURTHER.match(self.text, token.start)
                 or self.clause.has("quantity", "centre")
                 or self.clause.has("who", "scene")
+                or _AT_A_SPEED.match(self.text, token.end)
                 or self._nears_something(token)
             ):
                 return ()

@@ -12,6 +12,9 @@ from caption.truth.prose.statements import NOW, Statement
 from caption.truth.prose.sureness import Sureness
 from caption.truth.prose.timing import Timing
 
+_BECOMES = re.compile(r"\s*(?:has|have) (?:now )?(?:become|shrunk|grown)\b|\s*(?:已经?)?(?:变成|变为|缩成|成了)")
+_LED_TO = re.compile(r"\bto (?:(?:about|roughly|some|only|just|a mere) )?$")
+_AND_BACK = re.compile(r"\band (?:\w+ )?(?:back|recover\w*)\b")
 _EXTREME = re.compile(r"\b(?:biggest|largest|smallest|tallest|widest|peak)\b|最")
 
 
@@ -44,7 +47,12 @@ class Rows:
         others = ("dist", "alt") if numeral.unit == "mps" else ()  # "the speed has dropped back to 3.5 m/s"
         trends = [t for t in self.clause.of("trend") if t.value.endswith(("up", "down"))]
         trends = [t for t in trends if not t.value.startswith(others)] if others else trends
+        first = self.sentence.numerals[early]
+        if _LED_TO.search(self.text, self.clause.start, first.start):  # "after slowing to 2 m/s they sprang to 8.7 m/s"
+            trends = [t for t in trends if t.start >= first.end]
+        is_there_and_back = _AND_BACK.search(self.text, first.end, numeral.start) is not None
         signs = {1 if t.value.endswith("up") else -1 for t in trends if not self.sentence.is_negated(self.clause, t)}
+        signs = set() if is_there_and_back else signs
         start = self.timing.adjacent_frames(self.sentence.numerals[early])
         frames = self.timing.adjacent_frames(numeral)
         if frames is None:
@@ -53,7 +61,6 @@ class Rows:
             later = any(t.value == "now" and t.start > numeral.end for c in self.sentence.clauses for t in c.of("time"))
             frames = None if later or loose or (is_past and not self.clause.has("time", "now")) else (NOW,)
         side, vertical = self.beside.side(numeral)
-        first = self.sentence.numerals[early]
         if numeral.unit == "px" and (side or vertical):
             names, is_cued = ("offset_x",) if side else ("offset_y",), True
         told = {own for n in (first, numeral) if (own := self.sureness.names(n))}
@@ -97,7 +104,7 @@ class Rows:
         frames: tuple[int, ...] | None = None if is_past and not self.clause.has("time", "now") else (NOW,)
         if len(members) == 2 and len(times) == 1:
             frames = times[0][1]
-        elif (
+        elif _BECOMES.match(self.text, self.sentence.numerals[members[-1]].end) or (
             self._is_beside_now()
             or self.clause.has("time", "max", "min")
             or _EXTREME.search(self.text, self.clause.start, self.clause.end)

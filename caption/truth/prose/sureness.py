@@ -22,6 +22,10 @@ from caption.truth.prose.versus import pairs_of_speeds
 _OFF_TO = re.compile(
     r"\s*(?:(?:to the |over to the )?(?P<x>left|right)|above|below) (?:of )?(?:and #(?:\.#)? ?(?:px|pixels) (?:to the )?(?:left|right|above|below) (?:of )?)?(?:the )?(?:\w+ )?(?:middle|cent(?:re|er)|axis|cross ?hairs?|reticle|midline)\b"
 )
+# "19 px across and 27 px down", both from the centre
+_ACROSS = re.compile(
+    r"\s*across (?P<and>and #(?:\.#)? ?(?:px|pixels) (?:down|low|up|high|below|above))|\s*(?:down|low)\b"
+)
 _ASIDE = re.compile(r"偏[左右](?:了|约|大约|近)?\s*$")
 _CLOSING = re.compile(
     r"\b(?:clos(?:ing|ure)|approach\w*|opening|relative|vertical\w*|climb\w*|sink\w*|descen\w*|surplus|margin|lead|deficit|wind)\b|接近|靠近|逼近|远离|相对|垂直|爬升|升降|下降|富余|风"
@@ -70,6 +74,8 @@ class Sureness:
             return ()
         if _MISSING.search(self.text, self.clause.start, self.clause.end) or self._is_apart(numeral):
             return ()
+        if numeral.unit == "px" and (across := _ACROSS.match(self.text, numeral.end)):
+            return ("offset_x",) if across["and"] else ()
         if numeral.unit == "px" and self.language == "en" and (beside := _OFF_TO.match(self.text, numeral.end)):
             return ("offset_x",) if beside["x"] else ("offset_y",)
         if (
@@ -155,6 +161,8 @@ class Sureness:
             return set()  # "the person is left of the nose, 3 degrees"
         if self.text[: self.clause.start].endswith(("(", ":")) and numeral.unit != "m":
             return set()
+        if self.text[: self.clause.start].endswith(":") and len(told) != 1:
+            return set()  # "gains height while closing in: up by 2.1 m"
         if self.text[: self.clause.start].endswith(("(", ":")):
             last = before[-1].of("quantity") if before else []
             mark = self.clause.start - 1
@@ -266,7 +274,9 @@ class Sureness:
     def ends_of_course(self, first: Numeral, last: Numeral) -> tuple[int, ...] | None:
         """Give the frames of "from A at t1 to B now" or "from A to B in the last step", where both are told."""
         found = [self.moments.beside(n) for n in (first, last)]
-        if found[1] is None and _LATER.search(self.text, last.end, self.clause.end):
+        if found[1] is None and (
+            _LATER.search(self.text, last.end, self.clause.end) or _AND_THEN.match(self.text, last.end)
+        ):
             return None  # "dipping to 18.3 m at the middle frame and back up to 22.2 m half a second later"
         if found[0] is not None:
             return None if found[0] == found[1] else (found[0], NOW if found[1] is None else found[1])
@@ -339,6 +349,7 @@ class Sureness:
 
 
 _LATER = re.compile(r"\blater\b|之后|以后")
+_AND_THEN = re.compile(r"\s*,?\s*(?:and|before|but)? ?then (?:to|back|again|up|down)\b")
 _SIDED = re.compile(r"[左右上下](?:方|侧|边|偏|移)?\s*$")
 _DERIVED = {"en": re.compile(r"\bi\.?e\b\.?|[,;(]\s*that is\b"), "zh": re.compile(r"也就是|亦即|折合|相当于")}
 _ALONG = re.compile(r"\s*(?:in a|as a|along the) straight line\b")

@@ -19,6 +19,7 @@ _GOES = {
     "en": re.compile(r"\b(?:covers|covered|flew|flown|walked|strolled|put in|logged)(?: (?:a mere|only|just|about|some|roughly|all of))? $"),
     "zh": re.compile(r"(?:飞行|行走|行进|航行|飞出|走出|走|飞)(?:了|约|共)?\s*$|(?:总共|一共|合计|累计)\s*$"),
 }  # fmt: skip
+_GONE = re.compile(r"\s*(?:were |was )?(?:(?P<flown>flown)|walked)\b")  # "14.1 m flown against 1.4 m walked"
 # The whole of what was seen, where ways are told.
 _IN_ALL = {
     "en": re.compile(
@@ -81,7 +82,9 @@ class Ways:
         people = self.clause.of("who", "drone", "target")
         named = {self.text[t.start : t.end] for t in people} - _PRONOUNS
         owners = {t.value for t in people}
-        if _FLIES.search(self.text, self.clause.start, numeral.start):
+        if goes := _GONE.match(self.text, numeral.end):
+            owners = {"drone" if goes["flown"] else "target"}
+        elif _FLIES.search(self.text, self.clause.start, numeral.start):
             owners = {"drone"}
         elif not people and (told := self.sureness.owners.gone_on_by(numeral)):
             owners = {told}
