@@ -58,6 +58,24 @@ class ClauseWords:
             return None
         return (NOW,)
 
+    def _trend_span(self) -> tuple[int, int] | None:
+        if self.clause.has("time", "last_step"):
+            return (-2, NOW)
+        if self.clause.has("time", "last_second"):
+            return (-3, NOW)
+        frames = [f[0] for time, f in times_of(self.clause) if len(f) == 1]
+        if len(frames) == 2:
+            return (frames[0], frames[1])
+        if len(frames) == 1 and frames[0] != NOW and self._is_since(frames[0]):
+            return (frames[0], NOW)
+        return None
+
+    def _is_since(self, frame: int) -> bool:
+        """Tell whether "since" stands before the time of a frame: "since t1", not "from 25.6 m down to 23.6 m at t3"."""
+        times = [time for time, frames in times_of(self.clause) if frames[0] == frame]
+        reach = 10 if self.language == "en" else 2
+        return any(0 <= times[0].start - t.end <= reach for t in self.clause.of("time", "since"))
+
     def _told_moment(self, token: Token) -> tuple[int, ...] | None:
         """Give the frames of a word that means one moment: those told, else now; any where another moment is told of."""
         if times_of(self.clause) or not _IN_PASSING.search(self.text, self.clause.start, self.clause.end):

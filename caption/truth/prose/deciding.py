@@ -199,7 +199,10 @@ def _final(last: list[Said]) -> Said | None:
 def _beside(final: Said, last: list[Said]) -> list[Said]:
     """Give what else its own clause asks for, or leaves open in words of a side: "a small turn to the left keeps him centred; it can go on hovering"."""
     return [
-        one for one in last if one != final and (one.clause == final.clause or (one.side and one.force == "option"))
+        one
+        for one in last
+        if one != final
+        and (one.clause == final.clause or one.force == "directive" or (one.side and one.force == "option"))
     ]
 
 

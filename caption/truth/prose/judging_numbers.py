@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from itertools import combinations
 
 from caption.schema import EvidenceConfig
 from caption.truth.prose.changing import EITHER_WAY
@@ -38,15 +37,14 @@ class NumberJudge(NumberComparison):
         return None if found is False and self._is_told_difference(s) else found
 
     def _is_told_difference(self, s: Statement) -> bool:
-        """Tell whether a number is what lies between two others of its sentence: "from 43.8° to 60.0°, that is, 16.2°"."""
+        """Tell whether a number is what lies between the ends of a way that its sentence tells: "from 43.8° to 60.0°, that is, 16.2°"."""
         if s.kind != "number":
             return False
-        numeral, value, step = self.read(s.numbers[0])
-        others = [
-            self.read(i) for i, n in enumerate(self.form.numerals) if n.unit == numeral.unit and i not in s.numbers
-        ]
-        sides = [(abs(a - b), x + y) for (_, a, x), (_, b, y) in combinations(others, 2)]
-        return any(abs(value - between) <= step + slack for between, slack in sides)
+        _, value, step = self.read(s.numbers[0])
+        courses = [one.numbers for one in self.form.statements if one.kind == "course" and len(one.numbers) == 2]
+        return any(
+            abs(value - abs(a - b)) <= step + x + y for (_, a, x), (_, b, y) in (map(self.read, c) for c in courses)
+        )
 
     def _holds(self, s: Statement) -> bool | None:
         if self.is_in_wrong_unit(s):

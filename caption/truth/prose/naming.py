@@ -6,7 +6,7 @@ import re
 
 from caption.truth.prose.changing import MORE_THAN, ZH_MORE
 from caption.truth.prose.clauses import Clause, Sentence
-from caption.truth.prose.cues import Context, cues_of, names_of, owner_of, times_of
+from caption.truth.prose.cues import Context, crossing, cues_of, names_of, owner_of, times_of
 from caption.truth.prose.numerals import Numeral
 
 # "17.5 m beneath us", "19.1 m above the walker": how much higher the drone is.
@@ -142,6 +142,20 @@ class Naming:
 
     def is_from_origin(self, numeral: Numeral) -> bool:
         return _FROM_ORIGIN.search(self.text, self.clause.start, numeral.start) is not None
+
+    def is_of_height(self) -> bool:
+        """Tell whether a clause without a quantity tells of a climb or descent: "the drone climbs about half a metre"."""
+        vertical, apart = ("alt_up", "alt_down"), ("dist_up", "dist_down")
+        clause = self.clause
+        return not clause.has("quantity") and clause.has("trend", *vertical) and not clause.has("trend", *apart)
+
+    def is_by_a_word(self, numeral: Numeral) -> bool:
+        """Tell whether a quantity stands before a number, or behind it and no other: not "at 13.4 m with 5.9 m between us"."""
+        cues = self.clause.of("quantity")
+        return any(
+            t.start < numeral.end or not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)
+            for t in cues
+        )
 
     def is_of_nose(self, numeral: Numeral) -> bool:
         """Tell whether an angle is where somebody is or goes, against the drone's heading."""

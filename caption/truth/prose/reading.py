@@ -36,7 +36,7 @@ def read_form(masked: str, language: Language, subject: str, is_reasoning: bool)
     left_out = any_plan = False
     for clause in sentence.clauses:
         is_plan = _is_plan(masked, clause, is_reasoning, any_plan)
-        any_plan = any_plan or is_plan or (is_reasoning and clause.has("modality", "future"))
+        any_plan = any_plan or is_plan or (is_reasoning and clause.has("modality", "future") and clause.has("action"))
         in_scene = clause.has("who", "scene") and not clause.has("who", "drone", "target")
         numbers = NumberReader(sentence, clause, context, in_scene)
         numbers.read()

@@ -12,7 +12,6 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import (
     OVERALL,
     Context,
-    crossing,
     times_of,
 )
 from caption.truth.prose.naming import Naming
@@ -215,7 +214,7 @@ class NumberReader:
         names, mode, trend = self._change(numeral, names)
         if numeral.unit == "mps" and self.sureness.is_of_one_step(numeral):
             names = tuple([name for name in names if name != "target_mean"])
-        if mode == "change" and numeral.unit == "m" and self._is_of_height():
+        if mode == "change" and numeral.unit == "m" and self.naming.is_of_height():
             names = ("altitude",)
         side, vertical = self.beside.side(numeral)
         side = 0 if numeral.sign and numeral.unit == "deg" else side  # "to the left of our own -147.4 degrees"
@@ -226,8 +225,6 @@ class NumberReader:
         boxed = self.clause.has("quantity", "box", "width", "tall", "height") and is_cued and names[0].startswith("box")
         if numeral.unit == "px" and (side or vertical) and not boxed:
             names = ("offset_x",) if side else ("offset_y",)
-        if numeral.unit == "px" and sure_names and not set(names) & set(sure_names):
-            names = sure_names
         found = Statement(
             kind="range" if kind == "range" else "number",
             clause=(self.clause.start, self.clause.end),
@@ -254,18 +251,10 @@ class NumberReader:
         if names == ("way_difference",):
             found = replace(found, mode="value", frames=(NOW,), sure_names=names, sure_frames=(NOW,), sure_mode="value")
         if (moment := self.naming.over_moment(numeral)) is not None and names == ("altitude",):
-            found = replace(
-                found,
-                mode="change",
-                frames=(moment, NOW),
-                sure_names=names,
-                sure_frames=(moment, NOW),
-                sure_mode="change",
-            )
+            ends = (moment, NOW)
+            found = replace(found, mode="change", frames=ends, sure_names=names, sure_frames=ends, sure_mode="change")
         found = self._angle(found) if numeral.unit == "deg" else found
-        if self.changing.goes_from(numeral):
-            found = replace(found, frames=None, sure_frames=None)
-        if _OF_SOME_MOMENT.search(self.text, self.clause.start, self.clause.end):
+        if self.changing.goes_from(numeral) or _OF_SOME_MOMENT.search(self.text, self.clause.start, self.clause.end):
             found = replace(found, frames=None, sure_frames=None)
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
@@ -292,7 +281,7 @@ class NumberReader:
         """Read an angle with a side as a turn: the target's, or the drone's from the window's start."""
         numeral = self.sentence.numerals[s.numbers[0]]
         if _OF_FIRST.search(self.text, self.clause.start, numeral.start):
-            return replace(s, names=("yaw",), sure_names=(), frames=None, sure_frames=None)
+            return replace(s, names=("yaw",), sure_names=("yaw",), sure_frames=s.frames)
         if s.side and self.naming.is_of_nose(numeral):
             s = replace(s, names=("bearing", "relative_course"), mode="value", sure_mode="value")
             return replace(s, sure_names=s.names, frames=s.sure_frames or s.frames)
@@ -314,27 +303,16 @@ class NumberReader:
             return True
         return _SO_FAR.search(self.text, self.clause.start, self.clause.end) is not None and self.ways.tells_all()
 
-    def _is_of_height(self) -> bool:
-        """Tell whether a clause without a quantity tells of a climb or descent: "the drone climbs about half a metre"."""
-        vertical, apart = ("alt_up", "alt_down"), ("dist_up", "dist_down")
-        clause = self.clause
-        return not clause.has("quantity") and clause.has("trend", *vertical) and not clause.has("trend", *apart)
-
-    def _is_by_a_word(self, numeral: Numeral) -> bool:
-        """Tell whether a quantity stands before a number, or behind it and no other: not "at 13.4 m with 5.9 m between us"."""
-        cues = self.clause.of("quantity")
-        return any(
-            t.start < numeral.end or not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)
-            for t in cues
-        )
-
     def _surely(self, s: Statement, numeral: Numeral) -> Statement:
         """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""
         more = MORE_THAN.match(self.text, numeral.end)
         is_bare = not (self.clause.has("link", "than") or _PER.search(self.text, self.clause.start, self.clause.end))
         is_bare = is_bare and not (more and more["than"])
         is_length = (
-            numeral.unit == "m" and is_bare and self._is_by_a_word(numeral) and not self.sureness.is_in_group(numeral)
+            numeral.unit == "m"
+            and is_bare
+            and self.naming.is_by_a_word(numeral)
+            and not self.sureness.is_in_group(numeral)
         )
         if set(s.names) <= WAYS and not self.sureness.owners.owner(numeral):
             is_length = False  # of somebody who is not known to have been named
