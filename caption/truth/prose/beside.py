@@ -26,6 +26,8 @@ _EXTREME = {
 _IS = re.compile(r"\b(?:is|are|was|were)\b")
 _ZH_AFTER = 2  # letters between a number and its side: "3 度(左)"
 
+_LEVEL_SIDES = ("left", "right", "cw", "ccw")
+
 
 class Beside:
     """The neighbours of one clause's numbers. used_sides: the sides that belong to a number."""
@@ -43,6 +45,9 @@ class Beside:
         if self.language == "zh":
             near = [t for t in near if t.start < numeral.end or t.start - numeral.end <= _ZH_AFTER]
         near = [t for t in near if not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)]
+        near = [
+            t for t in near if t.value in _LEVEL_SIDES or not self.text.startswith(" to ", t.end)
+        ]  # "24 px down to 9"
         if not self.clause.has("side") and not self.in_scene:
             near = self._explained(numeral)
         if not near or (self.in_scene and numeral.unit != "px"):

@@ -31,6 +31,7 @@ _GOES_TO = {  # other words that end at their number
 _ASIDE_OF = re.compile(
     r"\s*(?:to the )?(?:left|right|above|below) (?:of )?(?:the )?(?:\w+ )?(?:cent(?:re|er)|middle|axis)\b"
 )
+_SLID = re.compile(r"\b(?:slid|slipped|jumped|swung|drifted|wandered) (?:(?:about|some|roughly) )?$")
 AFTERWARDS = re.compile(r"\bafter\b")  # "back to 8.9 m after a brief excursion to 14 m"
 _AFTER = re.compile(r"\s*,?\s*after (?:the |an? |some )?")
 _IN_LAST_STEP = {
@@ -71,6 +72,8 @@ class Changing:
         """Say whether a number is a change, and which way."""
         if numeral.unit == "px" and _ASIDE_OF.match(self.text, numeral.end):
             return "value", 0  # "had jumped 26 px to the right of the centre"
+        if numeral.unit == "px" and _SLID.search(self.text, self.clause.start, numeral.start):
+            return "either", 0
         before = [t for t in self.clause.tokens if t.kind in ("trend", "link") and t.end <= numeral.start]
         before = [t for t in before if not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)]
         ratios = {t.start for t in self.clause.of("ratio")}

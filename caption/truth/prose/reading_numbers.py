@@ -28,7 +28,9 @@ from caption.truth.prose.ways import WAYS, Ways
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
 # A turn that is told from the window's start: its sum.
 _OF_FIRST = re.compile(r"(?:首帧|起始|初始|最初|t0时?)[^,;#]{0,4}[左右]侧$")  # "首帧航向左侧 10°": of the turn since
-_OF_SOME_MOMENT = re.compile(r"\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消")
+_OF_SOME_MOMENT = re.compile(
+    r"# px (?:up|down) to (?:\w+ )?#|\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消"
+)
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
 )

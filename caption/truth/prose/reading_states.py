@@ -22,7 +22,9 @@ _FRAMES_OF = re.compile(
     r"\b(?:one|two|three|four|#) frames? of (?!the\b)\w+, "
 )  # "two frames of occlusion, one of partial cover"
 _OF_A_THING = re.compile(r"(?:方向|高度|航向|机头|距离|位置|角度)[^,;]{0,3}$")  # "方向也没动"
-_AFTER_A_MOMENT = re.compile(r"\bafter (?:the |that )?(?:first|second|third|fourth|t\d)\b")
+_AFTER_A_MOMENT = re.compile(
+    r"\band then (?:stop|stood|halt|paus|rest)\w*|\bafter (?:the |that )?(?:first|second|third|fourth|t\d)\b"
+)
 _IDIOM = re.compile(
     r"\s+(?:out of|out|low|late|short|high|hot|parallel|in parallel|smoothly)\b"
 )  # "running out of room"

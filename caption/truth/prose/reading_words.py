@@ -38,6 +38,8 @@ _GOES = re.compile(
 _AT_A_SPEED = re.compile(
     r"\s*at (?:(?:about|roughly|some|just|only) )?#"
 )  # "he approaches at 1.2 m/s": the way that he goes
+_THAT_WAY = re.compile(r"\b(?:down|up|left|right|round|over) $")  # "tips down further"
+_PIXELS_OF = re.compile(r"\b(?:px|pixels?) (?:of|in) height\b")
 _SIZE = re.compile(r"\b(?:bigger|larger|smaller)\b|[大小]$")
 
 
@@ -140,12 +142,14 @@ class WordReader(ClauseWords):
                 return ()
             if nearest == "speed" and self.clause.has("quantity", "speed"):
                 return self._speed_names(token)  # "the drone's speed climbs"
-            return () if self._owner(token) == "target" else ("altitude",)
+            is_taller = _PIXELS_OF.search(self.text, token.end, self.clause.end)  # "loses just a few pixels of height"
+            return () if is_taller or self._owner(token) == "target" else ("altitude",)
         if len(same) > 1 and any(t.value in _VERTICAL for t in same) and self._is_of_flier():
             return ()  # of nothing that its clause names: also a climb
         if value in _APART:
             if (
                 _FURTHER.match(self.text, token.start)
+                or _THAT_WAY.search(self.text, self.clause.start, token.start)
                 or self.clause.has("quantity", "centre")
                 or self.clause.has("who", "scene")
                 or _AT_A_SPEED.match(self.text, token.end)
