@@ -127,9 +127,9 @@ THIRD_SET = Path(__file__).with_name("prose_third.jsonl")  # the same by a hand 
 FOURTH_SET = Path(__file__).with_name("prose_fourth.jsonl")
 FIFTH_SET = Path(__file__).with_name("prose_fifth.jsonl")
 SIXTH_SET = Path(__file__).with_name("prose_sixth.jsonl")  # hard styles, whose wordings are kept from the reader
-# Plain styles and freer ones, seventeen hands on flights of three maps that had seen nothing of the reader (the tenth and the last three sets are of
+# Plain styles and freer ones, twenty-one hands on flights of three maps that had seen nothing of the reader (the tenth and the thirteenth to sixteenth sets are of
 # three hands each). All were measured before anybody read them (docs/captions.md), and read while rules were written afterwards. The wordings of the
-# ninth, tenth and twelfth to fifteenth are kept from the reader, as those of the sixth.
+# ninth, tenth and twelfth to eighteenth are kept from the reader, as those of the sixth.
 SEVENTH_SET = Path(__file__).with_name("prose_seventh.jsonl")
 EIGHTH_SET = Path(__file__).with_name("prose_eighth.jsonl")
 NINTH_SET = Path(__file__).with_name("prose_ninth.jsonl")
@@ -139,6 +139,9 @@ TWELFTH_SET = Path(__file__).with_name("prose_twelfth.jsonl")
 THIRTEENTH_SET = Path(__file__).with_name("prose_thirteenth.jsonl")
 FOURTEENTH_SET = Path(__file__).with_name("prose_fourteenth.jsonl")
 FIFTEENTH_SET = Path(__file__).with_name("prose_fifteenth.jsonl")
+SIXTEENTH_SET = Path(__file__).with_name("prose_sixteenth.jsonl")
+SEVENTEENTH_SET = Path(__file__).with_name("prose_seventeenth.jsonl")
+EIGHTEENTH_SET = Path(__file__).with_name("prose_eighteenth.jsonl")  # true captions alone, eight hands
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}
 
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from retold import misread
 from specimens_prose import (
     CASES,
+    EIGHTEENTH_SET,
     EIGHTH_SET,
     ELEVENTH_SET,
     FIFTEENTH_SET,
@@ -28,7 +29,9 @@ from specimens_prose import (
     NINTH_SET,
     SECOND_SET,
     SET_WORDS,
+    SEVENTEENTH_SET,
     SEVENTH_SET,
+    SIXTEENTH_SET,
     SIXTH_SET,
     TENTH_SET,
     THIRD_SET,
@@ -101,22 +104,24 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
 @pytest.mark.parametrize(
     ("path", "flagged_at_most", "of_all", "numbers", "sides"),
     [
-        (GOLD_PROSE, 0, 0.855, 0.95, 0.875),
-        (SECOND_SET, 0, 0.825, 0.91, 0.82),
-        (THIRD_SET, 0, 0.70, 0.75, 0.66),
-        (FOURTH_SET, 0, 0.815, 0.81, 0.89),
-        (FIFTH_SET, 0, 0.67, 0.66, 0.82),
-        (SEVENTH_SET, 1, 0.74, 0.86, 0.9),
-        (EIGHTH_SET, 0, 0.80, 0.84, 0.76),
-        (ELEVENTH_SET, 0, 0.79, 0.83, 0.77),
+        (GOLD_PROSE, 0, 0.855, 0.945, 0.87),
+        (SECOND_SET, 0, 0.835, 0.91, 0.84),
+        (THIRD_SET, 0, 0.71, 0.75, 0.7),
+        (FOURTH_SET, 0, 0.83, 0.82, 0.89),
+        (FIFTH_SET, 0, 0.68, 0.67, 0.825),
+        (SEVENTH_SET, 1, 0.765, 0.87, 0.91),
+        (EIGHTH_SET, 0, 0.815, 0.845, 0.77),
+        (ELEVENTH_SET, 0, 0.81, 0.835, 0.78),
         # Of these the wordings are not met: hard styles and common ones. What they gave before they were read stands in docs/captions.md.
-        (SIXTH_SET, 1, 0.60, 0.68, 0.53),
-        (NINTH_SET, 0, 0.75, 0.86, 0.76),
-        (TENTH_SET, 3, 0.70, 0.83, 0.82),
-        (TWELFTH_SET, 0, 0.77, 0.82, 0.77),
-        (THIRTEENTH_SET, 0, 0.76, 0.895, 0.78),
-        (FOURTEENTH_SET, 0, 0.735, 0.815, 0.8),
-        (FIFTEENTH_SET, 0, 0.71, 0.825, 0.72),
+        (SIXTH_SET, 0, 0.62, 0.69, 0.53),
+        (NINTH_SET, 0, 0.78, 0.86, 0.765),
+        (TENTH_SET, 3, 0.735, 0.825, 0.83),
+        (TWELFTH_SET, 0, 0.795, 0.83, 0.78),
+        (THIRTEENTH_SET, 0, 0.8, 0.89, 0.79),
+        (FOURTEENTH_SET, 0, 0.76, 0.825, 0.795),
+        (FIFTEENTH_SET, 0, 0.745, 0.835, 0.76),
+        (SIXTEENTH_SET, 0, 0.725, 0.78, 0.735),
+        (SEVENTEENTH_SET, 2, 0.715, 0.81, 0.885),
     ],
     ids=[
         "gold",
@@ -134,6 +139,8 @@ def test_foreign_captions_pass_and_their_errors_are_caught():
         "thirteenth",
         "fourteenth",
         "fifteenth",
+        "sixteenth",
+        "seventeenth",
     ],
 )
 def test_captions_of_others_pass_and_their_errors_are_caught(
@@ -149,6 +156,14 @@ def test_captions_of_others_pass_and_their_errors_are_caught(
     assert caught["all"] >= of_all
     assert caught["numbers"] >= numbers
     assert caught["sides"] >= sides
+
+
+def test_true_captions_of_eight_hands_are_seldom_flagged():
+    """Idioms, history before the present and comparisons; each third of them flagged 7 to 13 % when they were new (docs/captions.md)."""
+    captions = list(read_gold_prose(EIGHTEENTH_SET))
+    flagged = [one.id for one in captions if check_evidence(one.coc, one.facts, CFG, one.language)]
+    assert len(captions) == 480
+    assert len(flagged) <= 14, flagged
 
 
 def test_true_captions_told_of_other_windows_stay_true():

@@ -3,7 +3,7 @@
     python tests/wordings.py
 
 Writes `en_wordings.txt` and `zh_wordings.txt` anew from the gold sets, their planted errors, our own sentences, the rule teacher's and
-the foreign captions in ../shared: as few sentences as hold all groups of neighbouring words. The sixth, ninth, tenth and twelfth to fifteenth set are left out, so that they tell what
+the foreign captions in ../shared: as few sentences as hold all groups of neighbouring words. The sixth, ninth, tenth and twelfth to eighteenth set are left out, so that they tell what
 becomes of wordings that were not met.
 """
 

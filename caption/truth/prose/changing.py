@@ -44,7 +44,7 @@ _PER_STEP = {  # before a number, and after it
         re.compile(r"\b(?:each|every) (?:half second|step|frame) (?:(?!at |in |of |is |was |to |on )\w+ ){1,3}?(?:(?:about|roughly|around|some|almost|nearly|by) )*$"),
         re.compile(r"\s*(?:to the )?(?:left |right |clockwise )?(?:(?:in each(?= interval)|per|each|every|a|with every|with each) (?:single )?(?:half second |frame |0\.5 s )?(?:frame|step|interval|half second)\b(?! (?:ago|earlier|before|back|later))|from (?:one )?(?:frame|step) to (?:the next|frame|step)\b)"),
     ),
-    "zh": (re.compile(r"(?:每帧|每步|每一步|每一帧|逐帧|每半秒|每0\.5\s?秒|每隔半秒)[^#,;是为在]{0,8}$"), None),
+    "zh": (re.compile(r"(?:每帧|每步|每一步|每一帧|逐帧|每半秒|每0\.5\s?秒|每隔半秒|步[^#,;]{0,4}各)[^#,;是为在]{0,8}$"), None),
 }  # fmt: skip
 _FROM_TO = {  # what stands before the first number and between the two
     "en": (

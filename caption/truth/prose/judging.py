@@ -8,7 +8,6 @@ from functools import lru_cache
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.prose.against_itself import compares_wrongly, goes_wrongly
-from caption.truth.prose.changing import MORE_THAN
 from caption.truth.prose.deciding import argues_against
 from caption.truth.prose.judging_numbers import NumberJudge
 from caption.truth.prose.judging_strong import StrongJudge
@@ -129,7 +128,8 @@ def _judge(
 def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: Language) -> bool:
     """Tell whether a clause is worded so that what it says wrongly is a contradiction.
 
-    Less is asked of what is seldom misread: who is faster, who stands or walks, and a number that the window does not give for anything.
+    Nothing is asked of what is seldom misread: what the window gives for nothing, speeds and lengths that are surely named, trends of what
+    their clause names, set words, a wrong unit or side.
     """
     is_nothing = s.kind in _NUMBERS and s.kind != "clock" and not numbers.is_of_the_window(s)
     is_speed = (
@@ -139,13 +139,9 @@ def _is_worded_as_met(s: Statement, form: Form, numbers: NumberJudge, language: 
         and s.is_named
         and form.numerals[s.numbers[0]].unit == "mps"
     )
-    is_change = s.kind == "number" and s.sure_mode == "change" and bool(s.sure_names) and s.is_named
-    if is_change:
-        numeral = form.numerals[s.numbers[0]]  # "25.5 m higher" may be than somebody
-        is_change = numeral.unit == "m" and not MORE_THAN.match(form.text, numeral.end)
     is_plain_trend = s.kind == "trend" and s.is_sure and s.is_named
     is_length = s.is_single and form.numerals[s.numbers[0]].unit == "m"
-    if is_nothing or s.is_per_step or is_speed or is_change or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
+    if is_nothing or s.is_per_step or is_speed or is_plain_trend or is_length or s.kind in _NEVER_MISREAD:
         return not cites(form.text)
     if s.kind in _NUMBERS and (numbers.is_on_wrong_side(s) or numbers.is_in_wrong_unit(s)):
         return not cites(form.text)

@@ -129,7 +129,8 @@ class Moments:
         if match is None and (frame := self._told_after(numeral)) is not None:
             return frame
         if match is None:
-            is_now = _IS_AT[self.language].search(self.text, self.clause.start, numeral.start)
+            is_at = _IS_AT[self.language].search(self.text, self.clause.start, numeral.start) is not None
+            is_now = is_at and not _AND_NEXT.match(self.text, numeral.end)
             return NOW if is_now and all(t.value == "now" for t in self.clause.of("time")) else None
         if self.language == "zh" and match.groupdict().get("first"):
             return 1 if numeral.unit == "mps" else 0
@@ -222,6 +223,7 @@ _NTH_AFTER = re.compile(
 )
 # "after 1.3 m/s at t2 only 0.19 is left", "t0 to t4: 0.19"
 _IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $|\bt\d\s*(?:至|到|to|→|-|~)\s*$")
+_AND_NEXT = re.compile(r"\s*(?:and|,) then\b")
 _IS_AT = {  # what a value has come to
     "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$|\b(?:is|are) (?:(?:\w+ly|now|already|still|just|merely) )?\w+ing (?:again |along |on |away )?at (?:(?:only|just|about|roughly|some|a mere) )*$"),
     "zh": re.compile(r"已(?:经)?(?:提速?|升|降|减速?|放慢|加速|回落|收|缩|变|压|拉|涨|飞|走|跑|转)?(?:到|至|为|达)(?:了)?(?:约)?\s*$"),

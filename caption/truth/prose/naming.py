@@ -9,6 +9,7 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, crossing, cues_of, names_of, owner_of, times_of
 from caption.truth.prose.numerals import Numeral
 
+_IS_TURNED = re.compile(r"[偏转摆甩]了(?:约|大约|近)?\s*$")
 # "17.5 m beneath us", "19.1 m above the walker": how much higher the drone is.
 OVER_OTHER = re.compile(
     r"\s*(?:straight |directly |right |vertically )?(?:above|over|below|beneath|under|underneath|higher than|lower than)"
@@ -159,6 +160,8 @@ class Naming:
 
     def is_of_nose(self, numeral: Numeral) -> bool:
         """Tell whether an angle is where somebody is or goes, against the drone's heading."""
+        if _IS_TURNED.search(self.text, self.clause.start, numeral.start):
+            return False  # "机头朝右偏了 5.7°"
         before, after = _OF_NOSE[self.language]
         if before is not None:
             return before.search(self.text, self.clause.start, numeral.start) is not None

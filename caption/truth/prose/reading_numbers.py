@@ -29,7 +29,7 @@ _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|acc
 # A turn that is told from the window's start: its sum.
 _OF_FIRST = re.compile(r"(?:首帧|起始|初始|最初|t0时?)[^,;#]{0,4}[左右]侧$")  # "首帧航向左侧 10°": of the turn since
 _OF_SOME_MOMENT = re.compile(
-    r"# px (?:up|down) to (?:\w+ )?#|\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消"
+    r"\bis (?:now )?behind us\b|\bhaving (?:touched|reached)\b|# px (?:up|down) to (?:\w+ )?#|\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消"
 )
 _FROM_START = re.compile(
     r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
@@ -252,7 +252,11 @@ class NumberReader:
             found = replace(found, names=found.sure_names)
         if names == ("way_difference",):
             found = replace(found, mode="value", frames=(NOW,), sure_names=names, sure_frames=(NOW,), sure_mode="value")
-        if (moment := self.naming.over_moment(numeral)) is not None and names == ("altitude",):
+        if (
+            (moment := self.naming.over_moment(numeral)) is not None
+            and names == ("altitude",)
+            and self.context.cue not in ("distance", "range", "slant")
+        ):
             ends = (moment, NOW)
             found = replace(found, mode="change", frames=ends, sure_names=names, sure_frames=ends, sure_mode="change")
         found = self._angle(found) if numeral.unit == "deg" else found

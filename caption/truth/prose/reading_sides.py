@@ -92,6 +92,12 @@ class SideReader(ClauseWords):
                 continue
             if word == "box" and self.text.endswith(("向", "往", "朝"), 0, match.start()):
                 continue  # "向画面左边横穿过去"
+            if (
+                word == "about"
+                and match.groupdict().get("goes")
+                and _OF_OURS.search(self.text, self.clause.start, match.start())
+            ):
+                continue  # "the nose has been moving to the right"
             if word == "bend" and self.text.endswith(("the ", "this ", "a "), 0, match.start()):
                 continue  # "the swing to the left must not stop": whose is not told
             is_noun = match.groupdict().get("adj")  # "1.4° of left yaw": asked for or done
@@ -117,6 +123,7 @@ class SideReader(ClauseWords):
         return degrees or _DONE[self.language].search(self.text, self.clause.start, match.end()) is not None
 
 
+_OF_OURS = re.compile(r"\b(?:nose|heading|camera|view|box)\b")
 _SO_FAR = re.compile(r"\b(?:has|have|had|so far|in (?:two|the|one|total)|each|every|was|were|is running)\b")
 _DONE = {
     "en": re.compile(

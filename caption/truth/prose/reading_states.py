@@ -75,7 +75,7 @@ class StateReader(ClauseWords):
         text = self.text[token.start : token.end]
         after = self.text[token.end : token.end + 14]
         if text in ("lost", "covered", "lose") and re.match(
-            r"\s*(?:about |roughly |some |a |only |just |another )?[#\d]|\s*(?:height|altitude|speed|two|three|four|more|less|twice|half|as much|ground|the ground|the distance|some|a (?:distance|way|lot|bit|little|few))\b",
+            r"\s*(?:about |roughly |some |a |only |just |another )?[#\d]|\s*(?:height|altitude|speed|two|three|four|more|less|twice|half|as much|the (?:first|second|third|fourth|last)|ground|the ground|the distance|some|a (?:distance|way|lot|bit|little|few))\b",
             after,
         ):
             return

@@ -30,7 +30,7 @@ _LEADS = ("", "from", "to", "by", "从", "到", "至", "由", "了")  # between 
 _FURTHER = re.compile(r"(?:further|farther) (?:under|below|beneath|above|down|up|left|right|along|into|to the)\b")
 _BESIDE = re.compile(r"[侧方]")
 _NO_CHANGE = re.compile(
-    r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|slid(?:es?|ing)? (?:along|over|across|beside)\b|jump\w* (?:back )?from (?:\w+ )?#(?:\.#)? px|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
+    r"cut(?:s|ting)? (?:across|through|in|into)\b|up (?:at|here|there)\b|gain per\b|slid(?:es?|ing)? (?:along|over|across|beside)\b|jump\w* (?:back )?from (?:\w+ )?#(?:\.#)? px|slow (?:pan|turn|climb|descent|yaw|sweep|drift|pass|approach|walk|pace|orbit|circle|arc)\b"
 )
 _GOES = re.compile(
     r"\b(?:walk|head|mov|mak|go|run|stroll)(?:s|es|ing)\b|走|远去|离去|行进|前行|横穿|穿过|移动|横过|跑去"
