@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from caption.truth.prose.measured import Measured, change
 from caption.truth.prose.statements import Statement
+from caption.truth.references import QUANTITIES
 
 _STANDS_MPS, _RUNS_MPS = 0.5, 1.8
 _GOES_MPS = {"speed": 1.0, "target_speed": 0.9}  # from here on nobody says that it stands
@@ -61,7 +62,8 @@ class StrongJudge:
                 continue
             from_first = [change(name, known[0], v) for v in known]
             spread = max(from_first) - min(from_first)
-            answers.append(False if spread <= _STILL[name] else True if spread > 4.0 * _STILL[name] else None)
+            still = min(_STILL[name], QUANTITIES[name].allowed_spread(known)) if name in QUANTITIES else _STILL[name]
+            answers.append(False if spread <= still else True if spread > 4.0 * _STILL[name] else None)
         return None if not answers or None in answers else True in answers
 
     def _framing(self, s: Statement) -> bool | None:
