@@ -59,6 +59,7 @@ class ClauseWords:
         return (NOW,)
 
     def _trend_span(self) -> tuple[int, int] | None:
+        """Give the two frames between which a clause tells of a change; None where it names none."""
         if self.clause.has("time", "last_step"):
             return (-2, NOW)
         if self.clause.has("time", "last_second"):

@@ -197,7 +197,7 @@ def _final(last: list[Said]) -> Said | None:
 
 
 def _beside(final: Said, last: list[Said]) -> list[Said]:
-    """Give what else its own clause asks for, or leaves open in words of a side: "a small turn to the left keeps him centred; it can go on hovering"."""
+    """Give what else the sentence asks for, its own clause names or another leaves open with a side: "a small turn to the left keeps him centred; it can go on hovering"."""
     return [
         one
         for one in last
@@ -207,9 +207,12 @@ def _beside(final: Said, last: list[Said]) -> list[Said]:
 
 
 def _is_plainly_opposite(decision: str, said: Said) -> bool:
-    if said.action in _SIDED:
-        return said.side != 0 and decision == _SIDED[said.action].format("right" if said.side > 0 else "left")
-    return (said.action, decision) in _PLAIN_OPPOSITES
+    return _is_to_other_side(decision, said) or (said.action, decision) in _PLAIN_OPPOSITES
+
+
+def _is_to_other_side(decision: str, said: Said) -> bool:
+    sided = _SIDED.get(said.action)
+    return sided is not None and said.side != 0 and decision == sided.format("right" if said.side > 0 else "left")
 
 
 def _is_opposite(decision: str, said: Said) -> bool:
@@ -217,9 +220,7 @@ def _is_opposite(decision: str, said: Said) -> bool:
         return decision not in ("break_off", "return_to_home")
     if said.action in _SIDED and decision == "track_straight":
         return said.side != 0 and said.force == "directive"
-    if said.action in _SIDED:
-        return said.side != 0 and decision == _SIDED[said.action].format("right" if said.side > 0 else "left")
-    return said.action in _OPPOSITE.get(decision, ())
+    return _is_to_other_side(decision, said) or said.action in _OPPOSITE.get(decision, ())
 
 
 def _allowed(said: list[Said]) -> set[str]:

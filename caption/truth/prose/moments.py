@@ -80,6 +80,10 @@ class Moments:
                 return None
         return (NOW,) if self._is_told_of_now(numeral, is_value=is_value) else None
 
+    def is_some(self) -> bool:
+        """Tell whether the clause tells of a moment before now without saying which: "the surge of 8.4 m/s is behind us"."""
+        return _SOME_MOMENT.search(self.text, self.clause.start, self.clause.end) is not None
+
     def goes_on_after(self, numeral: Numeral) -> bool:
         """Tell whether the sentence tells of a later moment behind a number."""
         return _THEN_LATER[self.language].search(self.text, numeral.end) is not None
@@ -223,6 +227,9 @@ _NTH_AFTER = re.compile(
 )
 # "after 1.3 m/s at t2 only 0.19 is left", "t0 to t4: 0.19"
 _IS_OF_ANOTHER = re.compile(r"#\s*(?:m/s|m|px|°|degrees) at $|\bt\d\s*(?:至|到|to|→|-|~)\s*$")
+_SOME_MOMENT = re.compile(
+    r"\bis (?:now )?behind us\b|\bhaving (?:touched|reached)\b|# px (?:up|down) to (?:\w+ )?#|\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消"
+)
 _AND_NEXT = re.compile(r"\s*(?:and|,) then\b")
 _IS_AT = {  # what a value has come to
     "en": re.compile(r"\b(?:is|are) (?:now |already |back )?(?:down|up) to (?:(?:only|just|about|roughly|some|a mere) )*$|\b(?:is|are) (?:(?:\w+ly|now|already|still|just|merely) )?\w+ing (?:again |along |on |away )?at (?:(?:only|just|about|roughly|some|a mere) )*$"),

@@ -9,6 +9,7 @@ from caption.truth.prose.clauses import Clause, Sentence
 from caption.truth.prose.cues import Context, crossing, cues_of, names_of, owner_of, times_of
 from caption.truth.prose.numerals import Numeral
 
+_OF_FIRST = re.compile(r"(?:首帧|起始|初始|最初|t0时?)[^,;#]{0,4}[左右]侧$")
 _IS_TURNED = re.compile(r"[偏转摆甩]了(?:约|大约|近)?\s*$")
 # "17.5 m beneath us", "19.1 m above the walker": how much higher the drone is.
 OVER_OTHER = re.compile(
@@ -157,6 +158,10 @@ class Naming:
             t.start < numeral.end or not crossing(self.sentence, self.clause, t, numeral.start, numeral.end)
             for t in cues
         )
+
+    def is_of_first_heading(self, numeral: Numeral) -> bool:
+        """Tell whether an angle is against the heading of the first frame: "首帧航向左侧 10°"."""
+        return _OF_FIRST.search(self.text, self.clause.start, numeral.start) is not None
 
     def is_of_nose(self, numeral: Numeral) -> bool:
         """Tell whether an angle is where somebody is or goes, against the drone's heading."""

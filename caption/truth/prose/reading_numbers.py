@@ -26,18 +26,6 @@ from caption.truth.prose.versus import owners_behind
 from caption.truth.prose.ways import WAYS, Ways
 
 _GIVE_OR_TAKE = re.compile(r"(?:give or take|plus or minus|\+/-|±|to within|accurate to|不差|误差)\s*(?:about |约)?$")
-# A turn that is told from the window's start: its sum.
-_OF_FIRST = re.compile(r"(?:首帧|起始|初始|最初|t0时?)[^,;#]{0,4}[左右]侧$")  # "首帧航向左侧 10°": of the turn since
-_OF_SOME_MOMENT = re.compile(
-    r"\bis (?:now )?behind us\b|\bhaving (?:touched|reached)\b|# px (?:up|down) to (?:\w+ )?#|\blast two steps (?:were|had)\b|\b(?:undone|taken back|cancelled out)\b|抵消"
-)
-_FROM_START = re.compile(
-    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
-)
-# The same, where nothing tells of a part of the window.
-_SO_FAR = re.compile(
-    r"\b(?:so far|two seconds|(?:over|within|in|across) the (?:whole |entire )?window|has (?:now |already |itself )?(?:turned|swung|come round|come around|rotated|drifted|veered|yawed|panned))\b|两秒|窗口内|全程|迄今|已向?[左右]?(?:转|偏|摆)"
-)
 # Shares of the picture: "one per cent of the image width", "图像宽度的百分之一".
 _OF_PICTURE = {
     "en": re.compile(r"\s*of (?:the |a )?(?:image|picture|frame)(?:'s)?(?: (?:width|height))?\b"),
@@ -260,7 +248,7 @@ class NumberReader:
             ends = (moment, NOW)
             found = replace(found, mode="change", frames=ends, sure_names=names, sure_frames=ends, sure_mode="change")
         found = self._angle(found) if numeral.unit == "deg" else found
-        if self.changing.goes_from(numeral) or _OF_SOME_MOMENT.search(self.text, self.clause.start, self.clause.end):
+        if self.changing.goes_from(numeral) or self.sureness.moments.is_some():
             found = replace(found, frames=None, sure_frames=None)
         if side and found.sure_names:
             names = tuple([name for name in found.names if name in found.sure_names])
@@ -286,7 +274,7 @@ class NumberReader:
     def _angle(self, s: Statement) -> Statement:
         """Read an angle with a side as a turn: the target's, or the drone's from the window's start."""
         numeral = self.sentence.numerals[s.numbers[0]]
-        if _OF_FIRST.search(self.text, self.clause.start, numeral.start):
+        if self.naming.is_of_first_heading(numeral):
             return replace(s, names=("yaw",), sure_names=("yaw",), sure_frames=s.frames)
         if s.side and self.naming.is_of_nose(numeral):
             s = replace(s, names=("bearing", "relative_course"), mode="value", sure_mode="value")
@@ -297,17 +285,11 @@ class NumberReader:
             s = replace(s, names=("target_turn",), sure_names=("target_turn",))
         is_theirs = self.clause.has("who", "target") or self.clause.has("quantity", "target_heading")
         is_total = (s.side or set(s.names) <= {"yaw", "heading"}) and "yaw" in s.names and not is_theirs
-        if not is_total or not self._is_from_start():
+        if not is_total or not self.ways.are_from_start():
             return s
         named = [moment for _, moment in times_of(self.clause) if moment not in ((0,), (0, 1))]
         frames = (NOW,) if not named else named[0] if len(named) == 1 else None
         return replace(s, names=("yaw",), mode="value", frames=frames, sure_names=("yaw",), sure_frames=frames, sure_mode="value")  # fmt: skip
-
-    def _is_from_start(self) -> bool:
-        """Tell whether a clause tells of turns from the window's start on."""
-        if _FROM_START.search(self.text, self.clause.start, self.clause.end):
-            return True
-        return _SO_FAR.search(self.text, self.clause.start, self.clause.end) is not None and self.ways.tells_all()
 
     def _surely(self, s: Statement, numeral: Numeral) -> Statement:
         """Add what is sure of a number by how it was read: of what a length or a change is, and between which frames."""

@@ -39,6 +39,16 @@ _IN_PART = {
 }
 
 
+# A turn that is told from the window's start: its sum.
+_FROM_START = re.compile(
+    r"\b(?:start\w*|began|begun|datum|reference|original\w*|initial\w*|in all|in total|total|net|overall|altogether|cumulative|to date|where it (?:\w+ at t0|was|had been|stood|pointed))\b|起始|初始|起点|出发|基准|最初|累计|总共|一共|合计|净"
+)
+# The same, where nothing tells of a part of the window.
+_SO_FAR = re.compile(
+    r"\b(?:so far|two seconds|(?:over|within|in|across) the (?:whole |entire )?window|has (?:now |already |itself )?(?:turned|swung|come round|come around|rotated|drifted|veered|yawed|panned))\b|两秒|窗口内|全程|迄今|已向?[左右]?(?:转|偏|摆)"
+)
+
+
 class Ways:
     """The ways of one clause."""
 
@@ -66,6 +76,12 @@ class Ways:
         return not _IN_PART[self.language].search(told) and not any(
             frames not in ((0,), (NOW,)) for clause in self.sentence.clauses for _, frames in times_of(clause)
         )
+
+    def are_from_start(self) -> bool:
+        """Tell whether a clause tells of turns from the window's start on."""
+        if _FROM_START.search(self.text, self.clause.start, self.clause.end):
+            return True
+        return _SO_FAR.search(self.text, self.clause.start, self.clause.end) is not None and self.tells_all()
 
     def _named(self) -> set[str]:
         """Give those whom the sentence names, pronouns of the third person aside."""
