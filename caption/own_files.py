@@ -10,11 +10,11 @@ from pathlib import Path
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import PROMPTS, SUFFIX, own_prompts
 from caption.teachers.rules import DECIDES
-from cosfly import in_place
 from cosfly.errors import ConfigError
 from cosfly.products.actions import ACTIONS_FILE, ActionSet, read_actions, write_own_actions
 from cosfly.products.captions import OWN_PROMPTS
-from cosfly.store import write_bytes
+from cosfly.work import in_place
+from cosfly.work.store import write_bytes
 
 
 @contextmanager

@@ -17,13 +17,13 @@ from pydantic import Field, model_validator
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.protocol import check_url
+from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
 from cosfly.chat.vllm_engine import VllmConfig
-from cosfly.config import Config, MayDiffer
-from cosfly.frame_views import DEPTH_RANGE_M, Layout, View
+from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.products.captions import KeyframeRecord, LabelFrom, TeacherKind, Verdict, Writing
 from cosfly.products.places import FlightChoice
 from cosfly.products.predictions import PREDICTIONS
-from cosfly.student_chat import MAX_ANSWER_TOKENS
+from cosfly.work.config import Config, MayDiffer
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Treatment = Literal["keep", "repair", "drop"]

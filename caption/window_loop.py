@@ -21,10 +21,11 @@ from caption.truth.judge import Case, Judge
 from caption.truth.mirror import check_translation
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused, refuse_decision, way_of
-from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Usage
+from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
 from cosfly.products.answer_text import Parsed, parse_answer
-from cosfly.products.captions import Caption, Checks, Coc, JudgeRecord, Language, RepairRecord, Verdict
+from cosfly.products.captions import Caption, Checks, Coc, JudgeRecord, Language, RepairRecord, Usage, Verdict
+from cosfly.reading.objects import CONTEXT_FULL
 
 
 async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:

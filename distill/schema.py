@@ -19,17 +19,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
-from cosfly import in_place
 from cosfly.errors import InputError
-from cosfly.frame_views import VIEW_FILES, Pictures, View
+from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
-from cosfly.provenance import fingerprint, fingerprints
+from cosfly.products.splits import SPLITS, Split
 from cosfly.reading.documents import read_model, validation_errors
 from cosfly.reading.tables import TableRows
-from cosfly.splits import SPLITS, Split
-from cosfly.store import atomic_file, write_bytes, write_model
+from cosfly.work import in_place
+from cosfly.work.provenance import fingerprint, fingerprints
+from cosfly.work.store import atomic_file, write_bytes, write_model
 
 RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
 PAGE = "README.md"
@@ -95,7 +95,7 @@ class Sample(BaseModel):
 
 
 class SourceTree(BaseModel):
-    """A playback tree that samples name frames of: the name of its run, and its fingerprint (cosfly/provenance.py)."""
+    """A playback tree that samples name frames of: the name of its run, and its fingerprint (cosfly/work/provenance.py)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -15,10 +15,10 @@ from typing import Any, Literal
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict
 
+from cosfly.products.splits import Split
 from cosfly.reading.documents import read_model, validation_errors
 from cosfly.reading.tables import rows_of
-from cosfly.splits import Split
-from cosfly.store import write_bytes, write_model
+from cosfly.work.store import write_bytes, write_model
 from distill.schema import PAGE, SourceTree, SplitFiles, page_of, split_path
 
 RECORD, RECORD_SCHEMA, VERSION = "tracks.json", "cosfly.track_windows", "1.0"

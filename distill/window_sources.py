@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from cosfly.errors import ConfigError, InputError, nearest
-from cosfly.frame_views import VIEW_FILES, Pictures, read_view
+from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view
 from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.products.places import stand
@@ -22,7 +22,7 @@ from cosfly.reading.arrays import parse_picture
 from cosfly.reading.documents import read_object
 from cosfly.reading.files import check_stays_below
 from cosfly.reading.tables import TableRows, open_table, rows_of
-from cosfly.store import inside
+from cosfly.work.store import inside
 
 # What is known of each frame, as the columns of a release are called: members of a struct, "" for a number.
 FACTS: dict[str, tuple[str, ...]] = {

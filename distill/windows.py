@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
-from cosfly.frame_views import scaled_size
+from cosfly.look.frame_views import scaled_size
 from cosfly.products.captions import Language
 from distill.window_sources import open_source
 

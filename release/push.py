@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError, VerifyError
 from cosfly.products.shown_captions import CaptionReader
-from cosfly.store import CHECKSUMS, read_checksums
+from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.source import SHARD_NAME, open_release
 from release.get.remote import without_secrets
 from release.verify.findings import Verified

@@ -15,7 +15,7 @@ from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.reading.documents import read_model
-from cosfly.store import sha256_bytes, write_model
+from cosfly.work.store import sha256_bytes, write_model
 from release.columns import SplitName
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"

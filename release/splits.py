@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from cosfly.splits import Split, assign_splits
+from cosfly.products.splits import Split, assign_splits
 from release.columns import SplitName
 
 NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}

@@ -25,7 +25,7 @@ from zlib import crc32
 
 from crashes import run, sweep
 
-from cosfly import ahead
+from cosfly.app import ahead
 from cosfly.cli import app
 
 if TYPE_CHECKING:

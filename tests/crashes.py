@@ -25,11 +25,11 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from cosfly import worker_pool
 from cosfly.errors import CosflyError
-from cosfly.journal import ASIDE
-from cosfly.provenance import checked_inputs, recorded_digests
-from cosfly.stage_events import EVENTS
+from cosfly.work import worker_pool
+from cosfly.work.journal import ASIDE
+from cosfly.work.provenance import checked_inputs, recorded_digests
+from cosfly.work.stage_events import EVENTS
 from release.verify.verify import verify
 
 PACKAGES = tuple(f"/{name}/" for name in ("cosfly", "caption", "distill", "release"))

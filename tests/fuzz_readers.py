@@ -29,7 +29,7 @@ from caption.truth.gold import GOLD_PROSE, read_gold_prose
 from caption.truth.prose.judging import judge_sentences
 from caption.truth.references import parse_reference
 from caption.writing.slots import Slots
-from cosfly import in_place, provenance
+from cosfly.app.settings import RunConfig
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
 from cosfly.chat.contract import Request
 from cosfly.chat.protocol import (
@@ -40,16 +40,14 @@ from cosfly.chat.protocol import (
     read_models,
 )
 from cosfly.chat.refusals import kind_of
+from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
-from cosfly.config import apply_overrides, build
 from cosfly.depth_study.study import run as study_depth
-from cosfly.gallery import contact_sheet, preview_gif
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
-from cosfly.items import Item
-from cosfly.journal import Journal
+from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
@@ -80,13 +78,15 @@ from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render import older_trees
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import read_pools
-from cosfly.settings import RunConfig
 from cosfly.simplify import stage as simplify
 from cosfly.simplify.passes import SimplifyConfig
-from cosfly.stage_events import EventLog, read_events
-from cosfly.stage_folder import StageFolder, read_failures, read_manifest
-from cosfly.store import CHECKSUMS, read_checksums, write_checksums, write_json
-from cosfly.student_chat import TAUGHT, read_taught, write_taught
+from cosfly.work import in_place, provenance
+from cosfly.work.config import apply_overrides, build
+from cosfly.work.items import Item
+from cosfly.work.journal import Journal
+from cosfly.work.stage_events import EventLog, read_events
+from cosfly.work.stage_folder import StageFolder, read_failures, read_manifest
+from cosfly.work.store import CHECKSUMS, read_checksums, write_checksums, write_json
 from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
 from distill.evaluation.scores import read_scores

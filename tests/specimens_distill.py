@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from cosfly.chat.student_chat import Look, Taught, write_taught
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
-from cosfly.provenance import fingerprint
-from cosfly.splits import Split
-from cosfly.store import write_json
-from cosfly.student_chat import Look, Taught, write_taught
+from cosfly.products.splits import Split
+from cosfly.work.provenance import fingerprint
+from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source

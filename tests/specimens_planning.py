@@ -4,13 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from cosfly import kernels
 from cosfly.geometry import DT_S
 from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.stage import make_scenario
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import Walk
+from cosfly.space import kernels
 
 
 def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):

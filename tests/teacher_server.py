@@ -20,8 +20,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
 
-from cosfly.journal import Journal
 from cosfly.products.actions import action_tokens
+from cosfly.work.journal import Journal
 
 MODEL = "test-teacher"
 ENGLISH = {

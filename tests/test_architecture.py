@@ -14,31 +14,22 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
-SHARED = (
-    "kernels",
-    "grid",
-    "flight_metrics",
-    "topview",
-    "overlay",
-    "frame_views",
-    "student_chat",
-    "coverage_page",
-)  # what several stages use; knows products
-# What may know all stages and siblings.
-ASSEMBLY = (
-    "cli",
-    "pipeline",
-    "ahead",
-    "settings",
-    "runs",
-    "estimate",
-    "library",
-    "doctor",
-    "gallery",
-    "bench",
-    "depth_study",
-    "__main__",
-)
+# From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do siblings.
+ROOMS = ("root", "reading", "work", "png", "products", "space", "look", "chat", "stages", "siblings", "app", "cli")
+# Pairs of folders that still import each other.
+MUTUAL = {
+    ("caption", "caption/teachers"),
+    ("caption", "caption/truth"),
+    ("caption", "caption/writing"),
+    ("caption/teachers", "caption/truth"),
+    ("caption/truth", "caption/truth/prose"),
+    ("cosfly/planners", "cosfly/planners/styles"),
+    ("cosfly/render", "cosfly/render/zoom"),
+    ("release", "release/export"),
+    ("release", "release/get"),
+    ("release", "release/verify"),
+}
+ASSEMBLY = ("app", "bench", "depth_study")  # what may know all stages and siblings
 HEAVY = {
     "torch",
     "transformers",
@@ -84,42 +75,65 @@ def imports(name: str, *, top_level_only: bool = False) -> set[str]:
 
 
 def room(name: str) -> str:
-    """Where a module stands: a stage, a sibling package, `assembly`, `shared`, `products`, or `foundations`."""
+    """Where a module stands: one of ROOMS, of which `root` has the errors, the escaping and the geometry that all others know."""
     package, _, rest = name.partition(".")
     first = rest.partition(".")[0]
     if package != "cosfly":
-        return package
+        return "siblings"
     if first in ASSEMBLY:
-        return "assembly"
-    if first in SHARED:
-        return "shared"
-    return first if first in (*STAGES, "products") else "foundations"
+        return "app"
+    if first in STAGES:
+        return "stages"
+    if first in ("", "__main__"):  # the front door: `import cosfly`, `python -m cosfly`
+        return "cli"
+    return first if first in ROOMS else "root"
 
 
-def rooms(names: set[str]) -> set[str]:
-    return {room(n) for n in names if n.split(".")[0] in PACKAGES}
+def house(name: str) -> str:
+    """The stage or sibling a module belongs to."""
+    return ".".join(name.split(".")[: 2 if name.startswith("cosfly.") else 1])
+
+
+def folder(name: str) -> str:
+    return SOURCES[name].parent.relative_to(ROOT).as_posix()
+
+
+def ours(name: str) -> set[str]:
+    """What it imports of ours, but for the version in `cosfly/__init__.py`."""
+    return {n for n in imports(name) if n in SOURCES} - {"cosfly"}
 
 
 def test_the_sources_were_found():
-    assert {"cosfly.cli", "cosfly.store", "caption", "distill", "release"} <= SOURCES.keys()
-    assert {room(name) for name in SOURCES} == {*STAGES, "assembly", "shared", "products", "foundations", *PACKAGES[1:]}
+    assert {"cosfly.cli", "cosfly.work.store", "caption", "distill", "release"} <= SOURCES.keys()
+    assert {room(name) for name in SOURCES} == set(ROOMS)
+    assert {path.name for path in (ROOT / "cosfly").glob("*.py")} == {
+        "__init__.py", "__main__.py", "errors.py", "escaping.py", "geometry.py",
+    }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(SOURCES))
-def test_imports_point_one_way(name):
-    """Foundations know nobody above them, products know foundations, no stage imports a stage, siblings meet through files."""
-    here, found = room(name), rooms(imports(name))
-    below = {"foundations": set(), "products": {"foundations"}, "shared": {"foundations", "products"}}
-    if here != "assembly":
-        allowed = {here} | below.get(here, {"foundations", "products", "shared"})
-        assert found <= allowed, f"{name} imports {sorted(found - allowed)}"
+def may_import(name: str, other: str) -> bool:
+    here, there = room(name), room(other)
+    if here == there and here in ("stages", "siblings"):
+        return house(name) == house(other)
+    return ROOMS.index(there) <= ROOMS.index(here)
 
 
-@pytest.mark.parametrize("name", sorted(SOURCES))
-def test_what_opengl_draws_with_stays_behind_its_renderer(name):
+def test_imports_point_one_way():
+    """Rooms know what stands below them, no stage imports a stage, siblings meet through files."""
+    assert [(name, other) for name in SOURCES for other in ours(name) if not may_import(name, other)] == []
+
+
+def test_no_two_folders_import_each_other():
+    """But the front door: `cosfly/__init__.py` and `__main__.py` open what stands behind them."""
+    doors = {"cosfly", "cosfly.__main__"}
+    arrows = {(folder(a), folder(b)) for a in SOURCES if a not in doors for b in ours(a) if folder(a) != folder(b)}
+    assert {tuple(sorted(pair)) for pair in arrows if pair[::-1] in arrows} == MUTUAL
+
+
+def test_what_opengl_draws_with_stays_behind_its_renderer():
     """Meshes, shaders and the figure are one renderer's own: callers and other renderers know the contract only."""
     own = "cosfly.render.gl"
-    assert name.startswith(own) or not [module for module in imports(name) if module.startswith(own)]
+    assert [n for n in SOURCES if not n.startswith(own) and any(m.startswith(own) for m in imports(n))] == []
 
 
 @pytest.mark.parametrize("step", ["prepare", "training", "inference", "evaluation"])
@@ -138,24 +152,22 @@ def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
     assert importers == {"cosfly.products.frames", "cosfly.products.playback"}
 
 
-@pytest.mark.parametrize("name", sorted(SOURCES))
-def test_heavy_packages_are_imported_where_they_are_used(name):
-    top = {n.split(".")[0] for n in imports(name, top_level_only=True)}
-    assert not top & HEAVY
+def test_heavy_packages_are_imported_where_they_are_used():
+    tops = {name: {n.split(".")[0] for n in imports(name, top_level_only=True)} for name in SOURCES}
+    assert [name for name, top in tops.items() if top & HEAVY] == []
 
 
 def test_compiled_functions_share_one_cache():
     importers = {name for name, path in SOURCES.items() if re.search(r"^(import|from) numba\b", path.read_text(), re.M)}
-    assert importers == {"cosfly.compiled"}
+    assert importers == {"cosfly.work.compiled"}
 
 
 # Names that read what stands on disk, or text that stood there. Only the gate calls them: it knows what a file may do.
 READING = {"open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread", "imdecode",
            "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"}  # fmt: skip
 ALLOWED_TO_READ = {
-    ("cosfly.folder_lock", "open"),  # a lock, opened to be written
-    ("cosfly.stage_events", "read_bytes"),  # /proc, whose files have no size
-    ("cosfly.chat.objects", "loads"),  # a string of a server's reply
+    ("cosfly.work.folder_lock", "open"),  # a lock, opened to be written
+    ("cosfly.work.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.chat.protocol", "open"),  # a picture that we made, for its size
     ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
@@ -185,25 +197,21 @@ def reading_calls(name: str) -> set[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("name", sorted(name for name in SOURCES if not name.startswith("cosfly.reading")))
-def test_only_the_gate_opens_files_to_read_them(name):
-    assert reading_calls(name) <= ALLOWED_TO_READ
-
-
-def test_the_exceptions_of_the_gate_are_needed():
+def test_only_the_gate_opens_files_to_read_them():
+    """And each exception is needed."""
     assert {
         call for name in SOURCES if not name.startswith("cosfly.reading") for call in reading_calls(name)
     } == ALLOWED_TO_READ
 
 
-def test_the_rule_can_fail(monkeypatch, tmp_path):
+def test_the_rules_can_fail(monkeypatch, tmp_path):
     bad = tmp_path / "bad.py"
     bad.write_text("import torch\nimport release.package.stage\n")
-    monkeypatch.setitem(SOURCES, "cosfly.store", bad)
-    with pytest.raises(AssertionError, match=r"cosfly\.store imports"):
-        test_imports_point_one_way("cosfly.store")
+    monkeypatch.setitem(SOURCES, "cosfly.work.store", bad)
+    with pytest.raises(AssertionError, match=r"cosfly\.work\.store"):
+        test_imports_point_one_way()
     with pytest.raises(AssertionError):
-        test_heavy_packages_are_imported_where_they_are_used("cosfly.store")
+        test_heavy_packages_are_imported_where_they_are_used()
     for text in (
         "open(path)",
         "path.open()",
@@ -214,7 +222,7 @@ def test_the_rule_can_fail(monkeypatch, tmp_path):
     ):
         bad.write_text(text)
         with pytest.raises(AssertionError):
-            test_only_the_gate_opens_files_to_read_them("cosfly.store")
+            test_only_the_gate_opens_files_to_read_them()
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -239,7 +247,7 @@ def test_help_is_instant():
 
 def test_settings_bring_no_solver_along():
     """Every command but help reads the settings of all stages: what these need to work is imported when they do."""
-    program = "import sys, cosfly.settings; print('LOADED', *sorted(sys.modules))"
+    program = "import sys, cosfly.app.settings; print('LOADED', *sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(result.stdout.split("LOADED")[1].split())
     assert not loaded & {"scipy.interpolate", "scipy.spatial", "scipy.optimize", "matplotlib", "torch", "transformers"}
@@ -261,14 +269,15 @@ def test_an_installed_cosfly_has_every_package_and_every_data_file():
     assert data <= packed
 
 
-@pytest.mark.parametrize("name", sorted(SOURCES))
-def test_foreign_text_is_escaped_in_one_place(name):
+def test_foreign_text_is_escaped_in_one_place():
     """No module escapes on its own, opens a console of its own, or writes a page without the policy of the others."""
-    text = SOURCES[name].read_text(encoding="utf-8")
-    if name != "cosfly.escaping":
-        assert not re.search(r"html import escape|html\.escape|rich\.markup|<!doctype", text, re.IGNORECASE)
-    if name != "cosfly.console":
-        assert not re.search(r"\bConsole\(", text)
+    page, console = (
+        re.compile(r"html import escape|html\.escape|rich\.markup|<!doctype", re.IGNORECASE),
+        re.compile(r"Console\("),
+    )
+    texts = {name: path.read_text(encoding="utf-8") for name, path in SOURCES.items()}
+    assert [name for name, text in texts.items() if name != "cosfly.escaping" and page.search(text)] == []
+    assert [name for name, text in texts.items() if name != "cosfly.work.console" and console.search(text)] == []
 
 
 def test_what_the_container_installs_is_pinned_with_hashes_and_is_what_the_project_needs():

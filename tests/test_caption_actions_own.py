@@ -22,9 +22,9 @@ from caption.schema import CaptionConfig, LabelConfig
 from caption.truth.actions import Motion, is_contradicted, label_of, measure, table_of
 from caption.truth.reach import never_labels
 from caption.truth.released import read_released
-from cosfly import in_place, pipeline
+from cosfly.app import pipeline
+from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.config import load
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.products.actions import (
     ACTIONS_FILE,
@@ -40,9 +40,10 @@ from cosfly.products.actions import (
 )
 from cosfly.products.answer_text import answer_schema, normalize_action
 from cosfly.products.captions import read_captions
+from cosfly.products.splits import SPLITS
 from cosfly.reading.documents import read_json
-from cosfly.settings import RunConfig
-from cosfly.splits import SPLITS
+from cosfly.work import in_place
+from cosfly.work.config import load
 from distill.evaluation import compare
 from distill.evaluation import stage as evaluate
 from distill.evaluation.floors import write_floors

@@ -29,11 +29,10 @@ from caption.schema import CaptionConfig
 from cosfly.chat import answers
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
-from cosfly.chat.contract import Usage
 from cosfly.chat.protocol import encode_body, with_image_ids
 from cosfly.errors import ConfigError, ResumeError, TeacherError
-from cosfly.journal import Journal
-from cosfly.products.captions import read_captions
+from cosfly.products.captions import Usage, read_captions
+from cosfly.work.journal import Journal
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 2, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}

@@ -29,11 +29,12 @@ from caption.teachers.teacher import AskingTeacher, first_budget
 from cosfly.chat import client, throttle
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Request, started
+from cosfly.chat.contract import NoAnswer, Reply, Request, started
 from cosfly.chat.throttle import Throttle
 from cosfly.cli import app
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
+from cosfly.reading.objects import CONTEXT_FULL
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 3, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}

@@ -21,7 +21,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
 from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction
-from cosfly.stage_folder import Failed
+from cosfly.work.stage_folder import Failed
 from distill.inference import stage as infer
 from distill.inference.outcome import Answered, make_prediction, prediction_of
 from distill.prepare.samples import PrepareConfig, make_sample

@@ -15,11 +15,11 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, prompt_format, read_prompt
 from caption.teachers.prompts import system_prompt
-from cosfly import in_place
+from cosfly.chat.student_chat import write_taught
 from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.products.captions import OWN_PROMPTS, read_captions
-from cosfly.student_chat import write_taught
+from cosfly.work import in_place
 from distill.schema import open_split
 from distill.student.taught import taught_by
 from specimens import make_playback_tree

@@ -16,10 +16,10 @@ from typer.testing import CliRunner
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
+from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import Caption, read_captions
-from cosfly.student_chat import TAUGHT, read_taught, write_taught
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
 from distill.student.taught import taught_by

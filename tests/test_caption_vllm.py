@@ -19,10 +19,10 @@ from teacher_server import CHINESE, ENGLISH, is_mirror
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.teacher import make_engine
-from cosfly.chat.contract import Reply, Usage
+from cosfly.chat.contract import Reply
 from cosfly.chat.vllm_engine import VllmEngine, read_output
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
-from cosfly.products.captions import read_captions
+from cosfly.products.captions import Usage, read_captions
 from cosfly.products.predictions import read_predictions
 from distill.inference import stage as infer
 from distill.schema import open_split

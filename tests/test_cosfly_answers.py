@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caption.truth.judge import parse_judgement
-from cosfly.chat.contract import Reply, Request, Usage
-from cosfly.chat.objects import find_object
+from cosfly.chat.contract import Reply, Request
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
-from cosfly.frame_views import encode_picture
+from cosfly.look.frame_views import encode_picture
 from cosfly.products.answer_text import normalize_action, parse_answer
-from cosfly.products.captions import Coc
+from cosfly.products.captions import Coc, Usage
+from cosfly.reading.objects import find_object
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

@@ -9,6 +9,7 @@ from rich.console import Console
 from toy_workers import make_counting_worker, make_worker, stage_in
 from typer.testing import CliRunner
 
+from cosfly.app.settings import RunConfig
 from cosfly.bench.faults import Faults, planted
 from cosfly.bench.measure import row_of, run
 from cosfly.bench.picture import COLORS, draw_events, draw_scaling
@@ -16,11 +17,10 @@ from cosfly.bench.tables import Bench, markdown, stage_rows, tables
 from cosfly.cli import app
 from cosfly.cli.bench import _tables
 from cosfly.errors import ConfigError, ResumeError
-from cosfly.runner import Item, run_items
-from cosfly.settings import RunConfig
-from cosfly.stage_events import Event, read_events
-from cosfly.stage_folder import Manifest, Tally, read_manifest
-from cosfly.worker_pool import WORDS, Watch
+from cosfly.work.runner import Item, run_items
+from cosfly.work.stage_events import Event, read_events
+from cosfly.work.stage_folder import Manifest, Tally, read_manifest
+from cosfly.work.worker_pool import WORDS, Watch
 
 
 def event(at_s: float, kind: str, **fields) -> Event:

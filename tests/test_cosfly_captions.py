@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption
 
-from cosfly.chat.objects import MAX_CHARACTERS
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
 from cosfly.products.captions import Caption, Coc, read_captions, write_captions
 from cosfly.products.sentences import END, cut_sentences
+from cosfly.reading.objects import MAX_CHARACTERS
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

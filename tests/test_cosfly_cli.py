@@ -13,14 +13,15 @@ from typing import Any
 import pytest
 import typer
 
-from cosfly import cli, doctor
+from cosfly import cli
+from cosfly.app import doctor
+from cosfly.app.doctor import Check
+from cosfly.app.settings import RunConfig
 from cosfly.chat.wire import Connections, Response
 from cosfly.cli.options import resolve, tell_product
-from cosfly.doctor import Check
 from cosfly.errors import InputError
-from cosfly.settings import RunConfig
-from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import write_json
+from cosfly.work.stage_folder import StageFolder, Tally
+from cosfly.work.store import write_json
 
 
 @pytest.fixture(autouse=True)

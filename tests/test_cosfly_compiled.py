@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import cosfly
-from cosfly import ahead, compiled
+from cosfly.app import ahead
+from cosfly.work import compiled
 
 DAY_S = 86400.0
 
@@ -18,18 +19,18 @@ DAY_S = 86400.0
 def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     """Its own file stays as it is: numba alone would go on with the old function."""
     package = tmp_path / "src" / "cosfly"
-    package.mkdir(parents=True)
-    for name in ("__init__.py", "compiled.py"):
-        shutil.copy(Path(cosfly.__file__).parent / name, package)
+    (package / "work").mkdir(parents=True)
+    for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
+        shutil.copy(Path(cosfly.__file__).parent / name, package / name)
     (package / "upper.py").write_text(
-        "from cosfly.compiled import njit\nfrom cosfly.lower import f\n\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+        "from cosfly.work.compiled import njit\nfrom cosfly.lower import f\n\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
     )
     env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     env |= {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     printed = []
     for factor in (2, 3, 2):
         (package / "lower.py").write_text(
-            f"from cosfly.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
+            f"from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
         )
         code = "from cosfly.upper import g; print(g(7), sum(g.stats.cache_hits.values()))"
         done = subprocess.run(
@@ -43,7 +44,7 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
 def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     """Two functions in a new cache: one line; the second process loads them and says nothing."""
     (tmp_path / "two.py").write_text(
-        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\nfrom cosfly.compiled import njit\n\n\n"
+        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\nfrom cosfly.work.compiled import njit\n\n\n"
         "@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
     )
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -85,7 +86,7 @@ class Compiled(event.Listener):
 event.register("numba:compile", Compiled())
 import cosfly.planners.stage as s
 s.warm_up(s.PlanConfig(planner='muco'))
-from cosfly import ahead
+from cosfly.app import ahead
 ahead.compile_render()
 ahead.compile_inspection()
 print("done")
@@ -110,7 +111,7 @@ def test_what_is_compiled_ahead_is_found_by_the_stages(tmp_path, monkeypatch):
 
 def test_the_spare_process_ends_with_the_one_that_started_it(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "cosfly.ahead", "muco"]
+    command = [sys.executable, "-m", "cosfly.app.ahead", "muco"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as spare:
         spare.stdin.close()
         assert spare.wait(60) == 1

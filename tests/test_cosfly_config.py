@@ -7,11 +7,11 @@ import pytest
 from pydantic import BaseModel, Field
 from typer.testing import CliRunner
 
+from cosfly.app.settings import RunConfig
+from cosfly.app.settings_guide import as_page, explain, nested, with_words
 from cosfly.cli import app
-from cosfly.config import Config, apply_overrides, load, shipped
 from cosfly.errors import ConfigError
-from cosfly.settings import RunConfig
-from cosfly.settings_guide import as_page, explain, nested, with_words
+from cosfly.work.config import Config, apply_overrides, load, shipped
 
 
 class Inner(Config):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.coverage_page import coverage_html, ranges, shares
+from cosfly.look.coverage_page import coverage_html, ranges, shares
 from cosfly.products.actions import action_tokens
 from cosfly.products.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
 from cosfly.products.flights import find_flights

@@ -21,16 +21,16 @@ from rich.table import Table
 from caption.run.report import page_html
 from caption.run.stage import run as caption
 from caption.schema import CaptionConfig
-from cosfly import console as shared
 from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import InputError
 from cosfly.escaping import LONGEST, cut, for_html, for_markdown, for_terminal, markdown_code
 from cosfly.inspection.report import FlightView, report_html
 from cosfly.inspection.stage import run as inspect
-from cosfly.issues import Report
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.inspection import Inspection, read_inspection
+from cosfly.products.issues import Report
 from cosfly.reading.documents import read_json
+from cosfly.work import console as shared
 from release.card.render import render_card
 from release.record import ReleaseRecord
 from specimens import make_playback_tree

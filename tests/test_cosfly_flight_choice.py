@@ -13,16 +13,16 @@ from typer.testing import CliRunner
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig
 from caption.truth.released import read_released
+from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin, track_of
 from cosfly.products.inspection import read_inspection
 from cosfly.products.places import FlightChoice, place_of
 from cosfly.products.playback import read_flight
-from cosfly.provenance import fingerprint
-from cosfly.settings import RunConfig
+from cosfly.work.config import build
+from cosfly.work.provenance import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
-from cosfly import flight_metrics, kernels
-from cosfly.chance import rng_for
 from cosfly.planners.contract import PlanConfig, load_planner
 from cosfly.planners.foresight import foresight, lattice, search, smooth
 from cosfly.planners.stage import make_scenario, plan_flight
+from cosfly.space import flight_metrics, kernels
+from cosfly.work.chance import rng_for
 
 CFG = PlanConfig()
 

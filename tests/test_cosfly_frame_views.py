@@ -18,7 +18,7 @@ from caption.teachers.teacher import RuleTeacher
 from caption.window_loop import caption_window
 from caption.windows import cut_windows
 from cosfly.errors import InputError
-from cosfly.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
+from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS

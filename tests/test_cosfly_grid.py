@@ -9,7 +9,10 @@ from scipy.optimize import linprog
 
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrix
-from cosfly.grid import (
+from cosfly.products.boxes import make_box_map
+from cosfly.products.kinds import KINDS
+from cosfly.products.roi import Roi
+from cosfly.space.grid import (
     OccupancyGrid,
     blocks_walking,
     compare,
@@ -20,9 +23,6 @@ from cosfly.grid import (
     roi_mask,
     surface,
 )
-from cosfly.products.boxes import make_box_map
-from cosfly.products.kinds import KINDS
-from cosfly.products.roi import Roi
 
 BUILDINGS, WATER, ROADS = KINDS["Buildings"], KINDS["Water"], KINDS["Roads"]
 

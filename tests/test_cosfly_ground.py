@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from cosfly.chance import rng_for
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.kernels import obstacle_index
 from cosfly.maps.synthetic import SyntheticConfig, load
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.planners.contract import PlanConfig
@@ -19,6 +17,8 @@ from cosfly.render.contract import GROUND_PLANE_DROP_M
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import report
+from cosfly.space.kernels import obstacle_index
+from cosfly.work.chance import rng_for
 
 LIFT_M = 2.0
 LIFT = np.array([0.0, 0.0, LIFT_M])

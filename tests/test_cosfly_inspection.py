@@ -26,18 +26,18 @@ from cosfly.inspection.others import check_others, others_told
 from cosfly.inspection.pixels import unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
-from cosfly.issues import Issue, Report
-from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, read_meta, tree_position
 from cosfly.products.inspection import read_inspection
+from cosfly.products.issues import Issue, Report
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.store import CHECKSUMS, write_checksums, write_json
+from cosfly.space.kernels import obstacle_index, signed_distances
+from cosfly.work.store import CHECKSUMS, write_checksums, write_json
 from specimens import make_playback_tree
 
 NUM_POINTS = 10
@@ -778,7 +778,7 @@ def test_progress_is_told_by_frames(tmp_path, monkeypatch):
 
         yield advance
 
-    monkeypatch.setattr("cosfly.runner.progress_bar", bar)
+    monkeypatch.setattr("cosfly.work.runner.progress_bar", bar)
     tree = make_playback_tree(tmp_path / "tree", 1, 7)
     run(InspectConfig(), None, None, tree, tmp_path / "inspect")
     assert bars == [["inspect: frames", 14, 14]]

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly import kernels
 from cosfly.geometry import rotation_matrices, rotation_matrix
 from cosfly.planners.muco.window import window_rays
 from cosfly.products.boxes import make_box_map
 from cosfly.products.kinds import KINDS
+from cosfly.space import kernels
 
 NO_TURN = np.eye(3)[None]
 

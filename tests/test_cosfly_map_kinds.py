@@ -12,12 +12,12 @@ from numpy.testing import assert_allclose
 from specimens_slopes import CITY_EAST_M, CITY_NORTH_M, city_height_m, sloped_city
 
 from cosfly.errors import InputError
-from cosfly.grid import lies_off_ground
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.space.grid import lies_off_ground
 
 Model = dict
 

@@ -11,8 +11,8 @@ import pytest
 import shapely
 from shapely.geometry import Point, Polygon, box
 
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.look.topview import TopView, draw_map, draw_text
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
@@ -25,7 +25,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
-from cosfly.topview import TopView, draw_map, draw_text
+from cosfly.work.config import build
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:

@@ -14,7 +14,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.config import build
 from cosfly.errors import InputError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
@@ -40,6 +39,7 @@ from cosfly.render.contract import (
 from cosfly.render.solids import solids_of
 from cosfly.render.stage import RENDERERS, open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.work.config import build
 
 SIZE = (320, 180)
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes

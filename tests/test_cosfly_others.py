@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.chance import rng_for
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Course, and_back, braked, company_of
@@ -19,7 +17,9 @@ from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import BUILDS, Company, Other, distances_to_boxes_m, gaps_m, read_others, write_others
 from cosfly.products.walks import read_paths
-from cosfly.store import dump_json
+from cosfly.work.chance import rng_for
+from cosfly.work.config import build
+from cosfly.work.store import dump_json
 
 PERSON, CAR = "Pedestrians", "Car"
 

@@ -1,4 +1,4 @@
-"""cosfly/overlay.py and `cosfly render sample`: boxes, ids and distances over a frame."""
+"""cosfly/look/overlay.py and `cosfly render sample`: boxes, ids and distances over a frame."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.gallery import four_panels
 from cosfly.geometry import box_corners, intrinsic_matrix, project, world_from_camera
-from cosfly.overlay import TARGET_COLOR, Overlay, _lines
+from cosfly.look.gallery import four_panels
+from cosfly.look.overlay import TARGET_COLOR, Overlay, _lines
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_instance, read_meta, read_rgb
 from cosfly.products.instance_ids import read_instance_ids
@@ -24,7 +24,7 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.store import read_checksums
+from cosfly.work.store import read_checksums
 
 SETTINGS = {
     "width_px": 320,

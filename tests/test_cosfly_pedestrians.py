@@ -5,11 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cosfly.chance import rng_for
-from cosfly.config import build
 from cosfly.errors import ConfigError, CosflyError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
-from cosfly.grid import OccupancyGrid
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
@@ -26,7 +23,10 @@ from cosfly.products.ground import Ground
 from cosfly.products.kinds import KINDS
 from cosfly.products.roi import Roi
 from cosfly.products.walks import read_paths
-from cosfly.store import dump_json
+from cosfly.space.grid import OccupancyGrid
+from cosfly.work.chance import rng_for
+from cosfly.work.config import build
+from cosfly.work.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
 

@@ -12,9 +12,6 @@ from scipy.optimize import minimize
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
-from cosfly import flight_metrics as metrics
-from cosfly import kernels
-from cosfly.config import load
 from cosfly.errors import ConfigError, InputError, NoPathError, NothingKept, ResumeError
 from cosfly.geometry import DT_S, look_at
 from cosfly.planners import wish
@@ -24,6 +21,9 @@ from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
+from cosfly.space import flight_metrics as metrics
+from cosfly.space import kernels
+from cosfly.work.config import load
 
 CFG = PlanConfig()
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from cosfly import provenance
-from cosfly.config import Config
 from cosfly.errors import InputError, NothingKept, VerifyError
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.stage_folder import Dropped, StageFolder, Tally
-from cosfly.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
+from cosfly.work import provenance
+from cosfly.work.config import Config
+from cosfly.work.stage_folder import Dropped, StageFolder, Tally
+from cosfly.work.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
 
 
 def begin(out: Path, name: str, **inputs: Path) -> StageFolder:

@@ -18,9 +18,7 @@ import pytest
 from shapely.geometry import Polygon
 
 from caption.teachers.foreign import read_foreign
-from cosfly.config import Config, apply_overrides, build, read_yaml
 from cosfly.errors import ConfigError, CosflyError, InputError
-from cosfly.journal import Journal
 from cosfly.maps import cityjson, simworld
 from cosfly.maps.footprints import check_outline, num_crossings
 from cosfly.products.boxes import read_boxes
@@ -36,8 +34,10 @@ from cosfly.products.walks import read_paths
 from cosfly.reading import arrays, documents, files, tables
 from cosfly.reading.files import read_text
 from cosfly.reading.limits import Limits, use_limits
-from cosfly.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
-from cosfly.store import CHECKSUMS, inside, read_checksums
+from cosfly.work.config import Config, apply_overrides, build, read_yaml
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
+from cosfly.work.store import CHECKSUMS, inside, read_checksums
 from distill.schema import RECORD, read_training_set
 from release.record import read_record
 

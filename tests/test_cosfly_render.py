@@ -15,12 +15,9 @@ from PIL import Image
 from public_reader import read_public
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
-from cosfly import gallery
-from cosfly.config import build
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept, ResumeError
 from cosfly.geometry import focal_px, intrinsic_matrix, look_at, rotation_matrices, world_from_camera
-from cosfly.journal import Journal
-from cosfly.kernels import obstacle_index, signed_distances
+from cosfly.look import gallery
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
@@ -54,7 +51,10 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run, script_flight
-from cosfly.store import read_checksums
+from cosfly.space.kernels import obstacle_index, signed_distances
+from cosfly.work.config import build
+from cosfly.work.journal import Journal
+from cosfly.work.store import read_checksums
 
 LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))

@@ -9,12 +9,12 @@ import pytest
 from teacher_server import TeacherServer, kept_answers
 from typer.testing import CliRunner
 
+from cosfly.app.repair import repair
 from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.journal import Journal
-from cosfly.repair import repair
-from cosfly.stage_folder import StageFolder
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import StageFolder
 from specimens import make_playback_tree
 
 ANSWER = {"key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t", "usage": {"prompt_tokens": 10, "completion_tokens": 2},
@@ -64,7 +64,7 @@ def test_a_repair_that_is_killed_leaves_no_stage_complete_that_lacks_a_line(tmp_
     def end(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cosfly.journal.write_bytes", end)
+    monkeypatch.setattr("cosfly.work.journal.write_bytes", end)
     with pytest.raises(KeyboardInterrupt):
         repair(tmp_path)
     assert not (tmp_path / "manifest.json").exists()

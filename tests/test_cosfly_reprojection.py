@@ -1,12 +1,13 @@
-"""cosfly/reprojection.py: what two frames say of each other, and what is usual among those of a flight."""
+"""cosfly/space/reprojection.py: what two frames say of each other, and what is usual among those of a flight."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from cosfly.products.frames import grid_rows
 from cosfly.products.kinds import KINDS
 from cosfly.render.contract import LAYERS
-from cosfly.reprojection import (
+from cosfly.space.reprojection import (
     COLUMNS,
     FLAT,
     LEAST_CONTRAST,
@@ -14,7 +15,6 @@ from cosfly.reprojection import (
     View,
     compare_views,
     correlate_colours,
-    grid_rows,
     median_of,
     usual_correlations,
     way_px,

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosfly.chance import draw_by_share, draws_for, rng_for
-from cosfly.config import Config
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.journal import Journal
-from cosfly.runner import Item, Outcome, run_items
-from cosfly.stage_folder import StageFolder
-from cosfly.store import dump_json
+from cosfly.work.chance import draw_by_share, draws_for, rng_for
+from cosfly.work.config import Config
+from cosfly.work.journal import Journal
+from cosfly.work.runner import Item, Outcome, run_items
+from cosfly.work.stage_folder import StageFolder
+from cosfly.work.store import dump_json
 
 
 def make_worker(log: Path):
@@ -139,7 +139,7 @@ def test_kill_and_resume(tmp_path):
         import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
         from test_cosfly_runner import _stage, make_slow_worker
-        from cosfly.runner import Item, run_items
+        from cosfly.work.runner import Item, run_items
         run_items(_stage(Path({str(tmp_path / "s")!r})), [Item(str(k), k) for k in range(40)], make_slow_worker)
         """
     )
@@ -164,9 +164,9 @@ STUCK = """
 import sys, time
 from pathlib import Path
 from cosfly import cli
-from cosfly.config import Config
-from cosfly.runner import Item, run_items
-from cosfly.stage_folder import StageFolder
+from cosfly.work.config import Config
+from cosfly.work.runner import Item, run_items
+from cosfly.work.stage_folder import StageFolder
 
 def slow(folder):
     def work(item):

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.merge import MergeRule, clusters, fill_share, merge
 from cosfly.simplify.passes import SimplifyConfig, crop_below_ground, prune_nested, simplify
 from cosfly.simplify.stage import cross_validate, run
+from cosfly.work.config import build
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}

@@ -8,11 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 from specimens_slopes import CELL_M, SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
 
-from cosfly.chance import rng_for
 from cosfly.errors import InputError
 from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
-from cosfly.grid import blocks_walking
-from cosfly.kernels import index_boxes, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_flight
@@ -25,6 +22,9 @@ from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.stage import RENDERERS, open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.space.grid import blocks_walking
+from cosfly.space.kernels import index_boxes, obstacle_index, segments_hit, signed_distances, visibility
+from cosfly.work.chance import rng_for
 
 WALKS = PedestriansConfig(min_distance_m=20.0, max_distance_m=60.0, min_component_cells=400)
 

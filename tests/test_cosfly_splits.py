@@ -1,4 +1,4 @@
-"""cosfly/splits.py: what one walk is, and splits that share none."""
+"""cosfly/products/splits.py: what one walk is, and splits that share none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cosfly.errors import InputError
 from cosfly.products.playback import Flight, read_flight, write_flight
-from cosfly.splits import SPLITS, Course, assign_splits, town_family, walks_of
+from cosfly.products.splits import SPLITS, Course, assign_splits, town_family, walks_of
 from specimens import make_flight
 
 STEP_S = 0.5

@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from cosfly import stage_folder, store
-from cosfly.config import Config, MayDiffer
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.folder_lock import give_up
-from cosfly.journal import Journal
-from cosfly.provenance import fingerprint, has_grown_from, read_stage_record
 from cosfly.reading.documents import read_json
-from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
-from cosfly.store import inside, write_bytes, write_json
+from cosfly.work import stage_folder, store
+from cosfly.work.config import Config, MayDiffer
+from cosfly.work.folder_lock import give_up
+from cosfly.work.journal import Journal
+from cosfly.work.provenance import fingerprint, has_grown_from, read_stage_record
+from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
+from cosfly.work.store import inside, write_bytes, write_json
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -487,7 +487,7 @@ def test_where_the_system_has_no_locks_work_goes_on_and_leaves_none(tmp_path, mo
     def flock(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr("cosfly.folder_lock.fcntl.flock", flock)
+    monkeypatch.setattr("cosfly.work.folder_lock.fcntl.flock", flock)
     assert not _open(tmp_path / "out").is_complete
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["stage.json"]
     assert "no lock against a second run" in caplog.text

@@ -7,12 +7,12 @@ import pytest
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
-from cosfly import flight_metrics, kernels
 from cosfly.errors import NoPathError
 from cosfly.planners import sight
 from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
 from cosfly.planners.track_astar import smooth, track_astar
 from cosfly.planners.wish import follow
+from cosfly.space import flight_metrics, kernels
 
 CFG = PlanConfig(planner="track_astar")
 

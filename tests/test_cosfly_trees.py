@@ -34,8 +34,8 @@ from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.render import older_trees
-from cosfly.stage_folder import read_failures
-from cosfly.store import read_checksums, write_checksums, write_json
+from cosfly.work.stage_folder import read_failures
+from cosfly.work.store import read_checksums, write_checksums, write_json
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 
-from cosfly.config import build
-from cosfly.coverage_page import coverage_html
 from cosfly.errors import ConfigError, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, rotation_matrices
+from cosfly.look.coverage_page import coverage_html
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.flights import find_flights
@@ -32,6 +31,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.render.weather_gallery import run as draw_gallery
+from cosfly.work.config import build
 
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}

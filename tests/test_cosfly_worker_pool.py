@@ -14,11 +14,11 @@ import pytest
 from toy_workers import make_broken_worker, make_counting_worker, make_talking_worker, make_worker, stage_in
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.journal import Journal
-from cosfly.runner import Item, Watch, run_items
-from cosfly.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
-from cosfly.stage_folder import Failed
-from cosfly.worker_pool import WORDS, limit_s
+from cosfly.work.journal import Journal
+from cosfly.work.runner import Item, Watch, run_items
+from cosfly.work.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
+from cosfly.work.stage_folder import Failed
+from cosfly.work.worker_pool import WORDS, limit_s
 
 QUICK = Watch(item_limit_s=2.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)  # stands still after 2 s
 
@@ -87,7 +87,7 @@ import sys; sys.path.insert(0, {tests!r})
 from pathlib import Path
 from toy_workers import make_idle_worker, stage_in
 from cosfly import cli
-from cosfly.runner import Item, run_items
+from cosfly.work.runner import Item, run_items
 
 if __name__ == "__main__":
     @cli.app.command()
@@ -157,7 +157,7 @@ def test_progress_is_told_in_steps_where_all_items_know_theirs(tmp_path, monkeyp
         bars.append((total, done, moves))
         yield moves.append
 
-    monkeypatch.setattr("cosfly.runner.progress_bar", bar)
+    monkeypatch.setattr("cosfly.work.runner.progress_bar", bar)
     payload = "once-die" if workers and expected == 21 else None
     items = [Item(f"i{k}", payload if k == 1 else None, size) for k, size in enumerate(sizes)]
     run_items(stage_in(tmp_path), items[:1], make_counting_worker, (tmp_path,))
@@ -237,7 +237,7 @@ def test_freed_memory_is_not_asked_for_again():
     """A process of its own: what is set stays set."""
     code = """if 1:
         import resource, numpy as np
-        from cosfly.worker import keep_freed_memory
+        from cosfly.work.worker import keep_freed_memory
         def num_pages():
             before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
             for _ in range(20):

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, street, write_inputs
 
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError, NothingKept, RenderError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
@@ -32,7 +31,8 @@ from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.render.zoom.lens import ZoomConfig, cameras_of, zoomed_deg
-from cosfly.stage_folder import read_failures, read_manifest
+from cosfly.work.config import build
+from cosfly.work.stage_folder import read_failures, read_manifest
 from release.columns import INTRINSICS, Placed, matrices_of, scalar_row
 from specimens import make_flight
 

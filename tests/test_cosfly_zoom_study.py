@@ -20,7 +20,7 @@ from cosfly.geometry import intrinsic_matrix
 from cosfly.products.frames import Camera
 from cosfly.render.zoom.fidelity import compare, digital_zoom, enlarged_camera, ssim
 from cosfly.render.zoom.study import ZoomStudyConfig, spread, text_rows
-from cosfly.stage_folder import read_manifest
+from cosfly.work.stage_folder import read_manifest
 
 LEVELS = [110.0, 60.0, 30.0]
 

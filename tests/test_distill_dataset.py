@@ -19,7 +19,7 @@ from specimens_distill import make_caption, make_captions, prepared
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
-from cosfly.splits import SPLITS
+from cosfly.products.splits import SPLITS
 from distill.prepare import stage
 from distill.prepare.leaks import check_no_leak
 from distill.prepare.samples import PrepareConfig, make_sample

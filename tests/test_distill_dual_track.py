@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.errors import InputError, NothingKept
 from cosfly.products.playback import STATES, read_flight, write_flight
-from cosfly.splits import SPLITS
-from cosfly.stage_folder import read_failures, read_manifest
+from cosfly.products.splits import SPLITS
+from cosfly.work.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
 from distill.prepare.dual_track import DualTrackConfig, windows_of
 from distill.tracks import TrackSample, read_track_samples, read_track_set

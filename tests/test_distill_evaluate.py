@@ -19,12 +19,12 @@ from typer.testing import CliRunner
 from cosfly.chat.answers import AnswerBook
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
-from cosfly.journal import Journal
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.predictions import Prediction, read_predictions
-from cosfly.stage_folder import StageFolder, Tally
-from cosfly.store import dump_json
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import StageFolder, Tally
+from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.figures import differences_of, draw_walks, figures_of, macro_f1

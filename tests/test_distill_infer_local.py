@@ -22,11 +22,11 @@ from typer.testing import CliRunner
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from cosfly.chat.student_chat import TAUGHT  # noqa: E402
 from cosfly.cli import app  # noqa: E402
 from cosfly.errors import ConfigError, InputError, NothingKept  # noqa: E402
 from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
-from cosfly.store import dump_json  # noqa: E402
-from cosfly.student_chat import TAUGHT  # noqa: E402
+from cosfly.work.store import dump_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.inference.outcome import make_prediction  # noqa: E402

@@ -20,10 +20,10 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from specimens_distill import TEACHING, make_adapter, make_captions, prepared  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
+from cosfly.chat.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.cli import app  # noqa: E402
 from cosfly.errors import InputError, ResumeError  # noqa: E402
-from cosfly.store import write_json  # noqa: E402
-from cosfly.student_chat import TAUGHT, read_taught  # noqa: E402
+from cosfly.work.store import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.schema import open_split, resolve_trees  # noqa: E402

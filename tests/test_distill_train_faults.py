@@ -256,7 +256,7 @@ def test_a_reader_that_is_killed_in_the_middle_of_a_step_is_one_error(place, tmp
 
 def test_a_second_process_is_refused(place, tmp_path):
     out = tmp_path / "out"
-    hold = "import pathlib, sys, time; from cosfly.folder_lock import hold_folder\n"
+    hold = "import pathlib, sys, time; from cosfly.work.folder_lock import hold_folder\n"
     hold += "held = hold_folder(pathlib.Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", hold, str(out)], stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None

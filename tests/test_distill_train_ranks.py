@@ -137,7 +137,7 @@ def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
 @pytest.mark.slow
 def test_one_that_fails_is_everybodys_error(place, tmp_path):
     """The first process finds the folder taken by another one: both end with its words, and what is there stays."""
-    from cosfly.folder_lock import hold_folder
+    from cosfly.work.folder_lock import hold_folder
 
     with hold_folder(tmp_path / "out"):
         processes = start(place, tmp_path / "out", 2)

@@ -29,15 +29,15 @@ from test_docs_commands import ALL, PAGES, blocks
 from test_release_get import served
 from typer.testing import CliRunner
 
-from cosfly import runner
 from cosfly.cli import app, options_first
-from cosfly.config import shipped
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.products.captions import read_captions
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.runner import Item, Watch
-from cosfly.stage_folder import StageFolder
+from cosfly.work import runner
+from cosfly.work.config import shipped
+from cosfly.work.runner import Item, Watch
+from cosfly.work.stage_folder import StageFolder
 from specimens import make_playback_tree
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.

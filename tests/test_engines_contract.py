@@ -15,10 +15,10 @@ from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, Request, Usage, started
+from cosfly.chat.contract import NoAnswer, Reply, Request, started
 from cosfly.errors import TeacherError
 from cosfly.products.answer_text import answer_schema, parse_answer
-from cosfly.products.captions import read_captions
+from cosfly.products.captions import Usage, read_captions
 from specimens import make_playback_tree
 
 SAMPLING = EndpointConfig(max_tries=1, max_tokens=64)

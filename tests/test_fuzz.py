@@ -17,17 +17,17 @@ from hypothesis import strategies as st
 from toy_readers import HONEST
 
 from caption.truth.prose.numerals import masked
+from cosfly.app.settings import RunConfig
 from cosfly.chat.contract import Request
-from cosfly.chat.objects import find_object
 from cosfly.chat.protocol import base_url, read_completion, read_models
 from cosfly.chat.refusals import kind_of
 from cosfly.chat.wire import Response, retry_after_s
-from cosfly.config import apply_overrides, build
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import FIELDS
 from cosfly.reading.documents import parse_document
-from cosfly.settings import RunConfig
-from cosfly.store import CHECKSUMS, read_checksums
+from cosfly.reading.objects import find_object
+from cosfly.work.config import apply_overrides, build
+from cosfly.work.store import CHECKSUMS, read_checksums
 
 INPUTS = 50  # of each reader whose share is 1
 EXAMPLES = 60

@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosfly import pipeline, provenance
+from cosfly.app import pipeline
+from cosfly.app.estimate import estimate, other_settings, rates_near, time_left
+from cosfly.app.runs import look
+from cosfly.app.settings import RunConfig
 from cosfly.bench import measure
 from cosfly.cli import app
-from cosfly.config import load
 from cosfly.errors import ConfigError, InputError, ResumeError, StorageError, VerifyError
-from cosfly.estimate import estimate, other_settings, rates_near, time_left
-from cosfly.folder_lock import hold_folder
-from cosfly.journal import Journal
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
@@ -29,10 +28,12 @@ from cosfly.products.playback import read_flight
 from cosfly.products.walks import read_paths as read_walks
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.runs import look
-from cosfly.settings import RunConfig
-from cosfly.stage_folder import read_failures
-from cosfly.store import read_checksums, write_checksums, write_json
+from cosfly.work import provenance
+from cosfly.work.config import load
+from cosfly.work.folder_lock import hold_folder
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import read_failures
+from cosfly.work.store import read_checksums, write_checksums, write_json
 from distill.prepare import stage as prepare
 from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
@@ -221,7 +222,7 @@ def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_pat
 def test_a_dry_run_tells_of_compiling_where_it_was_not_done(base, tmp_path, monkeypatch):
     told = {}
     for name, folder in (("new", tmp_path), ("none", None)):
-        monkeypatch.setattr("cosfly.ahead.cache_folder", lambda folder=folder: folder)
+        monkeypatch.setattr("cosfly.app.ahead.cache_folder", lambda folder=folder: folder)
         shown = CliRunner().invoke(app, ["run", str(base), "--out", str(tmp_path / "run"), "--dry-run"])
         told[name] = "of compiling, once on this machine" in shown.output
     assert told == {"new": True, "none": False}
@@ -497,8 +498,8 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import test_pipeline_tiny as tiny
-from cosfly.journal import Journal
-from cosfly.stage_folder import StageFolder
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import StageFolder
 
 what, left = {what!r}, {count}
 def deadly(function):

@@ -9,7 +9,6 @@ from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
 
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import label_of, measure
-from cosfly import kernels
 from cosfly.errors import InputError, NoPathError
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.planners.contract import PLANNERS, PlanConfig
@@ -31,7 +30,8 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import write_paths
-from cosfly.stage_folder import read_manifest
+from cosfly.space import kernels
+from cosfly.work.stage_folder import read_manifest
 
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])

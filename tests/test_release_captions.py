@@ -12,12 +12,12 @@ from test_release_package import CFG, build, make_caption, make_inspection
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.config import build as build_config
 from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.products.captions import Coc, Prompt, read_captions, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
+from cosfly.work.config import build as build_config
 from release.export import stage
 from release.export.captions import FORMULA, cell, export, read_lines
 from release.export.contract import ExportConfig

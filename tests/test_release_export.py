@@ -25,7 +25,6 @@ from test_release_package import CFG, all_bytes, build, make_caption, make_inspe
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.config import build as build_config
 from cosfly.errors import InputError, ResumeError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
@@ -36,7 +35,8 @@ from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
-from cosfly.store import CHECKSUMS, read_checksums
+from cosfly.work.config import build as build_config
+from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
 from release.export.lerobot.features import moves, tiff_of_depth
 from release.export.lerobot.format import runs_of

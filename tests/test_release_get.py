@@ -26,13 +26,13 @@ from test_release_package import CFG, all_bytes, build, make_caption, make_inspe
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.config import build as build_config
 from cosfly.errors import CosflyError, InputError, ResumeError, VerifyError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
-from cosfly.store import CHECKSUMS, read_checksums, sha256_bytes
+from cosfly.work.config import build as build_config
+from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes
 from release.columns import PICTURES
 from release.export.contract import ExportConfig
 from release.export.stage import run as export

@@ -21,7 +21,7 @@ from specimens_foreign import hub_snapshot
 from test_release_export import TWO_SPLITS, make_release
 from test_release_package import all_bytes
 
-from cosfly.config import build
+from cosfly.work.config import build
 from release.get.choice import Choice
 from release.get.stage import run as get
 from release.record import read_record

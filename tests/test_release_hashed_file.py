@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from cosfly.store import atomic_file
+from cosfly.work.store import atomic_file
 from release.package import hashed_file
 from release.package.hashed_file import BLOCK, NUM_BLOCKS, HashedFile
 

@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept
-from cosfly.issues import Issue
 from cosfly.products.boxes import MapHeader
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, read_captions, write_captions
 from cosfly.products.flights import find_flights
@@ -34,13 +33,14 @@ from cosfly.products.inspection import (
     TrajectoryFunnel,
     write_inspection,
 )
+from cosfly.products.issues import Issue
 from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.review import Choice, add_decisions
 from cosfly.products.town import write_town_map
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 from release.card.render import render_card, size_category
 from release.columns import SCALARS, Placed
 from release.package.config import ReleaseConfig

@@ -19,12 +19,12 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.flight_metrics import accel_rms, jerk_rms, length_m
 from cosfly.products.coverage import Coverage, default_coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.inspection import read_inspection, write_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.reading.documents import read_json
+from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import BOX, POINT, POSE
 from release.record import read_record
 from release.stats.counting import Counts, overlap

@@ -20,15 +20,15 @@ from specimens_foreign import hub_snapshot, write_foreign_tree
 from typer.testing import CliRunner
 
 from caption.truth.released import read_released
-from cosfly import pipeline
+from cosfly.app import pipeline
+from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.config import load
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
-from cosfly.settings import RunConfig
-from cosfly.store import write_bytes
+from cosfly.work.config import load
+from cosfly.work.store import write_bytes
 from release.columns import POSE
 from release.package import stage as package
 from release.package.config import ReleaseConfig

@@ -16,12 +16,12 @@ from release_lies import LIES
 from release_tampering import errors_in, forge, pixels_of, png
 
 from caption.truth.released import read_released
-from cosfly import pipeline
-from cosfly.config import load
+from cosfly.app import pipeline
+from cosfly.app.settings import RunConfig
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.settings import RunConfig
-from cosfly.store import read_checksums, write_checksums
+from cosfly.work.config import load
+from cosfly.work.store import read_checksums, write_checksums
 from release.export.contract import FORMATS, ExportConfig
 from release.export.stage import run as export
 from release.package import stage as package

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from release_tampering import png
 
 from cosfly.png.read import parse_png
-from cosfly.reprojection import grid_rows
+from cosfly.products.frames import grid_rows
 from release.verify.findings import Findings
 from release.verify.person import check_shown, outline_step
 from release.verify.pixels import (

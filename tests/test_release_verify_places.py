@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_release_verify_across import flight
 
 from cosfly.products.kinds import KINDS
-from cosfly.reprojection import View, compare_views
+from cosfly.space.reprojection import View, compare_views
 from release.verify.across import RowFiles
 from release.verify.findings import Findings
 from release.verify.places import check_places, kept_rows, packed, thinned, unpacked

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cosfly.reprojection import Agreement
+from cosfly.space.reprojection import Agreement
 from release.verify import scene
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.frame_views import read_view
+from cosfly.look.frame_views import read_view
 from cosfly.products.boxes import make_box_map, write_boxes
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights

@@ -18,12 +18,11 @@ import cv2
 import numpy as np
 import pytest
 
-from cosfly.config import build
 from cosfly.errors import EnvironmentMissing, RenderError
-from cosfly.frame_views import PEDESTRIAN_RGB, read_view
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
+from cosfly.look.frame_views import PEDESTRIAN_RGB, read_view
 from cosfly.products import playback
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.flights import find_flights
@@ -52,6 +51,7 @@ from cosfly.render.layers import layers_of
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
+from cosfly.work.config import build
 
 SIZE = (320, 180)
 DEPTH_TOLERANCE_M = 0.001  # within 60 m

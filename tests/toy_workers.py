@@ -6,11 +6,11 @@ import signal
 import time
 from pathlib import Path
 
-from cosfly.config import Config
 from cosfly.errors import RenderError
-from cosfly.runner import Item, Outcome, advance
-from cosfly.stage_folder import StageFolder
-from cosfly.store import atomic_folder
+from cosfly.work.config import Config
+from cosfly.work.runner import Item, Outcome, advance
+from cosfly.work.stage_folder import StageFolder
+from cosfly.work.store import atomic_folder
 
 
 def stage_in(path: Path) -> StageFolder:

@@ -23,12 +23,12 @@ from caption.truth.judge import open_judge
 from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
-from cosfly.chat.contract import NoAnswer, Troubles, Usage
-from cosfly.console import SECONDS_BETWEEN_LINES
+from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.errors import CosflyError, InputError, TeacherError
-from cosfly.products.captions import Caption, write_captions
+from cosfly.products.captions import Caption, Usage, write_captions
 from cosfly.products.places import flight_of
-from cosfly.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
+from cosfly.work.console import SECONDS_BETWEEN_LINES
+from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption, Language
-from cosfly.store import sha256_bytes
+from cosfly.work.store import sha256_bytes
 
 FEWEST_WINDOWS = 30  # below, a share says nothing
 FEWEST_TEXTS = 0.01  # distinct texts for each window, below which a warning says so

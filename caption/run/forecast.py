@@ -31,7 +31,7 @@ from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.products.captions import Caption
 from cosfly.products.places import flight_of
-from cosfly.stage_folder import Resume
+from cosfly.work.stage_folder import Resume
 
 TRIAL_WINDOWS = 6
 CONFIDENCE = 0.9

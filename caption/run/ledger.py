@@ -10,11 +10,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from caption.run.chance import ChanceCounts, ChanceReport
-from cosfly.chat.contract import Usage
 from cosfly.products.actions import action_tokens, actions_in_use, shipped_actions
-from cosfly.products.captions import Caption, TeacherRecord
-from cosfly.stage_folder import Tally
-from cosfly.store import sha256_bytes
+from cosfly.products.captions import Caption, TeacherRecord, Usage
+from cosfly.work.stage_folder import Tally
+from cosfly.work.store import sha256_bytes
 
 TEXT_FIELDS = ("critical_components", "reasoning_trace")
 BIN_CHARACTERS = {"en": 25, "zh": 10}  # a Chinese character carries about as much as two or three Latin letters

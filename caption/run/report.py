@@ -8,14 +8,14 @@ from pathlib import Path
 from caption.run.ledger import CaptionReport, Histogram
 from cosfly.chat.budget import BudgetConfig
 from cosfly.escaping import for_html, html_page
-from cosfly.frame_views import thumbnail
+from cosfly.look.frame_views import thumbnail
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.places import flight_of
 from cosfly.products.sentences import sentences_of
 from cosfly.reading.files import read_text
-from cosfly.store import write_bytes
+from cosfly.work.store import write_bytes
 
 PICTURE_WIDTH_PX = 240
 VERDICTS = {  # color, what it means

@@ -27,14 +27,14 @@ from caption.truth.glossary import GLOSSARY_FILE
 from caption.window_loop import caption_prepared
 from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
+from cosfly.chat.student_chat import student_files
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, line_of, write_caption_lines
 from cosfly.products.places import flight_of
 from cosfly.reading.files import read_lines
-from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.stage_folder import Resume, StageFolder, Tally, read_manifest
-from cosfly.store import write_json
-from cosfly.student_chat import student_files
+from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, Tally, read_manifest
+from cosfly.work.store import write_json
 
 log = logging.getLogger(__name__)
 

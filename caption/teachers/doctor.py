@@ -34,7 +34,7 @@ from cosfly.chat.client import ChatClient
 from cosfly.chat.protocol import request_body, response_format
 from cosfly.chat.refusals import MEANINGS
 from cosfly.errors import TeacherError
-from cosfly.frame_views import VIEW_FILES
+from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.answer_text import answer_schema, parse_answer
 from cosfly.products.captions import Writing
 from cosfly.reading.documents import parse_json

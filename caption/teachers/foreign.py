@@ -19,7 +19,7 @@ from cosfly.errors import InputError
 from cosfly.products.captions import Claim, Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.products.predictions import FAILED, Prediction, read_predictions
 from cosfly.reading.documents import model_lines
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 
 NOT_IN_FILE = "not_in_file"
 

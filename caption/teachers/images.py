@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from caption.schema import ImageConfig, ObservedWindow
-from cosfly.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
+from cosfly.look.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from string import Template
 
-from cosfly import in_place
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.files import read_text
-from cosfly.store import refuse_links, storage_errors, write_bytes
+from cosfly.work import in_place
+from cosfly.work.store import refuse_links, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
 

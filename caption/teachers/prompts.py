@@ -14,12 +14,12 @@ from caption.teachers.prompt_files import prompt_format, read_prompt
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.writing.contract import Draft, way_of
-from cosfly import in_place
-from cosfly.frame_views import Pictures, frame_label
+from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
-from cosfly.store import dump_json, sha256_bytes
+from cosfly.work import in_place
+from cosfly.work.store import dump_json, sha256_bytes
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it
 

@@ -19,11 +19,7 @@ from caption.teachers.prompts import Question, decision_words, system_prompt
 from caption.writing.contract import Draft
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
-from cosfly.errors import ConfigError, TeacherError
-from cosfly.frame_views import Pictures
-from cosfly.products.answer_text import answer_schema
-from cosfly.products.captions import Language, Prompt
-from cosfly.student_chat import (
+from cosfly.chat.student_chat import (
     IMAGE_ENCODING,
     SentPicture,
     StudentEndpointConfig,
@@ -32,6 +28,10 @@ from cosfly.student_chat import (
     read_taught,
     student_request,
 )
+from cosfly.errors import ConfigError, TeacherError
+from cosfly.look.frame_views import Pictures
+from cosfly.products.answer_text import answer_schema
+from cosfly.products.captions import Language, Prompt
 
 
 def as_taught(cfg: CaptionConfig) -> CaptionConfig:

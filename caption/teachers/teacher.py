@@ -28,7 +28,6 @@ from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
 from caption.teachers.trials import SCENES, Drawn, Scene, trial_question
 from caption.writing.contract import Draft, more_fields, way_of
-from cosfly.chance import draws_for, rng_for
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient
@@ -36,10 +35,11 @@ from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
 from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
-from cosfly.frame_views import Pictures
+from cosfly.look.frame_views import Pictures
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.products.places import flight_of
+from cosfly.work.chance import draws_for, rng_for
 
 ENCODING_THREADS = 4
 NUM_TRIALS = 2

@@ -18,7 +18,7 @@ from caption.schema import CaptionConfig, ImageConfig, ObservedWindow, observed_
 from caption.teachers.images import EncodedImage, encode_image
 from caption.teachers.prompts import Correction, Question, make_question, question_messages
 from caption.writing.contract import Refused, more_fields, refuse_decision, way_of
-from cosfly.frame_views import VIEW_FILES, Pictures
+from cosfly.look.frame_views import VIEW_FILES, Pictures
 from cosfly.products.answer_text import answer_schema, parse_answer
 from cosfly.products.captions import Writing
 

@@ -15,9 +15,9 @@ from functools import partial
 from itertools import pairwise
 
 from caption.schema import FutureMotion, LabelConfig
-from cosfly import in_place
 from cosfly.products.actions import Condition, Rule, Size, Term, actions_in_use
 from cosfly.products.captions import Verdict
+from cosfly.work import in_place
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cosfly import in_place
-from cosfly.config import Config, build, read_yaml
 from cosfly.products.actions import ActionSet, actions_in_use
 from cosfly.products.captions import Language
+from cosfly.work import in_place
+from cosfly.work.config import Config, build, read_yaml
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
 LANGUAGES: tuple[Language, Language] = ("en", "zh")

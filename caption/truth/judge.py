@@ -22,11 +22,11 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
-from cosfly.chat.objects import find_object
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord
 from cosfly.products.places import flight_of
-from cosfly.store import dump_json
+from cosfly.reading.objects import find_object
+from cosfly.work.store import dump_json
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"

@@ -8,8 +8,8 @@ import numpy as np
 
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import Motion, label_of, measure, table_of
-from cosfly import in_place
 from cosfly.products.actions import ActionSet
+from cosfly.work import in_place
 
 NUM_MOTIONS = 3000
 STEPS, STEP_S = 5, 0.5

@@ -20,9 +20,9 @@ from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose.judging import check_evidence
 from caption.windows import cut_future, frames_of
-from cosfly import in_place
 from cosfly.products.actions import actions_in_use
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
+from cosfly.work import in_place
 
 NUDGE = 1e-9  # of a threshold: what taking offsets off again may cost
 MOST_SHOWN = 160  # characters of a text in a finding

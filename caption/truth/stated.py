@@ -13,8 +13,8 @@ from pathlib import Path
 from pydantic import Field
 
 from caption.truth.numerals import Numeral, read_numerals
-from cosfly.config import Config, build, read_yaml
 from cosfly.products.captions import Language
+from cosfly.work.config import Config, build, read_yaml
 
 STATED_FILE = Path(__file__).with_name("stated.yaml")
 

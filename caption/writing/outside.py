@@ -13,9 +13,9 @@ from caption.truth.numerals import read_numerals
 from caption.truth.prose.numerals import masked
 from caption.truth.prose.reading import read_form
 from caption.writing.contract import Refused
-from cosfly import in_place
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Language
+from cosfly.work import in_place
 
 SLOT_MARK = "¤"
 

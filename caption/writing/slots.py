@@ -18,10 +18,10 @@ from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler, facts_of
 from caption.writing.templates import Sentence, read_sentence
-from cosfly import in_place
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, SentenceState, Template
 from cosfly.products.sentences import cut_sentences
+from cosfly.work import in_place
 
 MAX_COMPLAINTS = 6  # named at once
 # Nothing that was filled in is contradicted, so nobody asks which sentence it was.

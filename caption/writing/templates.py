@@ -29,10 +29,10 @@ from caption.truth.references import (
 )
 from caption.writing.contract import Refused
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, holds_state
-from cosfly import in_place
 from cosfly.errors import nearest
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Language, SentenceState
+from cosfly.work import in_place
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")

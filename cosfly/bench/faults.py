@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.chance import rng_for
-from cosfly.stage_events import is_running_child, read_events
-from cosfly.worker_pool import WORDS
+from cosfly.work.chance import rng_for
+from cosfly.work.stage_events import is_running_child, read_events
+from cosfly.work.worker_pool import WORDS
 
 SIGNALS = {"kill": signal.SIGKILL, "stall": signal.SIGSTOP}
 SPAN = (0.05, 0.9)  # of an undisturbed run's time: when faults happen

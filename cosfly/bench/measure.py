@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from caption.teachers.teacher import EMBEDDED
+from cosfly.app.pipeline import Stage, stages
+from cosfly.app.settings import RunConfig
 from cosfly.bench.faults import Faults, planted
 from cosfly.bench.picture import draw_events, draw_scaling
 from cosfly.bench.tables import Bench, Row, markdown, stage_rows
 from cosfly.errors import ConfigError, EnvironmentMissing, ResumeError
-from cosfly.pipeline import Stage, stages
-from cosfly.settings import RunConfig
-from cosfly.stage_events import EVENTS, Event, read_events
-from cosfly.stage_folder import Manifest, read_manifest
-from cosfly.store import write_bytes, write_model
-from cosfly.worker_pool import WORDS
+from cosfly.work.stage_events import EVENTS, Event, read_events
+from cosfly.work.stage_folder import Manifest, read_manifest
+from cosfly.work.store import write_bytes, write_model
+from cosfly.work.worker_pool import WORDS
 
 log = logging.getLogger(__name__)
 

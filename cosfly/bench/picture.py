@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from cosfly.bench.tables import Bench
-from cosfly.stage_events import Event
-from cosfly.topview import INK, PAPER, Color, draw_area, draw_dot, draw_line, draw_text, png_bytes
-from cosfly.worker_pool import WORDS
+from cosfly.look.topview import INK, PAPER, Color, draw_area, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.work.stage_events import Event
+from cosfly.work.worker_pool import WORDS
 
 WIDTH_PX, LEFT_PX, RIGHT_PX, ROW_PX, TOP_PX, CURVE_PX = 1400, 110, 1370, 46, 84, 150
 PANEL_PX = (380, 230)  # width, height of each figure of `bench.png`

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from pydantic import BaseModel
 
-from cosfly.stage_events import LOSSES, Event, read_events
-from cosfly.stage_folder import read_manifest
-from cosfly.worker_pool import WORDS
+from cosfly.work.stage_events import LOSSES, Event, read_events
+from cosfly.work.stage_folder import read_manifest
+from cosfly.work.worker_pool import WORDS
 
 
 class Row(BaseModel):

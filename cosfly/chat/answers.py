@@ -22,11 +22,13 @@ from weakref import WeakValueDictionary
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cosfly.chat.budget import Budget
-from cosfly.chat.contract import CONTEXT_FULL, MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request, Usage
+from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
 from cosfly.chat.protocol import answer_key
 from cosfly.errors import CosflyError, ResumeError
-from cosfly.journal import Journal
-from cosfly.store import sha256_bytes
+from cosfly.products.captions import Usage
+from cosfly.reading.objects import CONTEXT_FULL
+from cosfly.work.journal import Journal
+from cosfly.work.store import sha256_bytes
 
 log = logging.getLogger(__name__)
 

@@ -15,9 +15,9 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from cosfly.chat.contract import Usage
-from cosfly.config import Config
 from cosfly.errors import TeacherError
+from cosfly.products.captions import Usage
+from cosfly.work.config import Config
 
 MILLION = 1_000_000
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import httpx
 from pydantic import Field
 
-from cosfly.chat.contract import CONTEXT_FULL, NoAnswer, Reply, Request, Troubles
+from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
 from cosfly.chat.protocol import (
     ERROR_INSTEAD,
     base_url,
@@ -32,8 +32,9 @@ from cosfly.chat.protocol import (
 from cosfly.chat.refusals import MEANINGS, Refusal, kind_of
 from cosfly.chat.throttle import Throttle
 from cosfly.chat.wire import KEY_VARIABLE, Connections, Response
-from cosfly.config import Config, MayDiffer
 from cosfly.errors import TeacherError
+from cosfly.reading.objects import CONTEXT_FULL
+from cosfly.work.config import Config, MayDiffer
 
 log = logging.getLogger(__name__)
 

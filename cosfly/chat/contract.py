@@ -11,29 +11,10 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from pydantic import BaseModel, ConfigDict
+from cosfly.products.captions import Usage
 
 CountName = Literal["prompt_tokens", "completion_tokens"]
 MOST_TOKENS = 10_000_000  # of one answer: the longest context of any model that is served
-
-
-class Usage(BaseModel):
-    """Tokens of one answer or of several; 0 where a server does not count them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    prompt_tokens: int = 0
-    completion_tokens: int = 0
-
-    def __add__(self, other: Usage) -> Usage:
-        return Usage(
-            prompt_tokens=self.prompt_tokens + other.prompt_tokens,
-            completion_tokens=self.completion_tokens + other.completion_tokens,
-        )
-
-    @property
-    def total(self) -> int:
-        return self.prompt_tokens + self.completion_tokens
 
 
 @dataclass(frozen=True)
@@ -48,9 +29,6 @@ class Request:
     digests: list[str]
     schema: dict
     sampling: dict[str, Any]
-
-
-CONTEXT_FULL = "context_full"  # why an answer ended: prompt and answer fill the context, before `max_tokens`
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from typing import Any, get_args
 
 import httpx
 
-from cosfly.chat.contract import MOST_TOKENS, CountName, Reply, Request, Usage
+from cosfly.chat.contract import MOST_TOKENS, CountName, Reply, Request
 from cosfly.chat.wire import KEY_VARIABLE, Response
-from cosfly.store import dump_json, sha256_bytes
+from cosfly.products.captions import Usage
+from cosfly.work.store import dump_json, sha256_bytes
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content

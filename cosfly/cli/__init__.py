@@ -81,7 +81,7 @@ def _root(
     if version:
         typer.echo(f"cosfly {__version__}")
         raise typer.Exit
-    from cosfly.console import set_up_logging
+    from cosfly.work.console import set_up_logging
 
     set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
@@ -116,7 +116,7 @@ def main() -> None:
             _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
         _end(end.code)
     except OSError as error:
-        from cosfly.store import DISK_FULL
+        from cosfly.work.store import DISK_FULL
 
         if error.filename is not None or error.errno not in DISK_FULL:
             raise
@@ -126,7 +126,7 @@ def main() -> None:
 
 
 def _fail(message: str, status: int) -> None:
-    from cosfly.folder_lock import give_up
+    from cosfly.work.folder_lock import give_up
 
     typer.echo(f"error: {message}", err=True)
     give_up()

@@ -29,7 +29,7 @@ def bench(
 ) -> None:
     """Measure a stage with one and more workers, and with planted faults: tables, bench.json, bench.md, bench.png, pictures of the events."""
     from cosfly.bench import measure
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     counts = _counts(workers)
     cfg = options.resolve(run / "run.yaml", overrides)

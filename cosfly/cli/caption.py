@@ -12,8 +12,8 @@ from cosfly.cli import options
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
+    from cosfly.app.settings import RunConfig
     from cosfly.products.captions import Writing
-    from cosfly.settings import RunConfig
 
 app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
 
@@ -107,7 +107,7 @@ def caption(
 
 def _show_forecast(cfg: RunConfig, tree: Path, target: Path, resume: options.Resume) -> None:
     from caption.run.forecast import make_forecast
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume)
     console.print(options.plain_table("What this run will take", forecast.rows()))
@@ -130,7 +130,7 @@ def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> 
     """Print a table of what works; exit 1 when the endpoint is unusable."""
     from caption.own_files import own_files
     from caption.teachers.doctor import examine_endpoint
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     with own_files(cfg):
         findings = examine_endpoint(url, cfg, ways)
@@ -198,7 +198,7 @@ def caption_judge_check(
 
     from caption.own_files import own_files
     from caption.truth.judge import check_judge, judge_check_table, read_gold
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
     with own_files(cfg.caption):
@@ -221,7 +221,7 @@ def caption_compare_strategies(
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
     from caption.run import compare
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     chosen = {"caption.teacher": teacher, "caption.endpoint.model": model, "seed": seed}
     chosen |= options.chosen_flights("caption.flights", flights, tracks)

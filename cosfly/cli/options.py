@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from cosfly.settings import RunConfig
-    from cosfly.stage_folder import Tally
+    from cosfly.app.settings import RunConfig
+    from cosfly.work.stage_folder import Tally
 
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with the settings of a run.")]
@@ -79,10 +79,10 @@ Repair = Annotated[
 
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings; None is not given."""
-    from cosfly.config import load
+    from cosfly.app.settings import RunConfig
     from cosfly.reading.limits import use_limits
-    from cosfly.settings import RunConfig
-    from cosfly.store import dump_json
+    from cosfly.work.config import load
+    from cosfly.work.store import dump_json
 
     texts = {
         name: value if isinstance(value, int | float | list) else str(value)
@@ -99,14 +99,14 @@ def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str
 def set_aside(out: Path, asked: bool) -> None:
     """Do what --repair asks for, before the folder is opened."""
     if asked:
-        from cosfly.repair import repair
+        from cosfly.app.repair import repair
 
         typer.echo(f"{out}: {repair(out)} lines set aside")
 
 
 def _config_path(config: Path | None) -> Path | None:
     """A path, or the bare name of a configuration that ships with cosfly."""
-    from cosfly.config import shipped
+    from cosfly.work.config import shipped
 
     if config is None or config.is_file():
         return config
@@ -137,14 +137,14 @@ def needed(name: str, value: Path | None) -> Path:
 
 def manner(cfg: RunConfig, resume: Resume) -> dict[str, Any]:
     """How a stage works, whatever it makes: arguments that all stages with workers take."""
-    from cosfly.settings import manner_of_work
+    from cosfly.app.settings import manner_of_work
 
     return manner_of_work(cfg) | {"resume": resume}
 
 
 def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
     """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
-    from cosfly.stage_folder import read_manifest
+    from cosfly.work.stage_folder import read_manifest
 
     typer.echo(product)
     check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl", cfg)
@@ -197,7 +197,7 @@ def data_folders(data: list[Path] | None) -> list[Path]:
 
 def verify_first(is_wanted: bool, *paths: Path | None) -> None:
     """Hold inputs, and an output folder that holds something already, against their records before anything is done."""
-    from cosfly import provenance
+    from cosfly.work import provenance
 
     if is_wanted:
         provenance.verify(path for path in paths if path is not None and path.exists())

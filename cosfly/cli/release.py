@@ -104,8 +104,8 @@ def release_verify(
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.truth.released import read_released
-    from cosfly.settings import manner_of_work
-    from cosfly.store import write_json
+    from cosfly.app.settings import manner_of_work
+    from cosfly.work.store import write_json
     from release.verify.repair import plan_of
     from release.verify.verify import LEVELS, verify
 
@@ -148,7 +148,7 @@ def release_card(
     overrides: options.Overrides = None,
 ) -> None:
     """Render the data-set card of a release from its release.json, as `verify` expects it in README.md."""
-    from cosfly.store import write_bytes
+    from cosfly.work.store import write_bytes
     from release.card.render import render_card
     from release.record import read_record, release_folder
 
@@ -180,7 +180,7 @@ def release_viewer(
     overrides: options.Overrides = None,
 ) -> None:
     """Make one page that works offline: flights, frames (colour, depth, mask), tracks from above, captions with verdict and evidence, filters."""
-    from cosfly.config import build
+    from cosfly.work.config import build
     from release.viewer import page
     from release.viewer.schema import ViewerConfig
 
@@ -207,7 +207,7 @@ def release_export(
     repair: options.Repair = False,
 ) -> None:
     """Write a release in another format, without loss, with its licence and where it came from."""
-    from cosfly.config import build
+    from cosfly.work.config import build
     from release.export import stage as export
     from release.export.contract import ExportConfig
 
@@ -250,7 +250,7 @@ def release_get(
     resume: options.Resume = "if-same",
 ) -> None:
     """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and all that can be checked is."""
-    from cosfly.config import build
+    from cosfly.work.config import build
     from release.get import stage as get
     from release.get.choice import Choice
 
@@ -278,7 +278,7 @@ def release_push(
 ) -> None:
     """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
     from caption.truth.released import read_released
-    from cosfly.console import answer_console
+    from cosfly.work.console import answer_console
     from release import push
 
     cfg = options.resolve(config, overrides, {"workers": workers})

@@ -77,9 +77,9 @@ def weather_gallery(
     seed: options.Seed = None,
 ) -> None:
     """One view under every weather and time of day: nine pictures, and a sheet of all."""
-    from cosfly.console import progress_bar
     from cosfly.render import weather_gallery
     from cosfly.render.weather import read_pools
+    from cosfly.work.console import progress_bar
 
     pools = {"render.weather_pool": weather_pool, "render.tod_pool": tod_pool}
     mode = {"render.weather_mode": "random_per_path"} if any(pools.values()) else {}
@@ -112,10 +112,10 @@ def render_zoom_study(
     """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
     from rich.table import Table
 
-    from cosfly.config import build
-    from cosfly.console import console
     from cosfly.reading.documents import read_object
     from cosfly.render.zoom import study
+    from cosfly.work.config import build
+    from cosfly.work.console import console
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     options.set_aside(out, repair)
@@ -150,7 +150,7 @@ def render_sample(
     overrides: options.Overrides = None,
 ) -> None:
     """One frame's four pictures: colours, depth, instances, and boxes with ids and distances."""
-    from cosfly.gallery import four_panels
+    from cosfly.look.gallery import four_panels
     from cosfly.products.boxes import read_boxes
 
     options.resolve(config, overrides)
@@ -169,9 +169,9 @@ def gallery(
     overrides: options.Overrides = None,
 ) -> None:
     """A contact sheet and a preview GIF of a playback tree."""
-    from cosfly.config import build
-    from cosfly.gallery import contact_sheet, preview_gif
+    from cosfly.look.gallery import contact_sheet, preview_gif
     from cosfly.products.places import FlightChoice
+    from cosfly.work.config import build
 
     options.resolve(config, overrides)
     tree = options.data_folder(data)

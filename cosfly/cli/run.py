@@ -11,9 +11,9 @@ import typer
 from cosfly.cli import options
 
 if TYPE_CHECKING:
-    from cosfly.pipeline import StageResult
-    from cosfly.runs import StageLook
-    from cosfly.settings import RunConfig
+    from cosfly.app.pipeline import StageResult
+    from cosfly.app.runs import StageLook
+    from cosfly.app.settings import RunConfig
 
 app = typer.Typer()
 
@@ -40,7 +40,7 @@ def run(
     ] = False,
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again, or with the run's folder, to continue."""
-    from cosfly import pipeline
+    from cosfly.app import pipeline
 
     is_folder = (config / "run.yaml").is_file()
     if is_folder:
@@ -72,9 +72,9 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     from rich.table import Table
 
     from caption.run.progress import duration
-    from cosfly import estimate
-    from cosfly.ahead import not_compiled
-    from cosfly.console import answer_console
+    from cosfly.app import estimate
+    from cosfly.app.ahead import not_compiled
+    from cosfly.work.console import answer_console
 
     rows = estimate.estimate(cfg, out, estimate.rates_near(out))
     table = Table(title=f"What {out} would take; nothing is written", title_justify="left")
@@ -122,7 +122,7 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
 def _closing_table(results: list[StageResult], out: Path) -> None:
     from rich.table import Table
 
-    from cosfly.console import console
+    from cosfly.work.console import console
 
     table = Table(title=f"What was made in {out}", title_justify="left")
     for column in ("stage", "kept", "dropped", "failed", "seconds"):
@@ -147,10 +147,10 @@ def show(run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder."
     """Show a run: its stages, what they kept and take on the disk, the settings that are not the defaults."""
     from rich.table import Table
 
-    from cosfly.console import answer_console
+    from cosfly.app.runs import look
     from cosfly.products.review import how_to_decide
-    from cosfly.runs import look
-    from cosfly.store import dump_json
+    from cosfly.work.console import answer_console
+    from cosfly.work.store import dump_json
 
     seen = look(run)
     at_work = ", at work now" if seen.is_at_work else ""
@@ -196,9 +196,9 @@ def list_runs(root: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where 
     """List the runs in a folder: how far they are, flights, captions, size."""
     from rich.table import Table
 
-    from cosfly.console import answer_console
+    from cosfly.app.runs import looks
     from cosfly.errors import CosflyError
-    from cosfly.runs import looks
+    from cosfly.work.console import answer_console
 
     table = Table(box=None, padding=(0, 2, 0, 0))
     for column in ("run", "map", "stages", "flights", "captions", "on disk", ""):
@@ -244,7 +244,7 @@ def config_check(
     overrides: options.Overrides = None,
 ) -> None:
     """Check a configuration without running it; reports all problems at once, also a map's file that is not there and a licence that nobody names."""
-    from cosfly import pipeline
+    from cosfly.app import pipeline
 
     pipeline.check_with_files(options.resolve(config, overrides))
     typer.echo(f"{config}: ok")
@@ -273,8 +273,8 @@ def config_show(
     """Print the resolved configuration: every setting with its value, and with --describe or --find what it means."""
     import yaml
 
-    from cosfly import settings_guide
-    from cosfly.console import answer_console
+    from cosfly.app import settings_guide
+    from cosfly.work.console import answer_console
 
     if section is None and config is not None and _is_section(config):
         config, section = None, config
@@ -294,7 +294,7 @@ def config_show(
 
 def _is_section(word: str) -> bool:
     """Tell whether a word is no file and no configuration that ships."""
-    from cosfly.config import shipped
+    from cosfly.work.config import shipped
 
     path = Path(word)
     return not path.exists() and path.suffix not in (".yaml", ".yml") and not shipped(f"{path.name}.yaml").exists()
@@ -303,8 +303,8 @@ def _is_section(word: str) -> bool:
 @config_app.command("schema")
 def config_schema() -> None:
     """Print the JSON schema of a configuration file, for editors that complete and check one."""
-    from cosfly.settings import RunConfig
-    from cosfly.store import dump_json
+    from cosfly.app.settings import RunConfig
+    from cosfly.work.store import dump_json
 
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "cosfly run"}
     typer.echo(dump_json(RunConfig.model_json_schema() | dialect, indent=1))
@@ -316,7 +316,7 @@ def doctor(
     out: Annotated[Path, typer.Option(help="Where runs will be written.")] = Path("runs"),
 ) -> None:
     """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
-    from cosfly import doctor as examination
-    from cosfly.console import answer_console
+    from cosfly.app import doctor as examination
+    from cosfly.work.console import answer_console
 
     options.tell_checks(examination.examine(out, teacher), answer_console)

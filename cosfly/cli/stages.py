@@ -125,10 +125,10 @@ def plan_compare(
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from rich.table import Table
 
-    from cosfly.config import build
-    from cosfly.console import console
     from cosfly.planners import compare
     from cosfly.planners.compare_tables import text_tables
+    from cosfly.work.config import build
+    from cosfly.work.console import console
 
     cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
     options.set_aside(out, repair)

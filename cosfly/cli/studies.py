@@ -25,7 +25,7 @@ def depth_study(
 ) -> None:
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
     from cosfly.depth_study import study
-    from cosfly.gallery import best_frame, frame_in
+    from cosfly.look.gallery import best_frame, frame_in
 
     if frame is None:
         frame = best_frame(options.data_folder(data), "depth.npy")

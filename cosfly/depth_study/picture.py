@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cosfly.frame_views import depth_colors
-from cosfly.topview import INK, PAPER, Color, draw_line, draw_text, png_bytes
+from cosfly.look.frame_views import depth_colors
+from cosfly.look.topview import INK, PAPER, Color, draw_line, draw_text, png_bytes
 
 PANEL_PX = (480, 270)  # width, height of each of six
 GAP_PX, TITLE_PX = 14, 30

@@ -20,7 +20,7 @@ from cosfly.errors import InputError
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, read_rgb
 from cosfly.reading.arrays import parse_array, parse_array_header
 from cosfly.reading.files import read_bytes
-from cosfly.store import write_bytes, write_model
+from cosfly.work.store import write_bytes, write_model
 from release.depth import depth_of
 from release.package.depth import MOST_PNG_M, depth_record, encoded
 from release.record import DepthCodingName

@@ -14,7 +14,21 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import InputError, VerifyError
-from cosfly.flight_metrics import (
+from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
+from cosfly.inspection.files import Checksums, check_files, check_recorded
+from cosfly.inspection.frames import FrameNumbers, check_frames, choose_frames, target_box
+from cosfly.inspection.others import check_others, others_told
+from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.view import FlightView, draw_flight
+from cosfly.products.coverage import Coverage, coverage_of
+from cosfly.products.flights import read_twin
+from cosfly.products.inspection import FlightInspection
+from cosfly.products.inspection import Result as FlightResult
+from cosfly.products.issues import Report
+from cosfly.products.playback import STATES, Flight, read_flight
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.space.flight_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
     accel_rms,
@@ -22,25 +36,11 @@ from cosfly.flight_metrics import (
     length_m,
     smoothness_score,
 )
-from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
-from cosfly.inspection.files import Checksums, check_files, check_recorded
-from cosfly.inspection.frames import FrameNumbers, check_frames, choose_frames, target_box
-from cosfly.inspection.others import check_others, others_told
-from cosfly.inspection.settings import InspectConfig
-from cosfly.inspection.view import FlightView, draw_flight
-from cosfly.issues import Report
-from cosfly.products.coverage import Coverage, coverage_of
-from cosfly.products.flights import read_twin
-from cosfly.products.inspection import FlightInspection
-from cosfly.products.inspection import Result as FlightResult
-from cosfly.products.playback import STATES, Flight, read_flight
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.provenance import digest_of, folder_digests
+from cosfly.work.provenance import digest_of, folder_digests
 
 if TYPE_CHECKING:
-    from cosfly.kernels import BoxIndex
     from cosfly.products.boxes import BoxMap
+    from cosfly.space.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3
 
@@ -156,7 +156,7 @@ def check_surroundings(
     """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an obstacle; gives the
     first, (n,) m.
     """
-    from cosfly.kernels import signed_distances, visibility
+    from cosfly.space.kernels import signed_distances, visibility
 
     gaps_m, _ = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)
     metrics.update(clearance_min_m=float(gaps_m.min()))

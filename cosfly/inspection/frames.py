@@ -19,7 +19,6 @@ from cosfly.inspection.files import Checksums
 from cosfly.inspection.jumps import Jumps
 from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
-from cosfly.issues import Report
 from cosfly.products.frames import (
     FILE_NAMES,
     INVALID_DEPTH_M,
@@ -28,12 +27,13 @@ from cosfly.products.frames import (
     OthersMeta,
     frame_name,
 )
+from cosfly.products.issues import Report
 from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import read_bytes
-from cosfly.runner import advance
+from cosfly.work.runner import advance
 
 SMALL_PX, SMALL_ROWS = (
     (128, 72),

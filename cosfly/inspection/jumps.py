@@ -1,4 +1,4 @@
-"""Do the frames of a flight show one world? What stands still is carried from each frame into the next (`cosfly/reprojection.py`), and what
+"""Do the frames of a flight show one world? What stands still is carried from each frame into the next (`cosfly/space/reprojection.py`), and what
 comes out otherwise than the poses say is a jump: something vanished, another picture, a lamp that went out.
 """
 
@@ -11,10 +11,10 @@ import numpy as np
 from cosfly.geometry import world_from_camera
 from cosfly.inspection.pixels import Picture
 from cosfly.inspection.settings import InspectConfig
-from cosfly.issues import Report
-from cosfly.products.frames import frame_name
+from cosfly.products.frames import frame_name, grid_rows
+from cosfly.products.issues import Report
 from cosfly.products.playback import Flight
-from cosfly.reprojection import Agreement, View, compare_views, grid_rows, is_zoomed, usual_correlations
+from cosfly.space.reprojection import Agreement, View, compare_views, is_zoomed, usual_correlations
 
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
 LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share of them to mean something

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosfly.flight_metrics import CLEARANCE_TOLERANCE_M
-from cosfly.issues import Report
 from cosfly.products.frames import FrameMeta, OtherMeta, OthersMeta
+from cosfly.products.issues import Report
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.products.others import BUILDS, Other, distances_to_boxes_m
 from cosfly.products.playback import Flight
+from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
 
 
 def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:

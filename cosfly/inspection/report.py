@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.coverage_page import STYLE as COVERAGE_STYLE
-from cosfly.coverage_page import coverage_html
 from cosfly.escaping import for_html, html_page
 from cosfly.inspection.view import PLOTS, FlightView
-from cosfly.issues import Issue
+from cosfly.look.coverage_page import STYLE as COVERAGE_STYLE
+from cosfly.look.coverage_page import coverage_html
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
+from cosfly.products.issues import Issue
 from cosfly.products.playback import STATES
 from cosfly.reading.files import read_text
-from cosfly.store import write_bytes
+from cosfly.work.store import write_bytes
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 MB = 1_000_000

@@ -12,13 +12,13 @@ from cosfly.inspection.flight import Inspected
 from cosfly.inspection.report import HEAD, LEGEND, STYLE, cards
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
-from cosfly.journal import Journal
 from cosfly.products.inspection import FlightInspection, read_inspection
 from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions, undecided
 from cosfly.reading.documents import read_model
 from cosfly.reading.files import read_text, sha256_file
-from cosfly.stage_folder import Failed, read_item, result_of
-from cosfly.store import dump_json, write_bytes
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import Failed, read_item, result_of
+from cosfly.work.store import dump_json, write_bytes
 
 SCHEMA, VERSION = "cosfly.review", "1.0"
 FILLED = "decisions.json"  # as the page saves it

@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.config import Config
-from cosfly.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
 from cosfly.products.places import FlightChoice
+from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
+from cosfly.work.config import Config
 
 
 class InspectConfig(Config):

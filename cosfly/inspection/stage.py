@@ -15,7 +15,6 @@ from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
 from cosfly.inspection.report import write_report
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
-from cosfly.issues import Report
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
 from cosfly.products.flights import find_flights
@@ -29,19 +28,20 @@ from cosfly.products.inspection import (
     count_trajectories,
     write_inspection,
 )
+from cosfly.products.issues import Report
 from cosfly.products.playback import read_flight
 from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.provenance import recorded_digests
-from cosfly.runner import Finished, Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder, result_of
+from cosfly.work.provenance import recorded_digests
+from cosfly.work.runner import Finished, Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Failed, Resume, StageFolder, result_of
 
 log = logging.getLogger(__name__)
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
     """Worker factory: give the function that inspects one flight folder."""
-    from cosfly.kernels import obstacle_index
+    from cosfly.space.kernels import obstacle_index
 
     box_map = None if simplified is None else read_boxes(simplified)
     obstacles = None if box_map is None else obstacle_index(box_map)

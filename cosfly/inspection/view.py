@@ -7,11 +7,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.flight_metrics import CLEARANCE_CAP_M
-from cosfly.frame_views import small_jpeg, thumbnail
+from cosfly.look.frame_views import small_jpeg, thumbnail
+from cosfly.look.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 from cosfly.products.boxes import BoxMap
 from cosfly.products.playback import Flight
-from cosfly.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
+from cosfly.space.flight_metrics import CLEARANCE_CAP_M
 
 CURVE_POINTS = 160
 # Of a flight's curves: title, unit, what the axis shows at least.

@@ -21,7 +21,6 @@ import shapely
 from pydantic import Field, field_validator
 from shapely.geometry import Polygon
 
-from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
@@ -30,6 +29,7 @@ from cosfly.maps.units import check_units
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.reading.files import read_text
 from cosfly.reading.geojson import read_features
+from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
 

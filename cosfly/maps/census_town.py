@@ -11,9 +11,9 @@ import itertools
 
 import numpy as np
 
-from cosfly.chance import rng_for
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
+from cosfly.work.chance import rng_for
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.
 CENSUS = {

@@ -18,7 +18,6 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
-from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
@@ -29,6 +28,7 @@ from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader,
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.reading.meshes import Mesh
+from cosfly.work.config import Config
 
 SLAB_M = 0.3
 SLOPED_WALL_M, SLOPED_WALL_DEPTH_M = 6.0, 1.0  # on a slope walls are cut into steps of this length, founded this deep

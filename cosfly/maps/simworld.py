@@ -17,7 +17,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
-from cosfly.config import Config
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
@@ -25,6 +24,7 @@ from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.documents import read_json, validation_errors
+from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.config import Config
+from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps import boxfile, cityjson, simworld, synthetic
 from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.cityjson import CityJsonConfig
@@ -18,9 +18,9 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import write_bytes
-from cosfly.topview import TopView, draw_map, png_bytes
+from cosfly.work.config import Config
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.chance import rng_for
-from cosfly.config import Config
 from cosfly.errors import nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import census_town
@@ -35,6 +33,8 @@ from cosfly.maps.town_blocks import (
     tree,
 )
 from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
+from cosfly.work.chance import rng_for
+from cosfly.work.config import Config
 
 GENERATOR_VERSION = "1"
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.work.compiled import njit
 
 SQRT2 = math.sqrt(2.0)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.chance import draw_by_share
 from cosfly.geometry import headings_of
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.lanes import Lane
@@ -20,6 +19,7 @@ from cosfly.pedestrians.walking import arrival_times, menger_curvature, sample
 from cosfly.products.ground import Ground
 from cosfly.products.others import Company, Other, gaps_m
 from cosfly.products.walks import Walk
+from cosfly.work.chance import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met

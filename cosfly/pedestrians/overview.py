@@ -7,9 +7,9 @@ import colorsys
 import cv2
 import numpy as np
 
+from cosfly.look.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.pedestrians.walkable import WalkableGround
 from cosfly.products.walks import Walk
-from cosfly.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 
 LONGER_SIDE_PX = 1600
 STRIP_PX = 64  # legend below the map

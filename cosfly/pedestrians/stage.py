@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.chance import draw_by_share, rng_for
 from cosfly.errors import NoPathError
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.lanes import Lane, lanes_of
@@ -43,9 +42,10 @@ from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, walk_id, write_paths
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder, result_of
-from cosfly.store import write_bytes, write_json
+from cosfly.work.chance import draw_by_share, rng_for
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, result_of
+from cosfly.work.store import write_bytes, write_json
 
 log = logging.getLogger(__name__)
 

@@ -17,10 +17,16 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import Config
 from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
-from cosfly.grid import (
+from cosfly.pedestrians.paces import PACES
+from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS
+from cosfly.products.boxes import BoxMap
+from cosfly.products.ground import Ground
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.roi import Roi
+from cosfly.products.walks import PLAIN_PACE
+from cosfly.space.grid import (
     SURFACE_REACH_M,
     OccupancyGrid,
     blocks_walking,
@@ -32,13 +38,7 @@ from cosfly.grid import (
     roi_mask,
     surface,
 )
-from cosfly.pedestrians.paces import PACES
-from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS
-from cosfly.products.boxes import BoxMap
-from cosfly.products.ground import Ground
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.roi import Roi
-from cosfly.products.walks import PLAIN_PACE
+from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
 

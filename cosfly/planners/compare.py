@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
 from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner
 from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, result_of
-from cosfly.store import write_bytes, write_json
+from cosfly.work.chance import rng_for
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, result_of
+from cosfly.work.store import write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.plan_compare", "2.1"
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
@@ -183,8 +183,8 @@ class CompareConfig(PlanConfig):
 
 def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk with each of the planners."""
-    from cosfly.kernels import obstacle_index
     from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)

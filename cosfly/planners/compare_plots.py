@@ -6,12 +6,12 @@ from collections.abc import Collection
 
 import numpy as np
 
+from cosfly.look.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import Walk
-from cosfly.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 
 # RGB: the paper's blue and orange, then others that differ in brightness too.
 PALETTE = ((30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190))

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, model_validator
 from cosfly.planners.compare import AXES, FIGURES
 from cosfly.planners.contract import title_of
 from cosfly.reading.documents import read_object, validation_errors
-from cosfly.stage_folder import read_manifest
+from cosfly.work.stage_folder import read_manifest
 
 
 @dataclass(frozen=True)

@@ -19,21 +19,21 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import Config
 from cosfly.errors import nearest
-from cosfly.flight_metrics import (
+from cosfly.geometry import DT_S
+from cosfly.planners.styles.table import NAMES
+from cosfly.products.segments import FOLLOW
+from cosfly.space.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,
     FIVE_RAY_MEAN_MIN,
     JERK_RMS_MAX_MPS3,
     RELAXED_SAFETY_M,
     SAFETY_DISTANCE_M,
 )
-from cosfly.geometry import DT_S
-from cosfly.planners.styles.table import NAMES
-from cosfly.products.segments import FOLLOW
+from cosfly.work.config import Config
 
 if TYPE_CHECKING:
-    from cosfly.kernels import BoxIndex
+    from cosfly.space.kernels import BoxIndex
 
 # In the order of comparisons, which hold the first against each of the others.
 PLANNERS = {

@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.chance import rng_for
 from cosfly.errors import InputError, NoPathError
-from cosfly.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
 from cosfly.geometry import DT_S, step_s
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.segments import FOLLOW
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
-from cosfly.store import write_bytes
+from cosfly.space.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
+from cosfly.work.chance import rng_for
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
+from cosfly.work.store import write_bytes
 
 if TYPE_CHECKING:
-    from cosfly.kernels import BoxIndex
     from cosfly.planners.styles.drawing import Intent
+    from cosfly.space.kernels import BoxIndex
 
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
@@ -42,8 +42,8 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     Raises:
         NoPathError: nobody can walk or follow this: one point, uneven times, huge coordinates, or a way through a box.
     """
-    from cosfly.kernels import segments_hit
     from cosfly.planners.wish import follow
+    from cosfly.space.kernels import segments_hit
 
     targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
@@ -109,9 +109,9 @@ def style_rng(walk: Walk, seed: int) -> np.random.Generator:
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
-    from cosfly.kernels import segments_hit, signed_distances, visibility
     from cosfly.planners.styles.camera import view_of
     from cosfly.planners.styles.drawing import why_not_held
+    from cosfly.space.kernels import segments_hit, signed_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
@@ -169,8 +169,8 @@ def drop_reason(
 
 def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk."""
-    from cosfly.kernels import obstacle_index
     from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
@@ -185,7 +185,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
 
 def warm_up(cfg: PlanConfig) -> None:
     """Compile or load compiled code before the first walk, so that times per walk are planning times."""
-    from cosfly.kernels import index_boxes
+    from cosfly.space.kernels import index_boxes
 
     walk = np.arange(8.0)
     positions = np.column_stack([0.5 * walk, np.zeros(8), np.zeros(8)])

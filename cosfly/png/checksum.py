@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.work.compiled import njit
 
 # A block is so many rows of bytes: of a column the sum, and the sum of its sums so far, at most 255 * ROWS * (ROWS + 1) / 2, fit 16 bits, of
 # which the processor adds more at once than of 32; and 255 * BLOCK * (BLOCK + 1) / 2, the greatest weighted sum of a block, fits 32.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import njit, put_word, word_at
 from cosfly.png.checksum import adler32
 from cosfly.png.huffman import (
     BASE_LENGTH,
@@ -23,6 +22,7 @@ from cosfly.png.huffman import (
     code_lengths,
     codes_of,
 )
+from cosfly.work.compiled import njit, put_word, word_at
 
 BAND_BYTES = 85_000  # unpacked, at least: of a smaller band the lengths of its codes take more than a thousandth
 BAND_END = b"\0\0\xff\xff"  # of a block that holds nothing and ends at a byte

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.work.compiled import njit
 
 END = 256  # the symbol behind a block's last
 MOST_LITERALS, MOST_WAYS = 286, 30

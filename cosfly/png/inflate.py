@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import int64, njit, put_word, word_at
 from cosfly.png.huffman import (
     BASE_LENGTH,
     BASE_WAY,
@@ -30,6 +29,7 @@ from cosfly.png.huffman import (
     find_runs,
     next_symbol,
 )  # fmt: skip
+from cosfly.work.compiled import int64, njit, put_word, word_at
 
 LANES = 3  # bands that are unpacked in turns
 LOOKS = 56 // LOOK_BITS  # in the bits that one fetch has at least

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.errors import InputError
 from cosfly.png.checksum import adler32
 from cosfly.png.deflate import BAND_END, band_rows
 from cosfly.png.inflate import inflate
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
+from cosfly.work.compiled import njit
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
 MOST_NAMED = 8  # chunks

@@ -11,9 +11,9 @@ import zlib
 
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.png.deflate import BAND_BYTES, deflate
 from cosfly.reading.arrays import PNG_SIGNATURE
+from cosfly.work.compiled import njit
 
 CHANNELS, COLOUR_TYPE = 3, 2
 NONE, SUB, AVERAGE = 0, 1, 3  # filters

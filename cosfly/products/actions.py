@@ -14,12 +14,12 @@ from typing import Self, TypeVar
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from cosfly import in_place
-from cosfly.config import LEFT_OUT, Config, build, read_yaml
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.documents import read_model
 from cosfly.reading.files import read_bytes
-from cosfly.store import write_bytes, write_model
+from cosfly.work import in_place
+from cosfly.work.config import LEFT_OUT, Config, build, read_yaml
+from cosfly.work.store import write_bytes, write_model
 
 ACTIONS_FILE = Path(__file__).with_name("actions.yaml")
 ACTIONS_SCHEMA, ACTIONS_VERSION = "cosfly.actions", "1.0"

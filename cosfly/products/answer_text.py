@@ -8,10 +8,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from cosfly import in_place
-from cosfly.chat.objects import find_object
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import FIELDS, Coc, Language
+from cosfly.reading.objects import find_object
+from cosfly.work import in_place
 
 _DECISION = re.compile(
     r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
@@ -93,7 +93,7 @@ def parse_answer(
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
     What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in `recovered`
-    (cosfly/chat/objects.py), as are raw control characters inside strings. Anything else is a failure with a reason word.
+    (cosfly/reading/objects.py), as are raw control characters inside strings. Anything else is a failure with a reason word.
 
     Args:
         more: names of the further fields that were asked for.

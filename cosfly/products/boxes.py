@@ -19,7 +19,7 @@ from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
 from cosfly.reading.documents import MISSING, check_schema, read_json, validation_errors
-from cosfly.store import dump_json, write_bytes
+from cosfly.work.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
 AXES = "right-handed, metres, x east, y north, z up; degrees"

@@ -14,9 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.chat.contract import Usage
 from cosfly.reading.documents import model_lines
-from cosfly.store import atomic_file
+from cosfly.work.store import atomic_file
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 Language = Literal["en", "zh"]
@@ -29,6 +28,25 @@ Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
 # recorded offsets; or, where nobody recorded them, the perturbed one: then the label holds noise.
 LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
+
+
+class Usage(BaseModel):
+    """Tokens of one answer or of several; 0 where a server does not count them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+
+    def __add__(self, other: Usage) -> Usage:
+        return Usage(
+            prompt_tokens=self.prompt_tokens + other.prompt_tokens,
+            completion_tokens=self.completion_tokens + other.completion_tokens,
+        )
+
+    @property
+    def total(self) -> int:
+        return self.prompt_tokens + self.completion_tokens
 
 
 class Coc(BaseModel):

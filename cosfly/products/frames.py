@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.png.write import areas_png, colours_png
@@ -22,8 +21,8 @@ from cosfly.products.places import tree_of_flight
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import parse_array_header, read_array, read_picture
 from cosfly.reading.documents import read_model
-from cosfly.reprojection import grid_rows
-from cosfly.store import dump_json
+from cosfly.work.config import Config
+from cosfly.work.store import dump_json
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
@@ -45,6 +44,12 @@ COORDINATES = {
     "rotation": "degrees; yaw clockwise seen from above, pitch nose-up, roll right-side-down",
     "camera": "pose of the camera; image x right, y down; depth along the optical axis",
 }
+GRID_ROWS = 36  # rows of a picture that are compared between frames: what is read of one without the whole
+
+
+def grid_rows(height_px: int) -> np.ndarray:
+    """Rows of the grid, (GRID_ROWS,)."""
+    return ((np.arange(GRID_ROWS) + 0.5) * height_px / GRID_ROWS).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
-from cosfly.issues import Issue
 from cosfly.products.coverage import Coverage
+from cosfly.products.issues import Issue
 from cosfly.products.playback import ORIGINAL
 from cosfly.reading.documents import read_model
-from cosfly.store import write_model
+from cosfly.work.store import write_model
 
 INSPECT_SCHEMA, INSPECT_VERSION = "cosfly.inspect", "1.0"
 

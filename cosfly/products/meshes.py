@@ -24,7 +24,7 @@ from cosfly.reading.meshes import (
     joined,
     read_meshes,
 )
-from cosfly.store import write_bytes
+from cosfly.work.store import write_bytes
 
 MESHES_FILE = "meshes.glb"
 FLOAT, ARRAY_BUFFER = 5126, 34962

@@ -12,7 +12,7 @@ from cosfly.products.columns import column, records, rounded, text_id
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.documents import check_schema, read_json
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 
 OTHERS_FILE = "others.json"
 OTHERS_SCHEMA, OTHERS_VERSION = "cosfly.others", "1.0"

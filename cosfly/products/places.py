@@ -19,10 +19,10 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.reading.files import is_below, real_path
-from cosfly.store import inside
+from cosfly.work.config import Config
+from cosfly.work.store import inside
 
 TOWN = "Town"  # what the name of a town's folder begins with
 

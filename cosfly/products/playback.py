@@ -39,7 +39,7 @@ from cosfly.products.trajectory import (
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import read_json
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md

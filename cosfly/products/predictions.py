@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language
+from cosfly.products.splits import Split
 from cosfly.reading.documents import model_lines
-from cosfly.splits import Split
 
 PREDICTIONS = "predictions.jsonl"
 FAILED = "failed_"  # what the reason of a prediction begins with that could not be made

@@ -16,9 +16,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
-from cosfly.journal import Journal
 from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
 from cosfly.reading.files import sha256_file
+from cosfly.work.journal import Journal
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.boxes import UNKNOWN_LICENCE, LicenceId, MapHeader
 from cosfly.reading.documents import read_model
-from cosfly.store import write_model
+from cosfly.work.store import write_model
 
 TOWN_SCHEMA, TOWN_VERSION, TOWN_FILE = "cosfly.town_map", "1.0", "map.json"
 

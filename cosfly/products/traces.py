@@ -13,7 +13,7 @@ from cosfly.products.columns import column, records, rounded, text_id
 from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.reading.documents import check_schema, read_json
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
 

@@ -11,7 +11,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import column, matrix, records, rounded, text_id
 from cosfly.reading.documents import check_schema, read_json
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.config import Config
+from cosfly.work.config import Config
 
 WeatherMode = Literal["fixed", "random_per_path"]
 Percent = Annotated[float, Field(strict=True, ge=0, le=100)]

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.geometry import box_corners, project
 from cosfly.products.frames import Camera
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame
+from cosfly.work.compiled import njit
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 NOT_HIDDEN = -1  # no instance id

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.grid import lies_off_ground
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.render.contract import GROUND_PLANE_HALF_M
+from cosfly.space.grid import lies_off_ground
 
 DRAPED_KINDS = GROUND_KINDS | {KINDS["Water"]}
 BARE_GROUND = -1  # the row of triangles that are no box's

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.geometry import mask_box, world_from_camera
-from cosfly.overlay import Overlay
+from cosfly.look.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
@@ -26,8 +26,8 @@ from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Ren
 from cosfly.render.others import Cast
 from cosfly.render.person import Gait
 from cosfly.render.perturbation import HIDDEN, Perturbed, Poses
-from cosfly.runner import advance
-from cosfly.store import sha256_bytes, storage_errors, write_checksums, write_json
+from cosfly.work.runner import advance
+from cosfly.work.store import sha256_bytes, storage_errors, write_checksums, write_json
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight

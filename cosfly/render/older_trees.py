@@ -11,16 +11,16 @@ import os
 import shutil
 from pathlib import Path
 
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import FRAMES_DIR, XYZ, read_meta
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.playback import read_flight
 from cosfly.reading.files import check_stays_below, sha256_file
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder
-from cosfly.store import CHECKSUMS, atomic_folder, read_checksums, storage_errors, write_checksums, write_json
+from cosfly.work.config import Config
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Resume, StageFolder
+from cosfly.work.store import CHECKSUMS, atomic_folder, read_checksums, storage_errors, write_checksums, write_json
 
 log = logging.getLogger(__name__)
 

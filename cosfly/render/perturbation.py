@@ -15,17 +15,17 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.config import Config
-from cosfly.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
-from cosfly.kernels import obstacle_index, signed_distances
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import Camera
 from cosfly.products.kinds import GROUND_KINDS
+from cosfly.products.shift_draws import shift_draws
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.others import NOBODY, Cast
-from cosfly.shift_draws import shift_draws
+from cosfly.space.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
+from cosfly.space.kernels import obstacle_index, signed_distances
+from cosfly.work.config import Config
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"

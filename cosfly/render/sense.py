@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from cosfly.errors import RenderError
-from cosfly.kernels import signed_distances
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.render.perturbation import STEP_UP_M, Surroundings
+from cosfly.space.kernels import signed_distances
 
 TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
 

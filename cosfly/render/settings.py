@@ -6,12 +6,12 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import MayDiffer
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
 from cosfly.products.places import folder_name
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.weather import WeatherConfig
 from cosfly.render.zoom.lens import ZoomConfig
+from cosfly.work.config import MayDiffer
 
 
 class RenderConfig(WeatherConfig):

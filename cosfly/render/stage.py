@@ -13,19 +13,18 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from cosfly.chance import rng_for
 from cosfly.errors import ConfigError, InputError
-from cosfly.overlay import Overlay
+from cosfly.look.overlay import Overlay
 from cosfly.products.boxes import BoxMap, check_ground, read_boxes
 from cosfly.products.frames import Look
 from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION
 from cosfly.products.others import Company, read_others
 from cosfly.products.places import place_of, town_folder
+from cosfly.products.shift_draws import PERTURBED, rng_of_shifts
 from cosfly.products.town import write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
-from cosfly.provenance import checked_inputs, fingerprint
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, render_flight
 from cosfly.render.others import NOBODY, Cast, cast_of
@@ -35,10 +34,11 @@ from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.render.zoom.lens import cameras_of
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.shift_draws import PERTURBED, rng_of_shifts
-from cosfly.stage_folder import Kept, Resume, StageFolder, Tally, result_of
-from cosfly.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
+from cosfly.work.chance import rng_for
+from cosfly.work.provenance import checked_inputs, fingerprint
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Kept, Resume, StageFolder, Tally, result_of
+from cosfly.work.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import Config, MayDiffer, build, read_yaml
 from cosfly.errors import ConfigError, nearest
 from cosfly.products.weather import (
     TIMES,
@@ -23,6 +22,7 @@ from cosfly.products.weather import (
     preset_token,
     resolved,
 )
+from cosfly.work.config import Config, MayDiffer, build, read_yaml
 
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
 MOST_SEED = 2**31  # of a seed that is drawn

@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.chance import rng_for
 from cosfly.errors import InputError
-from cosfly.frame_views import encode_picture
 from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.look.frame_views import encode_picture
+from cosfly.look.topview import PAPER, draw_text
 from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.weather import resolved
@@ -22,8 +22,8 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer
 from cosfly.render.weather import Pools, read_pools
-from cosfly.store import write_bytes
-from cosfly.topview import PAPER, draw_text
+from cosfly.work.chance import rng_for
+from cosfly.work.store import write_bytes
 
 FIGURE = (  # fig:weather_gallery
     ("clear", "morning"), ("clear", "noon"), ("clear", "dusk"),

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
+from cosfly.work.compiled import njit
 
 VEGETATION = KINDS["Vegetation"]
 CLOSED_GAP_M = 1.0  # twice the safety radius of a person (tab:ped_params): nobody walks through

@@ -19,13 +19,13 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.compiled import njit
-from cosfly.config import Config
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.boxes import BoxMap, SimplifyPass
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.meshes import Meshes
 from cosfly.simplify.merge import MergeRule, merge
+from cosfly.work.compiled import njit
+from cosfly.work.config import Config
 
 VEGETATION, WATER = KINDS["Vegetation"], KINDS["Water"]
 # Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0, and a renderer needs them.

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
+from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.simplify.passes import SURFACE_KINDS, Simplified, SimplifyConfig, simplify
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import write_bytes, write_json
-from cosfly.topview import TopView, add_caption, draw_map, png_bytes
+from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import write_bytes, write_json
 
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.simplify_report", "1.0"

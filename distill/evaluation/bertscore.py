@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.config import Config
-from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
 from cosfly.reading.documents import read_json, read_object
 from cosfly.reading.files import sha256_file
+from cosfly.work.config import Config
+from cosfly.work.console import progress_bar
 from distill.student.model import Device, pick_device, quiet_transformers, require
 
 log = logging.getLogger(__name__)

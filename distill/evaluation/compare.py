@@ -11,14 +11,14 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly import in_place
-from cosfly.chance import rng_for
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.escaping import for_html, for_markdown, html_page
 from cosfly.products.actions import one_set
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import write_bytes, write_model
+from cosfly.work import in_place
+from cosfly.work.chance import rng_for
+from cosfly.work.config import Config
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import write_bytes, write_model
 from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, NEITHER, Difference, differences_of
 from distill.evaluation.measure import STUDENT, Measured, Report, read_report
 from distill.evaluation.pages import (

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.chance import rng_for
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Coc, Language
 from cosfly.products.predictions import PREDICTIONS, Prediction
+from cosfly.products.splits import Split
 from cosfly.reading.documents import parse_document, validation_errors
-from cosfly.splits import Split
-from cosfly.store import dump_json, write_bytes
+from cosfly.work.chance import rng_for
+from cosfly.work.store import dump_json, write_bytes
 from distill.evaluation.scores import Answer
 from distill.schema import Sample, in_its_actions, open_split
 

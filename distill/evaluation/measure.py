@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.chance import rng_for
 from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet, action_tokens
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.predictions import FAILED, Prediction
+from cosfly.products.splits import Split
 from cosfly.reading.documents import read_model
-from cosfly.splits import Split
+from cosfly.work.chance import rng_for
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.figures import Figure, draw_walks, figures_of
 from distill.evaluation.floors import Floors, coc_of

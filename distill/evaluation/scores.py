@@ -15,13 +15,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly import in_place
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import arrow_errors, row_groups
-from cosfly.store import atomic_file, dump_json, sha256_bytes
+from cosfly.work import in_place
+from cosfly.work.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
 
 SCORES = "scores.parquet"

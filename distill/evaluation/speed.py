@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.chat.answers import Answer, read_line
-from cosfly.journal import Journal
 from cosfly.products.predictions import Prediction
-from cosfly.provenance import MANIFEST_SCHEMA
 from cosfly.reading.documents import read_object, validation_errors
-from cosfly.stage_folder import read_manifest
+from cosfly.work.journal import Journal
+from cosfly.work.provenance import MANIFEST_SCHEMA
+from cosfly.work.stage_folder import read_manifest
 
 
 class Speed(BaseModel):

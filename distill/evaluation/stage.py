@@ -12,13 +12,13 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly import in_place
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.captions import Language
 from cosfly.products.predictions import Prediction, read_predictions
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import write_bytes, write_model
+from cosfly.work import in_place
+from cosfly.work.config import Config
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import write_bytes, write_model
 from distill.evaluation.bertscore import BertScoreConfig, Metric, Scorer, check_encoder, deciding_files
 from distill.evaluation.floors import Floors, coc_of
 from distill.evaluation.measure import (

@@ -10,11 +10,11 @@ from pathlib import Path
 from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers
 from cosfly.chat.contract import Engine, NoAnswer, Request
 from cosfly.chat.protocol import answer_key
-from cosfly.console import Advance
+from cosfly.chat.student_chat import StudentEndpointConfig, picture_to_send, student_request
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.answer_text import answer_schema
-from cosfly.stage_folder import Failed
-from cosfly.student_chat import StudentEndpointConfig, picture_to_send, student_request
+from cosfly.work.console import Advance
+from cosfly.work.stage_folder import Failed
 from distill.inference.outcome import Answered, OpenFlights
 from distill.schema import Sample
 from distill.student.encoding import load_pictures

@@ -15,12 +15,12 @@ from itertools import islice
 from pathlib import Path
 
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.console import Advance
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
 from cosfly.products.places import flight_of
-from cosfly.stage_folder import Failed
-from cosfly.store import dump_json, sha256_bytes
+from cosfly.work.console import Advance
+from cosfly.work.stage_folder import Failed
+from cosfly.work.store import dump_json, sha256_bytes
 from distill.inference.outcome import Answered, OpenFlights
 from distill.schema import Sample
 from distill.student.decoding import Constraint, Decoded, decode

@@ -15,13 +15,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cosfly.config import Config
-from cosfly.console import progress_bar
+from cosfly.chat.student_chat import TAUGHT
 from cosfly.errors import InputError
 from cosfly.reading.documents import read_json, read_object, validation_errors
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import atomic_folder, storage_errors, write_json
-from cosfly.student_chat import TAUGHT
+from cosfly.work.config import Config
+from cosfly.work.console import progress_bar
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import atomic_folder, storage_errors, write_json
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.model import require, student_folder, weight_files
 

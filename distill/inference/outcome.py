@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import IO
 
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.chat.contract import CONTEXT_FULL
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.places import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
-from cosfly.stage_folder import Failed, Tally, write_failures
-from cosfly.store import atomic_file, dump_json
+from cosfly.reading.objects import CONTEXT_FULL
+from cosfly.work.stage_folder import Failed, Tally, write_failures
+from cosfly.work.store import atomic_file, dump_json
 from distill.schema import Sample
 
 ANSWERS = "answers"  # the folder of journals

@@ -16,14 +16,14 @@ from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, started
 from cosfly.chat.protocol import base_url
+from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, read_taught
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
-from cosfly.config import Config, MayDiffer
-from cosfly.console import Advance, progress_bar
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.predictions import PREDICTIONS, Split
-from cosfly.stage_folder import Resume, StageFolder, read_manifest
-from cosfly.store import sha256_bytes
-from cosfly.student_chat import TAUGHT, StudentEndpointConfig, read_taught
+from cosfly.work.config import Config, MayDiffer
+from cosfly.work.console import Advance, progress_bar
+from cosfly.work.stage_folder import Resume, StageFolder, read_manifest
+from cosfly.work.store import sha256_bytes
 from distill.inference.asking import Asking
 from distill.inference.constraint import AnswerSchemas
 from distill.inference.local import LocalAnswers

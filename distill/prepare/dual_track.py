@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import step_s
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.places import Place, flight_ids, folder_name, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
-from cosfly.provenance import fingerprint
-from cosfly.splits import SPLITS, Course, Split, assign_splits, town_family, walks_of
-from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
+from cosfly.products.splits import SPLITS, Course, Split, assign_splits, town_family, walks_of
+from cosfly.work.console import progress_bar
+from cosfly.work.provenance import fingerprint
+from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
 from distill.prepare.leaks import check_no_leak
 from distill.prepare.splitting import SplitConfig
 from distill.schema import SourceTree, SplitFiles, write_splits

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from cosfly.errors import VerifyError
-from cosfly.splits import town_family
+from cosfly.products.splits import town_family
 
 
 class Placed(Protocol):

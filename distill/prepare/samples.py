@@ -7,11 +7,11 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from cosfly.errors import InputError
-from cosfly.frame_views import DEPTH_RANGE_M, Pictures, View
+from cosfly.look.frame_views import DEPTH_RANGE_M, Pictures, View
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict
 from cosfly.products.places import FlightChoice
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 from distill.prepare.splitting import SplitConfig
 from distill.schema import Sample
 

@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.errors import InputError, VerifyError
-from cosfly.frame_views import VIEW_FILES, View
+from cosfly.look.frame_views import VIEW_FILES, View
 from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.flights import find_flights, track_of
 from cosfly.products.frames import frame_name
 from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id, stand
 from cosfly.products.playback import read_flight
-from cosfly.provenance import was_made_of
+from cosfly.products.splits import Course, walks_of
 from cosfly.reading.files import check_stays_below
-from cosfly.splits import Course, walks_of
+from cosfly.work.provenance import was_made_of
 
 log = logging.getLogger(__name__)
 

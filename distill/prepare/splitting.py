@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from cosfly.config import Config
-from cosfly.splits import SPLITS, Split
+from cosfly.products.splits import SPLITS, Split
+from cosfly.work.config import Config
 
 
 class SplitConfig(Config):

@@ -15,14 +15,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from cosfly import in_place
-from cosfly.console import progress_bar
-from cosfly.frame_views import scaled_size
+from cosfly.look.frame_views import scaled_size
 from cosfly.products.actions import action_tokens, actions_beside, not_in_set, one_set
 from cosfly.products.captions import Caption, read_captions
-from cosfly.provenance import fingerprint
-from cosfly.splits import SPLITS, Split, assign_splits, town_family
-from cosfly.stage_folder import Resume, StageFolder, Tally
+from cosfly.products.splits import SPLITS, Split, assign_splits, town_family
+from cosfly.work import in_place
+from cosfly.work.console import progress_bar
+from cosfly.work.provenance import fingerprint
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from distill.prepare.choice import Cut, Limit, Ranks, cost_of, limit_to
 from distill.prepare.leaks import check_no_leak
 from distill.prepare.samples import PrepareConfig, make_sample

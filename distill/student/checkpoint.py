@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from cosfly.errors import InputError
 from cosfly.reading.documents import parse_json, read_json, read_model, read_object, validation_errors
 from cosfly.reading.files import read_lines, sha256_file
-from cosfly.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
+from cosfly.work.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
 from distill.student.model import Student, weight_files
 
 log = logging.getLogger(__name__)

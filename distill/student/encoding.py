@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from cosfly.chat.student_chat import IMAGE_PART, chat_messages
 from cosfly.errors import InputError
 from cosfly.products.frames import tree_of
 from cosfly.reading.arrays import array_header, picture_size
-from cosfly.store import inside
-from cosfly.student_chat import IMAGE_PART, chat_messages
+from cosfly.work.store import inside
 from distill.schema import Sample
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 

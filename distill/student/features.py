@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.frame_views import VIEW_FILES, Pictures, View
+from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.reading.arrays import read_array
 from cosfly.reading.files import sha256_file
-from cosfly.store import inside, storage_errors
+from cosfly.work.store import inside, storage_errors
 from distill.schema import Sample
 from distill.student.encoding import patches_of, picture_grid
 from distill.student.model import Processor, Student

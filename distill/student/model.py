@@ -16,9 +16,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from cosfly.chat.student_chat import TAUGHT
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.reading.documents import read_json
-from cosfly.student_chat import TAUGHT
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 
 INSTALL = 'pip install "cosfly[distill]"'

@@ -12,12 +12,12 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.chance import rng_for
-from cosfly.config import Config
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import FIELDS
-from cosfly.store import atomic_folder
+from cosfly.work.chance import rng_for
+from cosfly.work.config import Config
+from cosfly.work.store import atomic_folder
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
 
 TINY, RANDOM = "tiny", "random"  # what `--student` may say beside folders and names of repositories

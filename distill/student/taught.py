@@ -1,12 +1,12 @@
-"""What a training set teaches, for those who ask the student later: `cosfly_student.json` (cosfly/student_chat.py)."""
+"""What a training set teaches, for those who ask the student later: `cosfly_student.json` (cosfly/chat/student_chat.py)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
+from cosfly.chat.student_chat import Look, Taught
 from cosfly.errors import InputError
 from cosfly.products.captions import Language, Prompt
-from cosfly.student_chat import Look, Taught
 from distill.schema import Sample
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.console import progress_bar
 from cosfly.errors import InputError
-from cosfly.frame_views import VIEW_FILES
+from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.places import flight_of
-from cosfly.store import inside
+from cosfly.work.console import progress_bar
+from cosfly.work.store import inside
 from distill.schema import Sample
 from distill.student.encoding import encode_text, image_size, special_token_in
 from distill.student.features import Picture, pictures_of

@@ -16,10 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cosfly.chance import rng_for
-from cosfly.console import progress_bar
 from cosfly.errors import ConfigError, InputError
-from cosfly.store import dump_json, storage_errors
+from cosfly.work.chance import rng_for
+from cosfly.work.console import progress_bar
+from cosfly.work.store import dump_json, storage_errors
 from distill.schema import Sample
 from distill.student.checkpoint import (
     Progress,

@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.reading.limits import Limits, limits, use_limits
-from cosfly.worker import end_with_parent
+from cosfly.work.worker import end_with_parent
 from distill.schema import Sample
 from distill.student.encoding import Encoded, encode_text
 from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, pictures_of

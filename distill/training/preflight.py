@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
-from cosfly.store import write_json
+from cosfly.work.store import write_json
 from distill.schema import Sample
 from distill.student.encoding import END_OF_ANSWER, chat_text, prompt_text
 from distill.student.features import VisionFeatures

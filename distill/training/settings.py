@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import Config, MayDiffer
+from cosfly.work.config import Config, MayDiffer
 from distill.student.model import Device, Dtype
 from distill.student.random_student import RandomStudent
 

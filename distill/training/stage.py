@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.chance import rng_for
+from cosfly.chat.student_chat import Taught, write_taught
 from cosfly.errors import ConfigError, InputError
-from cosfly.stage_folder import Resume, StageFolder, Tally
-from cosfly.store import atomic_folder, write_json
-from cosfly.student_chat import Taught, write_taught
+from cosfly.work.chance import rng_for
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
+from cosfly.work.store import atomic_folder, write_json
 from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures, folder_bytes

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.chance import rng_for
+from cosfly.work.chance import rng_for
 from distill.training.settings import TrainConfig
 
 STAGE = "distill.train"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.console import progress_bar
 from cosfly.products.answer_text import parse_answer
+from cosfly.work.console import progress_bar
 from distill.schema import Sample
 from distill.student.decoding import decode
 from distill.student.model import Student

@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 from release.columns import CONTRACT, PICTURES, schema
 from release.record import ReleaseRecord, shard_pattern
 

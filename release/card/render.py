@@ -11,8 +11,8 @@ from pathlib import Path
 
 import yaml
 
-from cosfly.coverage_page import ranges, shares
 from cosfly.escaping import for_markdown, for_terminal, markdown_code
+from cosfly.look.coverage_page import ranges, shares
 from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED, Coverage
 from cosfly.products.frames import FrameFile

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from cosfly.errors import InputError, NothingKept, StorageError
-from cosfly.frame_views import Pictures, frame_label
+from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
 from cosfly.products.places import stand
 from cosfly.reading.files import check_stays_below
-from cosfly.store import atomic_file, dump_json
+from cosfly.work.store import atomic_file, dump_json
 from release.columns import LANGUAGES
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder

@@ -19,8 +19,8 @@ from typing import IO, Any, Literal, Protocol, cast
 
 from pydantic import BaseModel, Field
 
-from cosfly.config import Config
-from cosfly.store import atomic_file
+from cosfly.work.config import Config
+from cosfly.work.store import atomic_file
 from release.export.source import Release, ReleasedRows, Span
 
 FormatName = Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"]

@@ -12,7 +12,7 @@ import cosfly
 from cosfly.escaping import for_markdown
 from cosfly.products.actions import ActionSet
 from cosfly.reading.documents import read_model
-from cosfly.store import dump_json, sha256_bytes, write_bytes
+from cosfly.work.store import dump_json, sha256_bytes, write_bytes
 from release.export.contract import ExportConfig, Facts
 from release.export.source import Release
 from release.record import DepthCoding, ReleasedMap, Strict

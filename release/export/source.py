@@ -17,7 +17,7 @@ from cosfly.products.frames import FrameFile, depth_bytes
 from cosfly.reading.arrays import png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
-from cosfly.store import inside
+from cosfly.work.store import inside
 from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.depth import depth_of
 from release.record import DepthCoding, ReleaseRecord, read_record, release_folder

@@ -10,9 +10,9 @@ import os
 from pathlib import Path
 
 from cosfly.errors import InputError, VerifyError
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Resume, StageFolder, result_of
-from cosfly.store import CHECKSUMS, inside, storage_errors, write_bytes, write_checksums
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, result_of
+from cosfly.work.store import CHECKSUMS, inside, storage_errors, write_bytes, write_checksums
 from release.export.contract import ExportConfig, Unit, Written, format_of
 from release.export.manifest import describe, render_readme, write_export
 from release.export.source import Release, open_release, scan

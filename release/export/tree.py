@@ -27,8 +27,8 @@ from cosfly.products.segments import FOLLOW, Segment
 from cosfly.products.town import TOWN_FILE, TOWN_SCHEMA, TOWN_VERSION, TownMap
 from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
-from cosfly.runner import advance
-from cosfly.store import CHECKSUMS, checksum_lines, write_model
+from cosfly.work.runner import advance
+from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, matrices_of
 from release.export.contract import ExportConfig, Facts, Files, Unit, Written
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, vectors

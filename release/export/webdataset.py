@@ -16,8 +16,8 @@ from typing import IO, Any, cast
 
 from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile
-from cosfly.runner import advance
-from cosfly.store import atomic_file, dump_json
+from cosfly.work.runner import advance
+from cosfly.work.store import atomic_file, dump_json
 from release.columns import PICTURES, SPLIT_NAMES
 from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
 from release.export.source import PART, Release, ReleasedRows, Span, depth_in_words, picture, read_span

@@ -6,11 +6,11 @@ from collections import Counter
 
 from pydantic import Field
 
-from cosfly.config import Config
 from cosfly.errors import InputError, nearest
 from cosfly.products.frames import FrameFile
 from cosfly.reading.documents import check_schema, parse_document, validation_errors
-from cosfly.store import CHECKSUMS, sha256_bytes
+from cosfly.work.config import Config
+from cosfly.work.store import CHECKSUMS, sha256_bytes
 from release.columns import SplitName
 from release.get.remote import Remote
 from release.record import (

@@ -20,8 +20,8 @@ from urllib.parse import urlsplit, urlunsplit
 
 from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.reading.files import open_file
-from cosfly.runner import advance
-from cosfly.store import inside
+from cosfly.work.runner import advance
+from cosfly.work.store import inside
 from release.package.publishable import published_name
 from release.record import release_folder
 

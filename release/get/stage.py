@@ -23,13 +23,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import BaseModel
 
-from cosfly.config import Config
 from cosfly.errors import InputError, VerifyError
 from cosfly.reading.files import open_file, sha256_file
 from cosfly.reading.tables import arrow_errors, open_stream, read_row_group, row_groups
-from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.stage_folder import Resume, StageFolder, result_of
-from cosfly.store import (
+from cosfly.work.config import Config
+from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, result_of
+from cosfly.work.store import (
     CHECKSUMS,
     atomic_file,
     atomic_folder,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cosfly
-from cosfly import in_place
+from cosfly.work import in_place
 from release import columns
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.config import ReleaseConfig

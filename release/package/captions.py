@@ -13,7 +13,7 @@ from cosfly.products.captions import FIELDS, Caption, caption_lines
 from cosfly.products.places import sample_id, town_folder
 from cosfly.reading.documents import parse_document, parse_json, validation_errors
 from cosfly.reading.files import read_span
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 from release.columns import (
     CAPTION_COUNTS,
     CAPTION_PROMPTS,

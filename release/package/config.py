@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.config import Config
 from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Track
+from cosfly.work.config import Config
 from release.columns import SplitName
 from release.record import DepthCodingName, Pairs, SplitBy
 

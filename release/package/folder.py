@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cosfly.errors import VerifyError
 from cosfly.reading.files import sha256_file
-from cosfly.store import write_bytes, write_checksums
+from cosfly.work.store import write_bytes, write_checksums
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
 from release.columns import SplitName

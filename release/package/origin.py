@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 import cosfly
-from cosfly.provenance import StageInput, stages_behind
+from cosfly.work.provenance import StageInput, stages_behind
 from release.package.captions import CaptionAccount, teacher_settings
 from release.package.publishable import published
 from release.package.sources import Source, input_names

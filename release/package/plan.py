@@ -12,7 +12,7 @@ from cosfly.errors import InputError, NothingKept
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
-from cosfly.stage_folder import StageFolder, Tally
+from cosfly.work.stage_folder import StageFolder, Tally
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig

@@ -15,12 +15,12 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, InputError, VerifyError
-from cosfly.items import advance
 from cosfly.products.frames import FILE_NAMES, FRAMES_DIR, FrameFile, frame_name, tree_of
 from cosfly.products.playback import Flight
-from cosfly.provenance import FLIGHT, digest_of, folder_digests
 from cosfly.reading.files import check_stays_below, sha256_file
-from cosfly.store import CHECKSUMS, atomic_file, read_checksums
+from cosfly.work.items import advance
+from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
+from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
 from release.columns import Placed, ReleasedCaption
 from release.package.captions import FlightCaptions, released

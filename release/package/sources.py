@@ -15,8 +15,8 @@ from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryF
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, stand, town_folder
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
-from cosfly.provenance import fingerprint, is_bound, was_made_of
 from cosfly.reading.files import check_stays_below, read_text
+from cosfly.work.provenance import fingerprint, is_bound, was_made_of
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 

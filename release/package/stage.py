@@ -9,13 +9,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from cosfly import in_place
 from cosfly.errors import VerifyError
 from cosfly.products.actions import actions_beside, one_set
-from cosfly.provenance import read_stage_record
-from cosfly.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.stage_folder import Failed, Resume, StageFolder, Tally, result_of
-from cosfly.store import CHECKSUMS, atomic_folder
+from cosfly.work import in_place
+from cosfly.work.provenance import read_stage_record
+from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_of
+from cosfly.work.store import CHECKSUMS, atomic_folder
 from release.card.numbers import compute_numbers
 from release.package.account import make_record
 from release.package.config import ReleaseConfig

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.console import progress_bar
 from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
 from cosfly.products.places import Track
 from cosfly.products.playback import Flight, read_flight
-from cosfly.splits import Course, town_family, walks_of
+from cosfly.products.splits import Course, town_family, walks_of
+from cosfly.work.console import progress_bar
 from release.columns import SplitName
 from release.package.sources import Candidate
 from release.record import Pairs, SplitBy

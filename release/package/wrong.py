@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cosfly.errors import CosflyError, InputError, VerifyError
-from cosfly.stage_folder import Failed, StageFolder, write_failures
+from cosfly.work.stage_folder import Failed, StageFolder, write_failures
 
 NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
 

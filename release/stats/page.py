@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cosfly.coverage_page import STYLE as COVERAGE_STYLE
-from cosfly.coverage_page import coverage_html
 from cosfly.escaping import for_html, for_markdown, html_page
+from cosfly.look.coverage_page import STYLE as COVERAGE_STYLE
+from cosfly.look.coverage_page import coverage_html
 from cosfly.products.coverage import Coverage
 from release.stats.schema import Absent, Cell, Stats, Table
 

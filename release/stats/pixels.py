@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.console import progress_bar
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, open_table, row_groups
+from cosfly.work.console import progress_bar
 from release.card.numbers import check_columns
 from release.columns import PICTURES
 from release.depth import depth_of

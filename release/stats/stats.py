@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cosfly.console import progress_bar
-from cosfly.store import write_bytes, write_json
+from cosfly.work.console import progress_bar
+from cosfly.work.store import write_bytes, write_json
 from release.card.numbers import COLUMNS as CARD_COLUMNS
 from release.card.numbers import Counted, check_rows, row_lists
 from release.record import read_record, release_folder

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from cosfly.geometry import wrap_deg
-from cosfly.issues import Severity
+from cosfly.products.issues import Severity
+from cosfly.products.splits import town_family
 from cosfly.reading.files import read_bytes
-from cosfly.splits import town_family
-from cosfly.store import write_bytes
+from cosfly.work.store import write_bytes
 from release.verify.findings import Findings
 from release.verify.motion import clean_positions
 from release.verify.places import Kept, check_places, packed

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.flight_metrics import accel_rms, jerk_rms
 from cosfly.products.places import folder_name, town_folder
-from cosfly.provenance import CONVERSION, CONVERTED
+from cosfly.products.splits import town_family
 from cosfly.reading.tables import row_groups
-from cosfly.splits import town_family
+from cosfly.space.flight_metrics import accel_rms, jerk_rms
+from cosfly.work.provenance import CONVERSION, CONVERTED
 from release.columns import PLACE
 from release.record import ReleasedFlight, ReleaseRecord, SourceRecord
 from release.splits import NAME_OF, SPLIT_RULE, split_groups

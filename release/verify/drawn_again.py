@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.chance import draw_by_share, rng_for
 from cosfly.geometry import look_at, wrap_deg
+from cosfly.products.shift_draws import PERTURBED, ShiftDraw, rng_of_shifts, shift_draws
 from cosfly.products.walks import walk_id
-from cosfly.shift_draws import PERTURBED, ShiftDraw, rng_of_shifts, shift_draws
+from cosfly.work.chance import draw_by_share, rng_for
 from release.record import MadeBy
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.escaping import cut, for_terminal
-from cosfly.issues import SEVERITIES, Issue, Report, Severity, sort_key
+from cosfly.products.issues import SEVERITIES, Issue, Report, Severity, sort_key
 
 EXAMPLES = 3  # places of a kind that are named
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 from cosfly.errors import InputError
-from cosfly.items import Item, Outcome
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
+from cosfly.work.items import Item, Outcome
 from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
 from release.verify.by_rule import check_drawn, check_inspected

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.reading.files import open_file, sha256_file
-from cosfly.store import CHECKSUMS, read_checksums
+from cosfly.work.store import CHECKSUMS, read_checksums
 from release.verify.findings import Findings
 
 ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set

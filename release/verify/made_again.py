@@ -10,8 +10,8 @@ from cosfly.errors import CosflyError, InputError
 from cosfly.reading.documents import validation_errors
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import open_table
-from cosfly.runner import Watch
-from cosfly.store import CHECKSUMS
+from cosfly.work.runner import Watch
+from cosfly.work.store import CHECKSUMS
 from release.export.contract import ExportConfig
 from release.export.manifest import ExportRecord
 from release.export.source import open_release

@@ -9,10 +9,10 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.png.read import Png, parse_png
-from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
+from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values, grid_rows
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reprojection import View, grid_rows, median_of
+from cosfly.space.reprojection import View, median_of
 from release.columns import PICTURES
 from release.depth import depth_of
 from release.record import DepthCoding

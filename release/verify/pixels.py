@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
-from cosfly.products.frames import SKY_DEPTH_M
+from cosfly.products.frames import GRID_ROWS, SKY_DEPTH_M, grid_rows
 from cosfly.products.kinds import KINDS
-from cosfly.reprojection import COLUMNS, ROWS, grid_rows, median_of
+from cosfly.space.reprojection import COLUMNS, median_of
+from cosfly.work.compiled import njit
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
 SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
@@ -293,10 +293,10 @@ def outline_of(colours, instance, rows, begin, end):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True)
 def _new_kinds(instance, known):  # type: ignore[no-untyped-def]
     height, width = instance.shape[:2]
-    found, num = np.empty(COLUMNS * ROWS, np.int64), 0
-    for j in range(ROWS):
+    found, num = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
+    for j in range(GRID_ROWS):
         for i in range(COLUMNS):
-            pixel = instance[int((j + 0.5) * height / ROWS), int((i + 0.5) * width / COLUMNS)]
+            pixel = instance[int((j + 0.5) * height / GRID_ROWS), int((i + 0.5) * width / COLUMNS)]
             own = np.int64(pixel[1]) | np.int64(pixel[2]) << 8
             if own != NOBODY and own != SHARED_ID and known[own] != pixel[0]:
                 found[num] = own << 8 | np.int64(pixel[0])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cosfly.reprojection import View, compare_views
+from cosfly.space.reprojection import View, compare_views
 from release.verify.findings import Findings
 
 if TYPE_CHECKING:

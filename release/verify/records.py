@@ -13,7 +13,7 @@ from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table
-from cosfly.stage_folder import flattened
+from cosfly.work.stage_folder import flattened
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers

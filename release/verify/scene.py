@@ -1,4 +1,4 @@
-"""The pictures of a flight against each other: what stands still is carried from frame to frame through the poses (cosfly/reprojection.py).
+"""The pictures of a flight against each other: what stands still is carried from frame to frame through the poses (cosfly/space/reprojection.py).
 
 That is where exchanged pictures, poses and cameras come to light: each of them may be right alone. Thresholds lie between what honest
 flights of six runs showed at worst and what the smallest exchange, that of two frames half a second apart, shows typically
@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cosfly.items import advance
-from cosfly.reprojection import (
+from cosfly.space.reprojection import (
     LEAST_PAIRS,
     Agreement,
     View,
@@ -24,6 +23,7 @@ from cosfly.reprojection import (
     usual_correlations,
     way_px,
 )
+from cosfly.work.items import advance
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
 from release.verify.person import check_shown

@@ -14,17 +14,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cosfly import in_place
-from cosfly.config import Config
 from cosfly.errors import InputError
-from cosfly.items import Item
 from cosfly.products.frames import FILE_NAMES
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.reading.files import read_bytes
-from cosfly.runner import Watch, run_items
-from cosfly.stage_folder import Failed, Kept, StageFolder
-from cosfly.store import CHECKSUMS
+from cosfly.work import in_place
+from cosfly.work.config import Config
+from cosfly.work.items import Item
+from cosfly.work.runner import Watch, run_items
+from cosfly.work.stage_folder import Failed, Kept, StageFolder
+from cosfly.work.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
 from release.export.manifest import ExportRecord, read_export, render_readme

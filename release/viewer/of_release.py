@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
-from cosfly.console import progress_bar
-from cosfly.frame_views import View, depth_colors, segmentation_colors
+from cosfly.look.frame_views import View, depth_colors, segmentation_colors
 from cosfly.products.captions import Coc, Language
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, row_groups
+from cosfly.work.console import progress_bar
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
 from release.columns import BOX, CAPTION_PROMPTS, PLACE, POINT, SCALAR_NAMES
 from release.columns import PICTURES as COLUMNS

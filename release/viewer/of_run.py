@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.console import progress_bar
 from cosfly.errors import InputError
-from cosfly.frame_views import VIEW_FILES, View, read_view
+from cosfly.look.frame_views import VIEW_FILES, View, read_view
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import Caption, Coc, Language, read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.review import read_settled
+from cosfly.work.console import progress_bar
 from release.viewer.choosing import boxes_of, choose_flights, choose_frames, path_of, shown_sentences
 from release.viewer.pictures import Pictures, box_of
 from release.viewer.schema import Shown, ShownBox, ShownCaption, ShownFlight, ShownFrame, ViewerConfig

@@ -11,7 +11,7 @@ from typing import Any
 
 from cosfly.escaping import for_html, for_terminal, html_page, json_block
 from cosfly.reading.files import read_text
-from cosfly.store import dump_json, write_bytes
+from cosfly.work.store import dump_json, write_bytes
 from release.viewer.of_release import show_release
 from release.viewer.of_run import show_run
 from release.viewer.schema import Shown, ViewerConfig

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.frame_views import View, small_jpeg
+from cosfly.look.frame_views import View, small_jpeg
 from release.viewer.schema import ViewerConfig
 
 MB = 1024 * 1024

@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from cosfly.config import Config
-from cosfly.frame_views import View
+from cosfly.look.frame_views import View
 from cosfly.products.captions import Language, SentenceState
+from cosfly.work.config import Config
 
 Point2 = tuple[float, float]  # x, y, m
 

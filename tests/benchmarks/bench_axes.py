@@ -10,13 +10,13 @@ import argparse
 import numpy as np
 import scenes
 
-from cosfly.chance import rng_for
-from cosfly.kernels import obstacle_index
 from cosfly.planners.compare import axis_differences, axis_scores, flight_figures, mean_figures
 from cosfly.planners.contract import PLANNERS, PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_flight, warm_up
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import Walk
+from cosfly.space.kernels import obstacle_index
+from cosfly.work.chance import rng_for
 
 # name -> raw map, settings of its walks. town5 and town9: other seeds of (a).
 MAPS = {

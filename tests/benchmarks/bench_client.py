@@ -33,7 +33,7 @@ from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.chat import client
 from cosfly.chat.protocol import encode_body
-from cosfly.frame_views import VIEW_FILES
+from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.frames import SKY_DEPTH_M
 from specimens import make_playback_tree
 

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from specimens_distill import make_caption, write_set
 
 from cosfly.products.actions import action_tokens
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 from distill.evaluation.bertscore import BertScoreConfig, Scorer, score_beside_floors
 from distill.evaluation.floors import coc_of, shuffled_groups, shuffled_places
 from distill.evaluation.measure import text_of

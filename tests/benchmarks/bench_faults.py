@@ -22,9 +22,9 @@ from cosfly.bench.faults import Faults, planted
 from cosfly.errors import EnvironmentMissing
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.runner import Watch
-from cosfly.stage_events import read_events
-from cosfly.stage_folder import read_manifest
+from cosfly.work.runner import Watch
+from cosfly.work.stage_events import read_events
+from cosfly.work.stage_folder import read_manifest
 
 RECORDS = ("stage.json", "manifest.json", "events.jsonl", "items.jsonl", "failures.jsonl")  # of times and processes
 

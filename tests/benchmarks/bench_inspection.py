@@ -28,12 +28,12 @@ from cosfly.inspection.pixels import NUM_IDS, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import FILE_NAMES, grid_rows, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes, sha256_file
-from cosfly.reprojection import View, compare_views, grid_rows
-from cosfly.stage_events import read_events
-from cosfly.store import sha256_bytes
+from cosfly.space.reprojection import View, compare_views
+from cosfly.work.stage_events import read_events
+from cosfly.work.store import sha256_bytes
 
 NOBODY = np.zeros(NUM_IDS, dtype=np.bool_)
 

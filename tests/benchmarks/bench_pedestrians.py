@@ -14,10 +14,10 @@ import scenes
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from cosfly.chance import rng_for
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.work.chance import rng_for
 
 BIG_M = (3784 * 0.5, 2357 * 0.5)
 SETTINGS = PedestriansConfig(num_paths=scenes.NUM_WALKS)

@@ -12,15 +12,15 @@ import numpy as np
 import scenes
 from scipy.optimize import minimize
 
-from cosfly import flight_metrics as metrics
-from cosfly.chance import rng_for
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
-from cosfly.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
+from cosfly.space import flight_metrics as metrics
+from cosfly.space.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
+from cosfly.work.chance import rng_for
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
 

@@ -29,7 +29,6 @@ import numpy as np
 import scenes
 
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.kernels import obstacle_index
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.products import frames
@@ -42,6 +41,7 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
+from cosfly.space.kernels import obstacle_index
 
 SIZE = (1280, 720)
 FOVS_DEG = (60.0, 90.0)

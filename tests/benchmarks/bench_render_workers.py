@@ -31,7 +31,7 @@ import cv2
 import scenes
 from bench_render import FILES, make_inputs
 
-from cosfly.ahead import compile_render
+from cosfly.app.ahead import compile_render
 from cosfly.products import frames
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import read_traces
@@ -41,7 +41,7 @@ from cosfly.render.gl import backend
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
-from cosfly.worker import keep_freed_memory
+from cosfly.work.worker import keep_freed_memory
 
 NUM_FLIGHTS = 4
 LEAD_S = 0.5  # between the word and the first frame that counts: the first flight's shadows

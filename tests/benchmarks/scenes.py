@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from cosfly.chance import rng_for
-from cosfly.config import build
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import Walk
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.work.chance import rng_for
+from cosfly.work.config import build
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM_WALKS, SEED = 20, 0

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cosfly.config import Config, build, read_yaml
 from cosfly.errors import ConfigError
 from cosfly.products.captions import Language
+from cosfly.work.config import Config, build, read_yaml
 
 Phrases = dict[str, str]  # value -> phrases, separated by commas
 

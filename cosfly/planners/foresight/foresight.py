@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from cosfly.errors import NoPathError
-from cosfly.kernels import BoxIndex, visibility
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.foresight.lattice import make_lattice
 from cosfly.planners.foresight.search import SPEED_SHARE, search_flight
 from cosfly.planners.foresight.smooth import smooth_flight, unsafe
+from cosfly.space.kernels import BoxIndex, visibility
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import njit
-from cosfly.kernels import (
+from cosfly.planners.contract import PlanConfig, Scenario
+from cosfly.planners.foresight.lattice import Lattice
+from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
+from cosfly.space.kernels import (
     HIGH_X,
     HIGH_Y,
     HIGH_Z,
@@ -23,9 +25,7 @@ from cosfly.kernels import (
     index_boxes,
     squared_gap,
 )
-from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.planners.foresight.lattice import Lattice
-from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
+from cosfly.work.compiled import njit
 
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
 NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last

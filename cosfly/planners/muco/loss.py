@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import int64, njit
-from cosfly.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 from cosfly.planners.muco.window import window_rays
+from cosfly.space.kernels import RAY_SPREAD_M, collect_hits, nearest_box, normal_of_box
+from cosfly.work.compiled import int64, njit
 
 TERM_NAMES = (
     "tracking", "smoothness", "jerk", "safety", "visibility", "view_angle", "path_length", "altitude", "pitch",

@@ -11,12 +11,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.errors import NoPathError
-from cosfly.kernels import BoxIndex, visibility
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.start import search_start
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
+from cosfly.space.kernels import BoxIndex, visibility
 
 # Where no step of any length lowers the loss, it changes by nothing: that is within the tolerance.
 AT_REST = ("converged", "no_step", "no_interior_waypoint")

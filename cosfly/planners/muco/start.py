@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from cosfly.compiled import njit
-from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box
 from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.muco.loss import GREATEST, PREFERRED, Problem
+from cosfly.space.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box
+from cosfly.work.compiled import njit
 
 # Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
 # the others climb over what blocks the way and are tried only where the first two do not suffice.

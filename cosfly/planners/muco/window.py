@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.compiled import njit
-from cosfly.kernels import HALF_X, RAY_OFFSETS_M, clip, in_box_frame
+from cosfly.space.kernels import HALF_X, RAY_OFFSETS_M, clip, in_box_frame
+from cosfly.work.compiled import njit
 
 
 @njit(cache=True)

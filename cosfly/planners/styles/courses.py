@@ -16,7 +16,7 @@ from cosfly.planners.styles.table import ALTITUDE_LEAST_M, TABLE, Range, Style
 from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:
-    from cosfly.kernels import BoxIndex
+    from cosfly.space.kernels import BoxIndex
 
 # How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
 APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 2.5
@@ -85,7 +85,7 @@ def _best_course(
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
     """Draw the parameters of a part until its places see the walker and are free, or take the best of DRAWS; (k, 3)."""
-    from cosfly.kernels import signed_distances, visibility
+    from cosfly.space.kernels import signed_distances, visibility
 
     targets_m, heading_rad = scenario.targets_m[part], scenario.wish.heading_rad[part]
     best, best_score = np.empty(0), -np.inf

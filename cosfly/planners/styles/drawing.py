@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.chance import draw_by_share
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles.courses import wish_of
 from cosfly.planners.styles.mission import wish_of_mission
 from cosfly.planners.styles.reacquire import finds_again, wish_of_reacquire
 from cosfly.planners.styles.table import REACQUIRE, RETURN_HOME, WHOLE
 from cosfly.products.segments import FOLLOW, Mission, Segment
+from cosfly.work.chance import draw_by_share
 
 if TYPE_CHECKING:
-    from cosfly.kernels import BoxIndex
+    from cosfly.space.kernels import BoxIndex
 
 # A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its distance.
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
-from cosfly.kernels import collect_hits, nearest_box
 from cosfly.planners.sight import look, make_horizon
+from cosfly.space.kernels import collect_hits, nearest_box
+from cosfly.work.compiled import njit
 
 ROUNDING_M = 1e-6  # of altitudes
 

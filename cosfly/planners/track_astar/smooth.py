@@ -14,8 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.compiled import njit
-from cosfly.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, signed_distances, visibility
+from cosfly.space.kernels import (
+    RAY_SPREAD_M,
+    BoxIndex,
+    collect_hits,
+    free_rays,
+    nearest_box,
+    signed_distances,
+    visibility,
+)
+from cosfly.work.compiled import njit
 
 if TYPE_CHECKING:
     from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig

@@ -20,13 +20,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from cosfly.compiled import njit
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
-from cosfly.kernels import BoxIndex
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.track_astar.search import MOVES, WEIGHTS, Costs, Voxels, search_layers
 from cosfly.planners.track_astar.smooth import smooth_flight
+from cosfly.space.kernels import BoxIndex
+from cosfly.work.compiled import njit
 
 MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
 

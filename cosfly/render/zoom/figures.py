@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from cosfly.look.topview import add_caption
 from cosfly.products.frames import level_name, rgb_bytes
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import FlightScript, draw_frame
 from cosfly.render.zoom.fidelity import compare
 from cosfly.render.zoom.study import ZoomStudyConfig, at_level, camera_of, optical_and_digital, ready
-from cosfly.topview import add_caption
 
 MOST_FLIGHTS = 4
 TILE_WIDTH_PX, PANEL_WIDTH_PX = 480, 960

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.config import Config
 from cosfly.geometry import focal_px, intrinsic_matrix
 from cosfly.products.frames import Camera
 from cosfly.products.segments import Segment
+from cosfly.work.config import Config
 
 
 class ZoomConfig(Config):

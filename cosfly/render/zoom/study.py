@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.chance import rng_for
 from cosfly.geometry import box_iou, intrinsic_matrix
 from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.frames import Camera, level_name
@@ -27,9 +26,10 @@ from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
 from cosfly.render.zoom.fidelity import KERNELS, compare, digital_zoom, enlarged_camera
-from cosfly.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.stage_folder import Resume, StageFolder, result_of
-from cosfly.store import write_bytes, write_json
+from cosfly.work.chance import rng_for
+from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, result_of
+from cosfly.work.store import write_bytes, write_json
 
 SCHEMA, VERSION = "cosfly.zoom_study", "1.0"
 STAGE = "zoom_study"

@@ -25,8 +25,8 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_array, parse_picture
-from cosfly.runner import advance
-from cosfly.store import atomic_file, dump_json
+from cosfly.work.runner import advance
+from cosfly.work.store import atomic_file, dump_json
 from release.columns import PICTURES, SPLIT_NAMES
 from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
 from release.export.lerobot.features import CAMERAS, COLUMNS, Feature, features_of, schema_of, tiff_of_depth, values_of

@@ -14,13 +14,13 @@ from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from cosfly.console import progress_bar
 from cosfly.errors import CosflyError, EnvironmentMissing
-from cosfly.items import Item, Outcome, Work, advance, attempt, counted_steps
-from cosfly.stage_events import EventLog, HowFar
-from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
-from cosfly.store import remove_partials
-from cosfly.worker_pool import Watch, WorkerPool
+from cosfly.work.console import progress_bar
+from cosfly.work.items import Item, Outcome, Work, advance, attempt, counted_steps
+from cosfly.work.stage_events import EventLog, HowFar
+from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
+from cosfly.work.store import remove_partials
+from cosfly.work.worker_pool import Watch, WorkerPool
 
 __all__ = ["Finished", "Item", "Outcome", "Watch", "Work", "advance", "run_items"]
 

@@ -21,12 +21,12 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cosfly.console import set_levels
 from cosfly.errors import CosflyError
-from cosfly.in_place import put_all
-from cosfly.items import Item, Work, attempt, counted_steps
 from cosfly.reading.limits import Limits, use_limits
-from cosfly.stage_folder import ItemRecord
+from cosfly.work.console import set_levels
+from cosfly.work.in_place import put_all
+from cosfly.work.items import Item, Work, attempt, counted_steps
+from cosfly.work.stage_folder import ItemRecord
 
 LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
 PR_SET_PDEATHSIG = 1  # prctl(2)
@@ -66,7 +66,7 @@ class Manner:
 @dataclass(frozen=True)
 class Start:
     """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what stands in the place of
-    files that ship (cosfly/in_place.py)."""
+    files that ship (cosfly/work/in_place.py)."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple

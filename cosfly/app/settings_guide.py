@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, nearest
 from cosfly.escaping import for_markdown
-from cosfly.store import dump_json
+from cosfly.work.store import dump_json
 
 PAGE_HEAD = """# Settings
 

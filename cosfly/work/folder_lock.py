@@ -21,7 +21,7 @@ from weakref import WeakValueDictionary
 
 from cosfly.errors import ResumeError, StorageError
 from cosfly.reading.documents import parse_json
-from cosfly.store import storage_errors
+from cosfly.work.store import storage_errors
 
 log = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ __all__ = ["boolean", "int64", "njit", "put_word", "word_at"]
 
 log = logging.getLogger(__name__)
 
-PACKAGE = Path(__file__).parent
+PACKAGE = Path(__file__).parents[1]
 intrinsic: Any = extending.intrinsic  # of what it decorates, callers do not give the first argument
 UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
 

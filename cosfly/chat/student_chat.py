@@ -19,10 +19,10 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
 from cosfly.errors import InputError
-from cosfly.frame_views import View, encode_picture, frame_label
+from cosfly.look.frame_views import View, encode_picture, frame_label
 from cosfly.products.captions import Language, Prompt
 from cosfly.reading.documents import read_model
-from cosfly.store import sha256_bytes, write_model
+from cosfly.work.store import sha256_bytes, write_model
 
 IMAGE_ENCODING: Literal["png"] = "png"
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it

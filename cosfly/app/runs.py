@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cosfly.config import load
+from cosfly.app.settings import RunConfig
+from cosfly.app.settings_guide import Setting, changed
 from cosfly.errors import CosflyError, InputError
-from cosfly.folder_lock import is_held
 from cosfly.products.review import undecided
-from cosfly.settings import RunConfig
-from cosfly.settings_guide import Setting, changed
-from cosfly.stage_events import HowFar, progress_of, read_events
-from cosfly.stage_folder import Failed, StageFolder, Tally, read_manifest
+from cosfly.work.config import load
+from cosfly.work.folder_lock import is_held
+from cosfly.work.stage_events import HowFar, progress_of, read_events
+from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 TO_LOOK_AT = (

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from caption.run.progress import duration
-from cosfly.config import load
+from cosfly.app.runs import STAGES, StageLook, find, look
+from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import CosflyError
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths
-from cosfly.runs import STAGES, StageLook, find, look
-from cosfly.settings import RunConfig, manner_of_work
-from cosfly.stage_folder import Failed, StageFolder, flattened
+from cosfly.work.config import load
+from cosfly.work.stage_folder import Failed, StageFolder, flattened
 
 UNITS = {
     "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames", "caption": "windows", "release": "frames",

@@ -13,8 +13,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosfly.chat.contract import CONTEXT_FULL
-from cosfly.chat.lenient import BLANK, Broken, ObjectReader
+from cosfly.reading.lenient import BLANK, Broken, ObjectReader
 
 MAX_CHARACTERS = 100_000  # more than any reasoning and answer take; what is longer is not read
 MAX_WRAPPERS = 3  # round the object that was asked for
@@ -38,6 +37,7 @@ _CLOSES = (
 _MARK = re.compile(rf"(?P<opens>{_OPENS})|(?P<closes>{_CLOSES})|\{{(?!\{{)", re.IGNORECASE)
 _CLOSE = re.compile(_CLOSES, re.IGNORECASE)
 
+CONTEXT_FULL = "context_full"  # why an answer ended: prompt and answer fill the context, before `max_tokens`
 _NOTHING = re.compile(rf"(?:[{BLANK}]|```\w*)*+")
 # Finish reason -> ours, of a message that was cut off.
 _CUT = {

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.roi import Roi
+from cosfly.work.compiled import njit
 
 RESOLUTION_M = 0.5  # tab:ped_params
 HUMAN_HEIGHT_M = 2.0  # tab:ped_params

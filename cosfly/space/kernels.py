@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.compiled import njit
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.work.compiled import njit
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells
 MAX_CELLS = 1 << 18  # a map with a stray box a thousand kilometres away must not fill the memory

@@ -17,11 +17,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 
 import cosfly
-from cosfly.config import Config
 from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
-from cosfly.journal import Journal
-from cosfly.provenance import (
+from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
+from cosfly.reading.files import sha256_file
+from cosfly.work.config import Config
+from cosfly.work.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
+from cosfly.work.journal import Journal
+from cosfly.work.provenance import (
     MANIFEST_SCHEMA,
     STAGE_SCHEMA,
     VERSION,
@@ -33,10 +35,8 @@ from cosfly.provenance import (
     read_stage_record,
     recorded_digests,
 )
-from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
-from cosfly.reading.files import sha256_file
-from cosfly.stage_events import EVENTS, lost_steps
-from cosfly.store import (
+from cosfly.work.stage_events import EVENTS, lost_steps
+from cosfly.work.store import (
     dump_json,
     inside,
     is_partial_of,

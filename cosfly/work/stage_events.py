@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cosfly.journal import Journal
+from cosfly.work.journal import Journal
 
 EVENTS = "events.jsonl"
 PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines

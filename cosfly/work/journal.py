@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from cosfly.errors import InputError, plain
 from cosfly.reading.documents import parse_json
 from cosfly.reading.files import open_file, read_lines
-from cosfly.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
+from cosfly.work.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
 
 TAIL = 65_536  # bytes at the end in which `last` looks
 ASIDE = ".aside"  # what is added to the name of a journal for the file that holds its broken lines

@@ -9,9 +9,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from cosfly.chat.answers import TOTALS, read_line
-from cosfly.folder_lock import hold_folder
-from cosfly.journal import ASIDE, Journal
-from cosfly.stage_folder import read_item
+from cosfly.work.folder_lock import hold_folder
+from cosfly.work.journal import ASIDE, Journal
+from cosfly.work.stage_folder import read_item
 
 log = logging.getLogger(__name__)
 

@@ -11,9 +11,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from cosfly.compiled import njit
+from cosfly.products.frames import GRID_ROWS, grid_rows
+from cosfly.work.compiled import njit
 
-COLUMNS, ROWS = 64, 36  # points are taken at the middle of so many cells
+COLUMNS = 64  # points are taken at the middle of so many cells of GRID_ROWS rows
 NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky
 ZOOMED = 0.05  # logarithm of the ratio of two focal lengths
 LEAST_CONTRAST = 4.0  # grey levels: less is a wall or a fog
@@ -67,11 +68,6 @@ class Agreement:
     shade: float
     shifted: int
     renamed: int
-
-
-def grid_rows(height_px: int) -> np.ndarray:
-    """Rows of the grid, (ROWS,)."""
-    return ((np.arange(ROWS) + 0.5) * height_px / ROWS).astype(np.int64)
 
 
 def is_zoomed(one: np.ndarray, other: np.ndarray) -> bool:
@@ -145,7 +141,7 @@ def _from_to(one: View, other: View) -> tuple[np.ndarray, np.ndarray]:
 def _grid_row_at(height_px: int) -> np.ndarray:
     """Number of the grid's row that is one of a picture's rows or lies beside it, (h,); -1: none."""
     rows = np.arange(height_px)
-    nearest = np.clip(np.round((rows + 0.5) * ROWS / height_px - 0.5).astype(np.int64), 0, ROWS - 1)
+    nearest = np.clip(np.round((rows + 0.5) * GRID_ROWS / height_px - 0.5).astype(np.int64), 0, GRID_ROWS - 1)
     return np.where(np.abs(grid_rows(height_px)[nearest] - rows) <= 1, nearest, -1)
 
 
@@ -226,13 +222,13 @@ def _carry(depth_a, inst_a, colours_a, depth_b, inst_b, colours_b, grid_row_at, 
     others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
-    errors, num_errors = np.empty(COLUMNS * ROWS), 0
-    colours, num_colours = np.empty((COLUMNS * ROWS, 6)), 0
-    firm, num_firm = np.empty(COLUMNS * ROWS, np.int64), 0
-    moved, num_moved = np.empty(COLUMNS * ROWS, np.int64), 0
-    renamed, num_renamed = np.empty(COLUMNS * ROWS, np.int64), 0
-    for j in range(ROWS):
-        v = int((j + 0.5) * height / ROWS)
+    errors, num_errors = np.empty(COLUMNS * GRID_ROWS), 0
+    colours, num_colours = np.empty((COLUMNS * GRID_ROWS, 6)), 0
+    firm, num_firm = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
+    moved, num_moved = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
+    renamed, num_renamed = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
+    for j in range(GRID_ROWS):
+        v = int((j + 0.5) * height / GRID_ROWS)
         if only_colours and j >= len(colours_a):
             break
         for i in range(COLUMNS):

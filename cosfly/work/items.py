@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cosfly.errors import CosflyError
-from cosfly.stage_folder import Dropped, Failed, ItemRecord, Kept
+from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept
 
 log = logging.getLogger(__name__)
 

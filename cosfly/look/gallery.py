@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
-from cosfly.overlay import Overlay
+from cosfly.look.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
+from cosfly.look.overlay import Overlay
+from cosfly.look.topview import add_caption, draw_text
 from cosfly.products.boxes import BoxMap
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import DEBUG_FILE, read_instance, read_meta, read_rgb, rgb_bytes
@@ -19,8 +20,7 @@ from cosfly.products.instance_ids import read_instance_ids
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.arrays import read_picture
-from cosfly.store import inside, write_bytes
-from cosfly.topview import add_caption, draw_text
+from cosfly.work.store import inside, write_bytes
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4

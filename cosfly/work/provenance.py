@@ -17,12 +17,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.console import progress_bar
 from cosfly.errors import InputError, VerifyError
-from cosfly.journal import Journal
 from cosfly.reading.documents import read_json, read_model, read_object
 from cosfly.reading.files import files_named, sha256_file
-from cosfly.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
+from cosfly.work.console import progress_bar
+from cosfly.work.journal import Journal
+from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
 

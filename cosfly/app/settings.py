@@ -10,8 +10,6 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from caption.schema import CaptionConfig
-from cosfly.chance import rng_for
-from cosfly.config import Config, build
 from cosfly.errors import ConfigError
 from cosfly.inspection.settings import InspectConfig
 from cosfly.maps.stage import MapsConfig
@@ -20,7 +18,9 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.reading.limits import Limits
 from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
-from cosfly.worker_pool import Watch
+from cosfly.work.chance import rng_for
+from cosfly.work.config import Config, build
+from cosfly.work.worker_pool import Watch
 from distill.evaluation.compare import CompareConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig

@@ -1,6 +1,6 @@
 """Compiled code of a run, compiled once by a spare process while the stages before run: two workers that need it would both compile it.
 
-`python -m cosfly.ahead PLANNER` is that process. It writes numba's cache and a mark for each stage that is ready, and ends when its
+`python -m cosfly.app.ahead PLANNER` is that process. It writes numba's cache and a mark for each stage that is ready, and ends when its
 input closes: whatever becomes of the process that started it.
 """
 
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.compiled import cache_folder
-from cosfly.store import sha256_bytes
+from cosfly.work.compiled import cache_folder
+from cosfly.work.store import sha256_bytes
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def compiled_ahead(planner: str, todo: Collection[str]) -> Iterator[Callable[[st
     if folder is None or not missing:
         yield lambda stage: None
         return
-    command = [sys.executable, "-m", "cosfly.ahead", planner]
+    command = [sys.executable, "-m", "cosfly.app.ahead", planner]
     try:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except OSError:  # no room for another process: the stages compile for themselves
@@ -111,7 +111,8 @@ def compile_inspection() -> None:
     """Compile what looks at pictures: at two frames, each from its files, as the inspection does."""
     from cosfly.inspection.pixels import NUM_IDS, unpack
     from cosfly.inspection.pixels import look_at as look_at_pixels
-    from cosfly.reprojection import View, compare_views, grid_rows
+    from cosfly.products.frames import grid_rows
+    from cosfly.space.reprojection import View, compare_views
 
     files = compile_encoders()
     picture = unpack(files, Path("frame"))

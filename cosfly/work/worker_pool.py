@@ -21,12 +21,12 @@ from multiprocessing.connection import Connection
 from typing import Any, Literal
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.in_place import everything
-from cosfly.items import Item, Work
 from cosfly.reading.limits import limits
-from cosfly.stage_events import EventLog, cpu_seconds
-from cosfly.stage_folder import Failed, ItemRecord
-from cosfly.worker import Broken, Manner, Message, Sign, Start, signals_held_back, work_through
+from cosfly.work.in_place import everything
+from cosfly.work.items import Item, Work
+from cosfly.work.stage_events import EventLog, cpu_seconds
+from cosfly.work.stage_folder import Failed, ItemRecord
+from cosfly.work.worker import Broken, Manner, Message, Sign, Start, signals_held_back, work_through
 
 log = logging.getLogger(__name__)
 

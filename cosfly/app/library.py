@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.chance import rng_for
-from cosfly.config import build
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
@@ -28,6 +26,8 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.work.chance import rng_for
+from cosfly.work.config import build
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
@@ -75,8 +75,8 @@ def plan(
     Raises:
         ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight that is free of collisions.
     """
-    from cosfly.kernels import obstacle_index
     from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.space.kernels import obstacle_index
 
     walking = build(PedestriansConfig, walk or {}, "plan: walk")
     cfg = build(PlanConfig, settings, "plan")

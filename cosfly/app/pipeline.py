@@ -24,17 +24,17 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly import estimate
-from cosfly.ahead import compiled_ahead
+from cosfly.app import estimate
+from cosfly.app.ahead import compiled_ahead
+from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import ConfigError, CosflyError, InputError, ResumeError
-from cosfly.folder_lock import give_up, hold_folder
-from cosfly.gallery import contact_sheet, preview_gif
+from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
 from cosfly.reading.limits import use_limits
-from cosfly.settings import RunConfig, manner_of_work
-from cosfly.stage_folder import Manifest, Resume, read_manifest
-from cosfly.store import refuse_link, write_bytes, write_json
+from cosfly.work.folder_lock import give_up, hold_folder
+from cosfly.work.stage_folder import Manifest, Resume, read_manifest
+from cosfly.work.store import refuse_link, write_bytes, write_json
 from release.package.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)

@@ -1,0 +1,1 @@
+"""The application: stages in one run, and what looks at runs."""

@@ -1,0 +1,1 @@
+"""Geometry of boxes, cells, flights and frames."""
