@@ -66,7 +66,7 @@ def parsed(text: str) -> tuple[Any, list[str]]:
 
 def test_the_commands_are_found():
     pages = {name for name, _ in ALL}
-    assert {"README.md", "distillation.md", "releases.md", "teachers.md", "files.md", "first-runs.md"} <= pages
+    assert {"commands.md", "distillation.md", "releases.md", "teachers.md", "files.md", "first-runs.md"} <= pages
     assert len(ALL) > 90
     assert any(text.startswith("distill train --dataset work/dataset") for _, text in ALL)
 

@@ -41,7 +41,7 @@ from cosfly.work.stage_folder import StageFolder
 from specimens import make_playback_tree
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
-FIRST, LAST = ("first-runs.md", "README.md"), ("rendering.md",)
+FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
 QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
@@ -230,7 +230,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
 
 def in_order() -> list[tuple[str, str]]:
     pages = [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
-    return [("README.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
+    return [("commands.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
 
 
 def test_what_cannot_run_here_is_in_the_documents():
