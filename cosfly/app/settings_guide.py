@@ -1,4 +1,4 @@
-"""The settings explained: each with its value, what it may be and what it means, for a terminal and as docs/settings.md."""
+"""The settings explained: each with its value, what it may be and what it means, for a terminal and as a page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cosfly.work.store import dump_json
 
 PAGE_HEAD = """# Settings
 
-Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > docs/settings.md`.
+Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > all-settings.md`.
 `--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them, and needs no more than
 `cosfly config show FILE --changed` does: what is not the default. `cosfly config show --find altitude` finds settings by a word of theirs. `cosfly config schema`
 gives the JSON schema, with which an editor completes and checks such a file: `cosfly config schema > schema.json`, and in many

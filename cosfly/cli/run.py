@@ -259,9 +259,7 @@ def config_show(
     section: Annotated[str | None, typer.Argument(help="Only this section or setting, for instance plan.muco.")] = None,
     overrides: options.Overrides = None,
     describe: Annotated[bool, typer.Option("--describe", help="Say what each setting means and may be.")] = False,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="With --describe: as the page docs/settings.md.")
-    ] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="With --describe: as a page.")] = False,
     changed: Annotated[bool, typer.Option("--changed", help="Only what is not the default.")] = False,
     find: Annotated[
         list[str] | None,
