@@ -21,12 +21,12 @@ from specimens_planning import walk_along
 from caption.run import stage as caption_stage
 from caption.run.asking import read_quarantine
 from caption.run.flights import named_flights
-from caption.schema import CaptionConfig, EvidenceConfig
+from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign, read_student
 from caption.teachers.prompt_files import export_prompts, own_prompts
 from caption.truth.facts import Facts
 from caption.truth.gold import GOLD_PROSE, read_gold_prose
-from caption.truth.prose.judging import judge_sentences
+from caption.truth.prose import judge_prose
 from caption.truth.references import parse_reference
 from caption.writing.slots import Slots
 from cosfly.app.settings import RunConfig
@@ -472,7 +472,7 @@ def _prose(root: Path, name: str, language: Any = "en") -> None:
     text = _bytes(root / name).decode("utf-8", "replace")[:20_000]
     components, _, trace = text.partition("\n")
     coc = Coc.model_construct(critical_components=components, reasoning_trace=trace, flight_decision="track_straight")
-    judge_sentences(coc, _facts(), EvidenceConfig(), language)
+    judge_prose(coc, _facts(), language)
 
 
 def _slots(root: Path) -> None:

@@ -1,9 +1,9 @@
 """Measure the judging of texts on captions that somebody else wrote: true ones flagged, one-change errors caught.
 
-    python tests/measure_prose.py claims|prose [FILE...] [--only PREFIX...] [--unmet] [--show]
+    python tests/measure_prose.py claims|prose [FILE...] [--only PREFIX...] [--show]
 
 Files are gold sets (caption/truth/gold.py), by default the one that ships; --only: the captions whose id begins so. Figures by where
-the error was planted (text, claims, both), language and kind; --unmet: as if the wordings of these files had not been met; --show prints the true captions that were flagged and the errors that
+the error was planted (text, claims, both), language and kind; --show prints the true captions that were flagged and the errors that
 were missed.
 """
 
@@ -15,13 +15,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from wordings import forget
-
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
 from caption.truth.gold import GOLD_PROSE, GoldCaption, PlantedError, read_gold_prose
-from caption.truth.prose.judging import check_evidence
+from caption.truth.prose import check_prose
 from cosfly.products.captions import Claim, Coc, Language
 
 GROUPS = {"numbers": ("num", "halluc", "unit", "words", "ratio"), "sides": ("side", "clock")}
@@ -44,7 +42,7 @@ def claims_problems(coc: Coc, claims: tuple[Claim, ...], facts: Facts, language:
 
 
 def prose_problems(coc: Coc, claims: tuple[Claim, ...], facts: Facts, language: Language) -> list[str]:
-    return check_evidence(coc, facts, EvidenceConfig(), language)
+    return check_prose(coc, facts, language)
 
 
 MODES: dict[str, tuple[Problems, tuple[str, ...]]] = {
@@ -118,14 +116,11 @@ def main() -> None:
     parser.add_argument("mode", choices=MODES)
     parser.add_argument("files", nargs="*", type=Path, default=[GOLD_PROSE])
     parser.add_argument("--only", nargs="+", default=[""], help="captions whose id begins with one of these")
-    parser.add_argument("--unmet", action="store_true", help="as if the wordings of these files had not been met")
     parser.add_argument("--show", action="store_true", help="print what was flagged and what was missed")
     asked = parser.parse_args()
     lines = [line for file in asked.files for line in read_gold_prose(file) if line.id.startswith(tuple(asked.only))]
     if not lines:
         parser.error("no caption to measure")
-    if asked.unmet:
-        forget([file.resolve() for file in asked.files])
     show(measure(lines, *MODES[asked.mode]), in_full=asked.show)
 
 

@@ -22,7 +22,6 @@ MUTUAL = {
     ("caption", "caption/truth"),
     ("caption", "caption/writing"),
     ("caption/teachers", "caption/truth"),
-    ("caption/truth", "caption/truth/prose"),
     ("cosfly/planners", "cosfly/planners/styles"),
     ("cosfly/render", "cosfly/render/zoom"),
     ("release", "release/export"),

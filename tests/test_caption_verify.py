@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 from specimens_captions import write_answers
 
-from caption.schema import EvidenceConfig, WindowConfig
+from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
+from caption.truth.gold import read_gold_prose
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose.judging import check_evidence
+from caption.truth.prose import check_prose, judge_prose
 from caption.windows import cut_windows
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Coc
 from specimens import make_flight
-
-CFG = EvidenceConfig()
 
 # tab:coc_sample_en and tab:coc_sample_zh, trajectory_1776047127_ORI_frame_00004.
 PAPER_EN = Coc(
@@ -71,8 +71,8 @@ FLIGHT = flight_numbers(PAPER_FACTS)
 
 def test_the_papers_own_sample_passes_both_checks():
     assert check_mirror(PAPER_EN, PAPER_ZH, FLIGHT) is None
-    assert check_evidence(PAPER_EN, PAPER_FACTS, CFG, "en") == []
-    assert check_evidence(PAPER_ZH, PAPER_FACTS, CFG, "zh") == []
+    assert check_prose(PAPER_EN, PAPER_FACTS, "en") == []
+    assert check_prose(PAPER_ZH, PAPER_FACTS, "zh") == []
 
 
 def altered(coc: Coc, old: str, new: str) -> Coc:
@@ -136,35 +136,45 @@ def test_another_decision_fails():
     assert check_mirror(PAPER_EN, other, FLIGHT) == "decision"
 
 
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("The horizontal distance increases from 20.0 m to 21.4 m", None),
-        ("The horizontal distance decreases from 20.0 m to 21.4 m", "trend"),
-        ("The horizontal distance is 30.0 m", "number"),
-        ("The altitude is 20.6 m", None),
-        ("The altitude is 29.0 m", "number"),  # a slant range, not an altitude
-        ("The drone climbs steadily", "trend"),
-        ("The drone descends in altitude", None),
-        ("The drone flies at 1.02 m/s", None),
-        ("The drone flies at 5 m/s", "number"),
-        ("The bounding box is 59 x 34 px", "box"),
-        ("The yaw has turned to the right", "side"),
-        ("The yaw has turned 4.8 deg to the left", None),
-        ("The target is occluded", "visibility"),
-        ("The target is visible", None),
-        ("The drone should descend", "decision"),
-        ("The distance has grown by 1.4 m", None),
-        ("The wall is 55 years old", None),  # nothing measured
-    ],
-)
-def test_evidence_check(text, kind):
-    coc = Coc(critical_components=text + ".", reasoning_trace="Nothing more is said here.", flight_decision="ascend")
-    found = check_evidence(coc, PAPER_FACTS, CFG, "en")
-    assert [problem.partition(":")[0] for problem in found] == ([kind] if kind else [])
+def test_plain_prose_is_unread_but_for_what_is_surely_wrong():
+    cases = {
+        "The horizontal distance increases from 20.0 m to 21.4 m": [],
+        "The horizontal distance decreases from 20.0 m to 21.4 m": ["trend"],
+        "The horizontal distance is 47.0 m": ["number"],
+        "The drone flies at 3.3 ft/s, 1.02 m/s": [],  # a foreign unit of the same speed
+        "The drone flies at 20.6 m/s": ["number"],  # a length
+        "The drone at 1.00 m/s is faster than the walker, who does 1.46 m/s": ["comparison"],
+        "The drone at 1.02 m/s is faster than the walker, who does 1.00 m/s": [],
+        "The manual allows no gap of more than 55 m": [],
+        "The bounding box is 59 x 34 px": [],  # an order that nothing here reads
+    }
+    for text, kinds in cases.items():
+        coc = Coc(
+            critical_components=text + ".", reasoning_trace="Nothing more is said here.", flight_decision="ascend"
+        )
+        first, last = judge_prose(coc, PAPER_FACTS, "en")
+        assert [problem.partition(":")[0] for problem in first.problems] == kinds, text
+        assert (first.state, last.state) == ("contradicted" if kinds else "unread", "unread")
+    turned = Coc(
+        critical_components="So it is.",
+        reasoning_trace="The drone should yaw left.",
+        flight_decision="yaw_right_to_follow",
+    )
+    assert judge_prose(turned, PAPER_FACTS, "en")[-1].problems == ("decision: The drone should yaw left.",)
 
 
-# --- seeded corruption of rule-teacher captions ------------------------------------------------------------------------
+@pytest.mark.slow
+def test_true_prose_of_others_is_seldom_flagged():
+    """Of captions that nobody wrote who works on the rules; 1.2 % of 1,974 was the most they might be."""
+    flagged = Counter(
+        bool(check_prose(line.coc, line.facts, line.language))
+        for path in sorted(Path(__file__).parent.glob("prose_*.jsonl"))
+        for line in read_gold_prose(path)
+    )
+    assert flagged[True] <= 0.01 * flagged.total()
+
+
+# --- captions of the rule teacher ------------------------------------------------------------------------
 
 
 def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
@@ -177,45 +187,6 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
                 facts = measure_facts(sample.observed)
                 captions.append((facts, *write_answers(facts, np.random.default_rng([seed, len(captions)]))))
     return captions
-
-
-SIDES = {
-    "en": (("left", "right"), ("increases", "decreases"), ("climbs", "descends"), ("grows", "shrinks")),
-    "zh": (("左", "右"), ("增加", "减小"), ("爬升", "下降"), ("增大", "缩小")),
-}
-
-
-def corruptions(coc: Coc, rng: np.random.Generator, language: str = "en") -> list[Coc]:
-    """Give the text with one side swapped and with one number changed (by a third, or its sign of change swapped)."""
-    text = coc.critical_components
-    made = []
-    edge = r"\b" if language == "en" else ""
-    for one, two in SIDES[language]:
-        for old, new in ((one, two), (two, one)):
-            spots = [m.start() for m in re.finditer(f"{edge}{old}{edge}", text)]
-            if spots:
-                at = int(rng.choice(spots))
-                made.append(text[:at] + new + text[at + len(old) :])
-    numbers = list(re.finditer(r"(?<!\bt)\d+(?:\.\d+)?", text))  # t0 is a frame
-    number = numbers[int(rng.integers(len(numbers)))]
-    digits = len(number.group().partition(".")[2])
-    value = float(number.group())
-    made.append(f"{text[: number.start()]}{value * 1.5 + 7:.{digits}f}{text[number.end() :]}")
-    return [coc.model_copy(update={"critical_components": changed}) for changed in made]
-
-
-def test_corruptions_are_caught_and_clean_captions_raise_no_alarm():
-    captions = clean_captions(20)
-    rng = np.random.default_rng(5)
-    alarms = sum(bool(check_evidence(en, f, CFG, "en") or check_evidence(zh, f, CFG, "zh")) for f, en, zh in captions)
-    assert len(captions) >= 400
-    assert alarms <= 0.01 * len(captions)
-    for language in ("en", "zh"):
-        texts = [(facts, en if language == "en" else zh) for facts, en, zh in captions]
-        planted = [(facts, bad) for facts, coc in texts for bad in corruptions(coc, rng, language)]
-        caught = sum(bool(check_evidence(bad, facts, CFG, language)) for facts, bad in planted)
-        assert len(planted) >= 1000
-        assert caught >= 0.98 * len(planted), f"{language}: {caught} of {len(planted)}"
 
 
 def test_rule_captions_are_one_record_in_two_languages():
@@ -239,8 +210,8 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)
         assert english.flight_decision == chinese.flight_decision == decision
-        assert check_evidence(english, facts, CFG, "en") == []
-        assert check_evidence(chinese, facts, CFG, "zh") == []
+        assert check_prose(english, facts, "en") == []
+        assert check_prose(chinese, facts, "zh") == []
         assert check_mirror(english, chinese, flight_numbers(facts)) is None
         assert load_glossary().actions[decision]["zh"] in chinese.reasoning_trace
 

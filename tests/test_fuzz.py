@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toy_readers import HONEST
 
-from caption.truth.prose.numerals import masked
 from cosfly.app.settings import RunConfig
 from cosfly.chat.contract import Request
 from cosfly.chat.protocol import base_url, read_completion, read_models
@@ -233,10 +232,3 @@ def test_any_checksums_name_files_below_their_folder(tmp_path_factory, lines):
     names: list[str] = []
     assert outcome_of(lambda: names.extend(read_checksums(folder))) is None
     assert all((folder / name).resolve().is_relative_to(folder.resolve()) for name in names)
-
-
-@settings(max_examples=EXAMPLES, derandomize=True)
-@given(TEXTS | st.text(st.sampled_from("#0.5 mtTx-、九十百分之left(")), st.sampled_from(["en", "zh"]))
-def test_every_mark_of_a_number_in_prose_stands_for_its_digits(text, language):
-    hidden, runs = masked(text, language)
-    assert hidden.count("#") == len(runs)

@@ -1,7 +1,7 @@
 """Claims: what a sentence states, in a form that can be compared exactly with the facts.
 
 A claim names a fact by its reference (references.py) and gives its value. Teachers that cannot write slots write claims beside
-their prose; the reader of prose makes them from sentences. One comparison serves both.
+their prose, a reader writes them for prose of others. One comparison serves both.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from caption.truth.coverage import cover
 from caption.truth.facts import Facts
 from caption.truth.holding import number_holds, word_holds
 from caption.truth.numerals import Numeral
-from caption.truth.prose.judging import judge_sentences
 from caption.truth.references import (
     MOTIONS,
     STEPS,
@@ -26,10 +25,10 @@ from caption.truth.references import (
     look_up,
     parse_reference,
 )
-from caption.truth.said import SCENE, Said
+from caption.truth.said import SCENE
 from caption.truth.sentences import Judged
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
-from caption.truth.stated import Stated, read_stated
+from caption.truth.stated import read_stated
 from cosfly.products.actions import kin_of
 from cosfly.products.answer_text import normalize_action
 from cosfly.products.captions import Claim, Coc, Language, SentenceState
@@ -53,46 +52,10 @@ def judge_claims(
         own = [claim for claim in claims if of_names[claim.sentence] == name]
         beside = [claim for claim in claims if claim not in own and _is_beside(of_names[claim.sentence], name)]
         judged.append(_judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language))
-    judged = [
-        _with_read(one, [claim for claim in claims if of_names[claim.sentence] == one.name], read, facts, language)
-        for one, read in zip(judged, judge_sentences(coc, facts, cfg, language), strict=True)
-    ]
     if stray and judged:
         first = judged[0]
         judged[0] = Judged(first.name, first.text, "contradicted", (*first.problems, *dict.fromkeys(stray)))
     return judged
-
-
-# What the reader of prose contradicts -> the words of a sentence that it is about.
-_ABOUT = {"trend": "course", "side": "side", "comparison": "pace", "state": "motion", "visibility": "seen"}
-
-
-def _with_read(one: Judged, claims: Sequence[Claim], read: Judged, facts: Facts, language: Language) -> Judged:
-    """Add what the reader of prose contradicts in a sentence, unless its claims say what is meant."""
-    kinds = {problem.partition(":")[0] for problem in read.problems}
-    if not kinds:
-        return one
-    stated, said = read_stated(one.text, language), Said(claims, facts, language)
-    explained = {kind for kind, dimension in _ABOUT.items() if _say_the_same(dimension, stated, said)}
-    if claims and all(claim.modality != "observed" for claim in claims):
-        explained |= set(_ABOUT)  # it plans or supposes
-    if all(said.covers_numeral(numeral, stated) for numeral in stated.numerals):
-        explained.add("number")  # each is compared already, with the fact that its claim names
-    if said.claims_shares(stated):
-        explained.add("ratio")
-    if not any(pole.dimension == "seen" for pole in stated.poles):
-        explained.add("visibility")
-    if not kinds - explained:
-        return one
-    problems = (*one.problems, *(f"text is not true: {kind}" for kind in sorted(kinds - explained)))
-    return Judged(one.name, one.text, "contradicted", problems)
-
-
-def _say_the_same(dimension: str, stated: Stated, said: Said) -> bool:
-    """Tell whether a sentence's words of one kind are those of its claims, which say but one thing of that kind."""
-    told = {pole.value for pole in stated.poles if pole.dimension == dimension and not pole.is_negated}
-    claimed = said.plain_words(dimension)
-    return len(claimed) == 1 and (told == claimed or (not told and claimed == {"steady"}))
 
 
 CUT_OTHERWISE = 2  # by so many sentences a writer may count differently

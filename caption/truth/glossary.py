@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +32,11 @@ class _Spellings(Config):
     zh: list[str] = Field(description="Chinese")
 
 
+class _Factors(Config):
+    en: dict[str, dict[str | int | float, str]] = Field(description="unit -> factor to it -> English spellings")
+    zh: dict[str, dict[str | int | float, str]] = Field(description="and Chinese")
+
+
 class _Opposites(Config):
     positive: _Spellings = Field(description="one side")
     negative: _Spellings = Field(description="the other side")
@@ -46,6 +52,7 @@ class _GlossaryFile(Config):
     schema_version: str = Field(description="version of this layout")
     visibility: dict[str, _Pair] = Field(description="visibility words")
     units: dict[str, _Spellings] = Field(description="unit -> spellings, the first is written")
+    written_units: _Factors = Field(description="every way a unit is written in running text")
     polarity: dict[str, _Opposites] = Field(description="opposites")
     negations: _Spellings = Field(description="words that turn a term round")
     not_terms: _Spellings = Field(description="spellings that hold a term but do not mean it")
@@ -54,6 +61,13 @@ class _GlossaryFile(Config):
     )
     states: _Spellings = Field(description="words beside slots for what a slot can say")
     idioms: _Spellings = Field(description="patterns in which an opposite states nothing of this window")
+
+
+class Unit(NamedTuple):
+    """A unit as it is written: its name among ours, and the factor to it."""
+
+    name: str
+    factor: float
 
 
 class Number(NamedTuple):
@@ -186,7 +200,23 @@ def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], langu
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
 
+@cache
+def _file() -> _GlossaryFile:
+    return build(_GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE)
+
+
+@cache
+def written_units(language: Language) -> dict[str, Unit]:
+    """Give every spelling of a unit in running text, foreign ones too."""
+    units: dict[str, Unit] = {}
+    for name, factors in getattr(_file().written_units, language).items():
+        for factor, spellings in factors.items():
+            for spelling in filter(None, map(str.strip, spellings.split(","))):
+                units.setdefault(spelling, Unit(name, float(factor)))
+    return units
+
+
 @in_place.kept()
 def load_glossary() -> Glossary:
     """Read the glossary, and put the actions in use into it."""
-    return Glossary(build(_GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE), actions_in_use())
+    return Glossary(_file(), actions_in_use())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
-from caption.truth.prose.lexicon import Unit, load_lexicon
+from caption.truth.glossary import Unit, written_units
 from cosfly.products.captions import Language
 
 _UNIT_GROUPS = ("unit", "half_of", "word_of")
@@ -175,14 +175,15 @@ _DIGITS = r"(?:(?<![A-Za-z0-9_.])|(?<=\d[x×]))[-+−]?\d+(?:\.\d+)?(?!\d)"
 @cache
 def _pattern(language: Language) -> re.Pattern[str]:
     # A unit in letters ends where the word does: "3 m", but not "3 more".
-    unit = load_lexicon(language).unit_pattern
+    unit = "|".join(re.escape(spelling) for spelling in sorted(written_units(language), key=len, reverse=True))
+    unit = f"(?:{unit})"
     groups = [f"(?P<{name}>{unit})(?:(?<=[^A-Za-z])|(?![A-Za-z]))" for name in _UNIT_GROUPS]
     return re.compile(_english_numerals(*groups) if language == "en" else _chinese_numerals(*groups), re.IGNORECASE)
 
 
 def read_numerals(text: str, language: Language) -> list[Numeral]:
     """Find the numerals of a text that measure something: no durations, no counts of frames, no small counts without a unit."""
-    units = load_lexicon(language).units
+    units = written_units(language)
     announced = _ANNOUNCED.search(text)
     found: list[Numeral] = []
     for match in _pattern(language).finditer(text):
@@ -193,7 +194,7 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
             unit = ""  # of a product, "34 × 59 px"
         if unit in _NOT_MEASURED or _SQUARED.match(after):
             continue
-        if language == "zh" and unit in ("m", "deg") and "每秒" in re.split("[，；。：、]", before)[-1]:
+        if language == "zh" and unit in ("m", "deg") and "每秒" in re.split("[，；。：、,;:]", before)[-1]:
             unit = {"m": "mps", "deg": "dps"}[unit]
         if language == "zh" and (unit, factor) == ("m", 1000.0) and _HOURLY.search(before):  # 时速 26 公里
             unit, factor = "mps", 1 / 3.6

@@ -6,19 +6,18 @@ where a stride left them out) is not judged.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from caption.label_motion import LabelMotion, label_motion
-from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
+from caption.schema import FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
 from caption.truth.actions import label_of, measure, verdict_of
-from caption.truth.facts import Facts, measure_facts
+from caption.truth.facts import measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose.judging import check_evidence
+from caption.truth.prose import check_prose
 from caption.windows import cut_future, frames_of
 from cosfly.products.actions import actions_in_use
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
@@ -110,10 +109,7 @@ def _text_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
     facts = measure_facts(window, caption.picture_px)
     lies = []
     for language, coc in caption.answers.items():
-        found = [one for one in check_evidence(coc, facts, EvidenceConfig(), language) if not _is_of_boxes(one, facts)]
-        # Their numbers were filled in; of a state ("nearly stands, 0.13 m/s") the words are a template's.
-        if caption.writing == "slots":
-            found = [one for one in found if not one.startswith("state:")]
+        found = check_prose(coc, facts, language)
         allowed = caption.contradicted.get(language, 0)
         if caption.writing == "claims":  # claims say what a word was meant of, and are not released
             allowed += 1
@@ -126,16 +122,6 @@ def _text_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
         if reason is not None:
             lies.append(Lie("languages", caption.sample_id, f"another {reason}", "the same in English and in Chinese"))
     return lies
-
-
-def _is_of_boxes(problem: str, facts: Facts) -> bool:
-    """Tell whether a sentence that is doubted for its boxes names sizes of the window's boxes alone: "from 8 x 11 to 6 x 14 px" is no
-    growth and no shrinking, and a teacher who fills slots may call it either."""
-    kind, _, text = problem.partition(":")
-    sizes = {size for size in (*facts.box_width_px, *facts.box_height_px) if size is not None}
-    named = {int(number) for number in re.findall(r"(?<![\d.])\d+(?![\d.])", text)}
-    is_of_pixels = kind == "box" or (kind == "trend" and ("px" in text or "像素" in text))
-    return is_of_pixels and bool(named) and named <= sizes
 
 
 # --- labels -----------------------------------------------------------------------------------------------------------

@@ -168,23 +168,6 @@ class Said:
         multiple = 1.0 + value / 100.0
         return not shares or any(is_share(numeral, both_ways(multiple, numeral), stated) for numeral in shares)
 
-    def plain_words(self, dimension: str) -> set[str]:
-        """Give what observed claims say of a dimension in words of their own: the trends as they stand, else their opposites."""
-        if dimension == "course":
-            courses = {"increasing": "up", "decreasing": "down"}
-            trends = [str(c.value) for c in self.words if c.quantity[:6] == "trend:" and c.modality == "observed"]
-            return {courses.get(trend, trend) for trend in trends}
-        return {value for of, value in self.observed if of == dimension}
-
-    def claims_shares(self, stated: Stated) -> bool:
-        """Tell whether each share and multiple of a sentence is that of a growth or a ratio that is claimed."""
-        shares = [n for n in stated.numerals if n.kind == "ratio" or n.unit in ("percent", "times")]
-        claimed = [abs(float(c.value)) for c in self.numbers if c.unit == "times"]
-        for claim in self.numbers:
-            if claim.unit == "percent":
-                claimed += [abs(float(claim.value)) / 100.0, 1.0 + float(claim.value) / 100.0]
-        return all(is_share(numeral, claimed, stated) for numeral in shares)
-
     def absent_scenery(self, stated: Stated) -> Iterator[str]:
         """Yield the numbers that are claimed of the scene and do not stand in the sentence, in digits or in words."""
         written = {value for n in numbers_in(stated.text, self.language) for value in (n, 100.0 * n, 10.0 * n)}

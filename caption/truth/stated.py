@@ -121,7 +121,7 @@ class Lexicon:
             re.compile("|".join(f"(?P<{name}>{words})" for name, of, words in parts if of == dimension), re.I)
             for dimension in file.poles
         ]
-        self._subjects = {who: self._any(getattr(words, language)) for who, words in file.subjects.items()}
+        self.subjects = {who: self._any(getattr(words, language)) for who, words in file.subjects.items()}
         self._actions = {action: self._any(getattr(words, language)) for action, words in file.actions.items()}
         self._named = {action: self._any(getattr(words, language)) for action, words in file.named.items()}
         plans = "|".join(getattr(file.plans, language))
@@ -218,7 +218,7 @@ class Lexicon:
             near = re.split(r"[，；：。]", text[max(0, start - 22) : start])[-1]
             if "的" not in near[-6:]:
                 return ""
-        found = [(match.start(), who) for who, words in self._subjects.items() for match in words.finditer(near)]
+        found = [(match.start(), who) for who, words in self.subjects.items() for match in words.finditer(near)]
         if not found:
             return ""
         named = min(found)[1] if self.language == "en" else max(found)[1]
@@ -236,10 +236,10 @@ class Lexicon:
                 or re.search(r"比(.{1,20})$", clause)
                 or (re.match("比(.{1,4}?)(?:（[^（）]*）)?.{0,1}[快慢]", rest))
             )
-        for who, words in self._subjects.items():
+        for who, words in self.subjects.items():
             if against and words.search(against[1].split(",")[0]):
                 return ("drone" if who == "target" else "target"), True
-        named = [who for who, words in self._subjects.items() if words.search(clause)]
+        named = [who for who, words in self.subjects.items() if words.search(clause)]
         return (named[0] if len(named) == 1 else ""), False
 
 
@@ -254,6 +254,16 @@ def _frames_round(sentence: str, start: int, end: int) -> frozenset[int]:
 @cache
 def lexicon_of(language: Language) -> Lexicon:
     return Lexicon(build(_StatedFile, read_yaml(STATED_FILE), STATED_FILE), language)
+
+
+def subject_before(text: str, end: int, language: Language) -> str:
+    """Give who was named last before a place of a text: drone | target, "" where nobody was."""
+    found = [
+        (match.start(), who)
+        for who, words in lexicon_of(language).subjects.items()
+        for match in words.finditer(text, 0, end)
+    ]
+    return max(found)[1] if found else ""
 
 
 @lru_cache(maxsize=4096)

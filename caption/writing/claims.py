@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
+from caption.truth.glossary import written_units
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose.lexicon import load_lexicon
 from caption.truth.references import QUANTITIES
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
@@ -126,7 +126,7 @@ def _claim(item: Any) -> Claim | str:
     if not isinstance(item, dict):
         return "it must be an object"
     given = {name: None if name in ("at", "unit") and text in ("", "null") else text for name, text in item.items()}
-    unit = load_lexicon("en").units.get(str(given.get("unit")).lower())
+    unit = written_units("en").get(str(given.get("unit")).lower())
     if given.get("unit") not in UNITS and unit is not None and unit.factor == 1.0:
         given["unit"] = unit.name  # "m/s"
     if given.get("at") is not None:

@@ -10,8 +10,6 @@ import re
 
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
-from caption.truth.prose.numerals import masked
-from caption.truth.prose.reading import read_form
 from caption.writing.contract import Refused
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Language
@@ -88,23 +86,32 @@ def holds_state(text: str, language: Language) -> bool:
     return bool(glossary.states(glossary.without_idioms(text, language), language))
 
 
-# What a text says to do -> the decisions that say the opposite.
-_OPPOSITE = {
-    "slow": ("speed_up",),
-    "fast": ("slow_down", "hover"),
-    "ascend": ("descend",),
-    "descend": ("ascend",),
-    "forward": ("move_backward",),
-    "backward": ("move_forward",),
-    "hover": ("speed_up",),
+# What a text asks for -> how, and the decisions that say the opposite.
+_ASKED = {
+    "slow": (r"slow(?:ing)?(?: down)?|brak(?:e|ing)|decelerat(?:e|ing)", ("speed_up",)),
+    "fast": (r"speed(?:ing)? up|accelerat(?:e|ing)|(?:fly|flying|go|going) faster", ("slow_down", "hover")),
+    "ascend": (r"ascend(?:ing)?|climb(?:ing)?", ("descend",)),
+    "descend": (r"descend(?:ing)?|sink(?:ing)?", ("ascend",)),
+    "forward": (r"(?:move|moving|fly|flying|push|pushing) (?:forwards?|ahead)|advanc(?:e|ing)", ("move_backward",)),
+    "backward": (r"(?:back|backing|move|moving) (?:away|off|backwards?)|retreat(?:ing)?", ("move_forward",)),
+    "hover": (r"hover(?:ing)?|hold(?:ing)? (?:its )?position", ("speed_up",)),
 }
+_UNASKED = re.compile(
+    r"\b(?:if|unless|instead|rather|without|not|no|never|before|until|would|could|may|might)\b|n't\b", re.I
+)
 
 
 def decisions_opposed(text: str) -> tuple[str, ...]:
     """Give the decisions that an English sentence of a reasoning plainly argues against: "braking is the safe choice" against speed_up."""
-    form = read_form(masked(text, "en")[0], "en", "", True)
-    planned = {one.action for one in form.actions if one.force == "directive" and not one.side}
-    return tuple(decision for name in sorted(planned) for decision in _OPPOSITE.get(name, ()))
+    if _UNASKED.search(text):
+        return ()
+    asked = r"\b(?:should|must|shall|ought to|needs? to|best to)(?: \w+)? (?:{0})\b|^(?:{0})\b[^,;.]{{0,20}} is (?:the )?(?:safe|best|right|wise|only)"
+    return tuple(
+        decision
+        for words, against in _ASKED.values()
+        if re.search(asked.format(words), text.strip(), re.I)
+        for decision in against
+    )
 
 
 def decisions_named(text: str) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose.judging import judge_sentences
+from caption.truth.prose import judge_prose
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from cosfly.products.answer_text import Parsed
@@ -15,7 +15,7 @@ from cosfly.products.captions import Language
 
 
 class Prose:
-    """The teacher writes as it likes; sentences are read for what contradicts the facts."""
+    """The teacher writes as it likes; its sentences are unread, but for what is plainly false."""
 
     system = "system_prose_en"
     mirror_system = "mirror_system"
@@ -37,4 +37,4 @@ class Prose:
         return Refused(problem, f"The Chinese text is not that of the English one: {problem}.", draft)
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
-        return judge_sentences(draft.coc, facts, cfg, language)
+        return judge_prose(draft.coc, facts, language)
