@@ -25,8 +25,9 @@ from zlib import crc32
 
 from crashes import run, sweep
 
-from cosfly.app import ahead
 from cosfly.cli import app
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.stage import warm_up
 
 if TYPE_CHECKING:
     from teacher_server import TeacherServer
@@ -78,9 +79,7 @@ def load_all() -> None:
             if not module.name.endswith("__main__"):
                 with suppress(ImportError):  # of an extra
                     importlib.import_module(module.name)
-    ahead.compile_planner("foresight")
-    ahead.compile_render()
-    ahead.compile_inspection()
+    warm_up(PlanConfig(planner="foresight"))
 
 
 def _base(place: Place) -> Path:

@@ -2,15 +2,11 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import cosfly
-from cosfly.app import ahead
 from cosfly.work import compiled
 
 DAY_S = 86400.0
@@ -75,70 +71,31 @@ def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
     assert compiled.numba.config.CACHE_DIR == "as it was"
 
 
-# --- ahead of use -----------------------------------------------------------------------------------------------------
-
-
-FOUND = """
+COUNT = """
+import sys, time
 from numba.core import event
 class Compiled(event.Listener):
-    def on_start(self, e): print("compiles", e.data["dispatcher"].py_func)
-    def on_end(self, e): pass
+    def on_start(self, e): print("compiles", e.data["dispatcher"].py_func.__name__)
+    def on_end(self, e): time.sleep(1.0)  # so that the other process comes meanwhile
 event.register("numba:compile", Compiled())
-import cosfly.planners.stage as s
-s.warm_up(s.PlanConfig(planner='muco'))
-from cosfly.app import ahead
-ahead.compile_render()
-ahead.compile_inspection()
-print("done")
+from cosfly.upper import g
+print(g(7))
 """
 
 
-@pytest.mark.slow
-def test_what_is_compiled_ahead_is_found_by_the_stages(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # for the spare process
-    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(ahead, "WAIT_MAX_S", 900.0)
-    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
-        for stage in ("maps", *ahead.STAGES, "release"):
-            wait(stage)
-            assert stage not in ahead.STAGES or (tmp_path / ahead._mark(stage, "muco")).exists()
-    done = subprocess.run([sys.executable, "-c", FOUND], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["done"]
-    monkeypatch.setattr(ahead.subprocess, "Popen", None)
-    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:  # nothing is started where it was done before
-        wait("plan")
-
-
-def test_the_spare_process_ends_with_the_one_that_started_it(tmp_path):
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "cosfly.app.ahead", "muco"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as spare:
-        spare.stdin.close()
-        assert spare.wait(60) == 1
-    assert not (tmp_path / ahead._mark("plan", "muco")).exists()
-
-
-def test_a_spare_process_that_takes_too_long_is_ended(tmp_path, monkeypatch):
-    started, popen = [], subprocess.Popen
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(ahead, "WAIT_MAX_S", 0.0)
-    monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[0])
-    with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
-        wait("plan")
-        assert started[0].wait(60) == -signal.SIGKILL
-
-
-def test_nothing_is_compiled_ahead_where_no_stage_needs_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(ahead.subprocess, "Popen", None)
-    with ahead.compiled_ahead("muco", {"maps", "release"}) as wait:
-        wait("plan")
-
-
-def test_a_run_goes_on_without_a_spare_process(tmp_path, monkeypatch):
-    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path)
-    for broken in ("/nowhere/python", "false"):
-        monkeypatch.setattr(ahead.sys, "executable", broken)
-        with ahead.compiled_ahead("muco", ahead.STAGES) as wait:
-            wait("plan")
+def test_of_two_processes_one_compiles_and_the_other_loads(tmp_path):
+    package = tmp_path / "src" / "cosfly"
+    (package / "work").mkdir(parents=True)
+    for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
+        shutil.copy(Path(cosfly.__file__).parent / name, package / name)
+    (package / "upper.py").write_text(
+        "from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return 2 * x\n\n\n"
+        "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+    )
+    env = os.environ | {"PYTHONPATH": str(package.parent), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    both = [
+        subprocess.Popen([sys.executable, "-c", COUNT], env=env, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    printed = [process.communicate()[0].splitlines() for process in both]
+    assert sorted(line for lines in printed for line in lines) == ["14", "14", "compiles f", "compiles g"]

@@ -25,7 +25,6 @@ import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
 from cosfly.app import estimate
-from cosfly.app.ahead import compiled_ahead
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.look.gallery import contact_sheet, preview_gif
@@ -225,12 +224,7 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
     for stage in todo:
         refuse_link(out / stage.name)
     with _run_folder(cfg, out):
-        undone = {stage.name for stage in todo if not (out / stage.name / "manifest.json").exists()}
-        results = []
-        with compiled_ahead(cfg.plan.planner, undone) as wait_for_compiled:
-            for number, stage in enumerate(todo, 1):
-                wait_for_compiled(stage.name)
-                results.append(_do(stage, out, f"{number}/{len(todo)}", left))
+        results = [_do(stage, out, f"{number}/{len(todo)}", left) for number, stage in enumerate(todo, 1)]
         tree = out / "render"
         if not _is_summed_up(results, out) or not (out / "preview.gif").exists():
             contact_sheet(tree, out / "contact_sheet.png")
