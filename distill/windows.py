@@ -8,17 +8,297 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, get_args
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict, get_args
 
 import cv2
 import numpy as np
+import pyarrow as pa
 
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError
-from cosfly.look.frame_views import scaled_size
-from cosfly.products.captions import Language
-from distill.window_sources import open_source
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, nearest
+from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
+from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
+from cosfly.products.frames import frame_name
+from cosfly.products.places import stand
+from cosfly.products.playback import Flight, read_flight
+from cosfly.reading.arrays import parse_picture
+from cosfly.reading.documents import read_object
+from cosfly.reading.files import check_stays_below
+from cosfly.reading.tables import TableRows, open_table, rows_of
+from cosfly.work.store import inside
+
+# What is known of each frame, as the columns of a release are called: members of a struct, "" for a number.
+FACTS: dict[str, tuple[str, ...]] = {
+    "time_s": ("",),
+    "pose": ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg"),
+    "intrinsics": ("fx", "fy", "cx", "cy"),
+    "target": ("x_m", "y_m", "z_m"),
+    "target_uv": ("u_px", "v_px"),
+    "target_bbox": ("xmin_px", "ymin_px", "xmax_px", "ymax_px"),
+    "target_mask_bbox": ("xmin_px", "ymin_px", "xmax_px", "ymax_px"),
+    "target_depth_m": ("",),
+    "target_in_view": ("",),
+    "target_visible": ("",),
+    "visibility": ("",),
+}
+FLAGS = ("target_in_view", "target_visible")
+PLACE = ("run", "town", "trajectory", "variant")
+
+
+@dataclass(frozen=True)
+class WindowPlace:
+    """A window before it is read: its flight, its frames, and where its caption and they stand in the source."""
+
+    sample_id: str
+    flight: tuple[str, ...]
+    window: tuple[int, ...]
+    where: Any
+
+
+@dataclass(frozen=True)
+class ReadWindow:
+    """What a source knows of a window. pictures: of its frames, each (h, w, 3). size_px: (width, height) of a picture as the teacher saw it."""
+
+    pictures: list[np.ndarray]
+    facts: dict[str, np.ndarray]
+    prompt: dict[str, str]
+    caption: dict[str, str]
+    size_px: tuple[int, int]
+
+
+class WindowSource(Protocol):
+    def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]: ...
+
+    def read(self, place: WindowPlace) -> ReadWindow: ...
+
+
+def open_source(source: Path, captions: Path | None, language: Language, split: str | None) -> WindowSource:
+    """Open a release, a run, or a playback tree with its captions; arguments as of `Windows`.
+
+    Raises:
+        ConfigError: a split of what has none. InputError: it is none of the three.
+    """
+    # A run is taken as its tree, which holds all of it, unless a split of its release is asked for.
+    released = [source, source / "dataset", *([source / "release/dataset"] if split else [])]
+    for folder in released if captions is None else ():
+        if (folder / "release.json").is_file():
+            return _Release(folder, language, split)
+    if split is not None:
+        raise ConfigError(
+            "only a release has splits", where=source, got=f"split={split!r}",
+            fix="build one of it: cosfly release build",
+        )  # fmt: skip
+    if captions is None and (source / "render").is_dir():
+        source, captions = source / "render", source / "caption/captions.jsonl"
+        check_stays_below(captions, captions.parent)
+    if captions is None:
+        raise InputError(
+            "neither a release nor a run folder", where=source, expected="release.json, or render/ and caption/ in it",
+            fix="of a playback tree give the captions too: Windows(tree, captions)",
+        )  # fmt: skip
+    return _Tree(source, captions, language)
+
+
+def _prompt(text: Prompt, size_px: tuple[int, int], language: Language) -> dict[str, str]:
+    told = text.told(Pictures(("rgb",), size_px).sentence(language))
+    return {"system": told.system, "user": told.user}
+
+
+# --- a playback tree --------------------------------------------------------------------------------------------------
+
+
+class _Tree:
+    """A playback tree and its captions, whose texts stay in memory (some 4 kB a window; a release reads them when they are asked for)."""
+
+    def __init__(self, tree: Path, captions: Path, language: Language) -> None:
+        self.tree, self.captions, self.language = tree, captions, language
+        self.run = tree.absolute().parent.name
+        self._flights: dict[Path, Flight] = {}
+
+    def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]:
+        whole: dict[Path, set[int]] = {}
+        for caption in read_captions(self.captions):
+            folder = stand(self.tree, f"{caption.town}/{caption.trajectory}/{caption.variant}")
+            if folder not in whole:
+                whole[folder] = _frames_in(folder)
+            if caption.status != "accepted":
+                left_out[f"dropped_{caption.drop_reason}"] += 1
+            elif getattr(caption, self.language) is None or self.language not in caption.prompt:
+                left_out[f"no_{self.language}"] += 1
+            elif not whole[folder].issuperset(caption.window):
+                left_out["missing_frame"] += 1
+            else:
+                flight = (self.run, *folder.parts[-3:])
+                prompt = _prompt(caption.prompt[self.language], caption.picture_px, self.language)
+                where = folder, prompt, self._texts(caption), caption.picture_px
+                yield WindowPlace(caption.sample_id, flight, tuple(caption.window), where)
+
+    def _texts(self, caption: Caption) -> dict[str, str]:
+        answer = getattr(caption, self.language).model_dump()
+        return {**answer, "label": caption.label or "", "verdict": caption.verdict or ""}
+
+    def read(self, place: WindowPlace) -> ReadWindow:
+        folder, prompt, caption, size_px = place.where
+        if folder not in self._flights:
+            self._flights[folder] = read_flight(folder, strict=False)
+        pictures = [read_view(folder / frame_name(index), "rgb") for index in place.window]
+        return ReadWindow(pictures, facts_of(self._flights[folder], place.window), prompt, caption, size_px)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_flights": {}}  # a process reads what it needs
+
+
+def _frames_in(folder: Path) -> set[int]:
+    """The frames of a flight that have a picture; none where it has no trajectory.json."""
+    if not (folder / "trajectory.json").is_file():
+        return set()
+    frames = (folder / frame_name(0)).parent.glob("frame_*")
+    return {int(f.name[6:]) for f in frames if f.name[6:].isdecimal() and (f / VIEW_FILES["rgb"]).is_file()}
+
+
+def facts_of(flight: Flight, window: Sequence[int]) -> dict[str, np.ndarray]:
+    """Give FACTS of some frames of a flight.
+
+    Raises:
+        InputError: it has not so many frames.
+    """
+    if max(window) >= len(flight):
+        raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
+    at = list(window)
+    cameras = np.array([flight.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for i in at])
+    mask = flight.target_mask_bbox
+    values = {
+        "time_s": flight.time_s[at],
+        "pose": np.hstack([flight.positions_m[at], flight.rotations_deg[at]]),
+        "intrinsics": cameras,
+        "target": flight.targets_m[at],
+        "target_uv": flight.target_uv[at],
+        "target_bbox": flight.target_bbox[at],
+        "target_mask_bbox": np.full((len(at), 4), np.nan) if mask is None else mask[at],
+        "target_depth_m": flight.target_depth_m[at],
+        "visibility": flight.visibility[at],
+    }
+    flags = {"target_in_view": flight.target_in_view[at], "target_visible": flight.target_visible[at]}
+    return {name: np.array(value, dtype=np.float64) for name, value in values.items()} | {
+        name: np.array(value, dtype=bool) for name, value in flags.items()
+    }
+
+
+# --- a release --------------------------------------------------------------------------------------------------------
+
+
+class _Release:
+    """A release: rows by number, captions read when they are asked for."""
+
+    def __init__(self, folder: Path, language: Language, split: str | None) -> None:
+        self.folder, self.language = folder, language
+        record = read_object(folder / "release.json", what="release", tree=folder)
+        shards = record.get("shards")
+        if not isinstance(shards, list) or not all(
+            isinstance(s, dict) and isinstance(s.get("path"), str) and isinstance(s.get("split"), str) for s in shards
+        ):
+            raise InputError(
+                "not the record of a release", where=folder / "release.json", expected="shards with path and split"
+            )
+        splits = sorted({shard["split"] for shard in shards})
+        if split is not None and split not in splits:
+            raise ConfigError(
+                f"no such split{nearest(split, splits)}", where=folder, got=split, expected=", ".join(splits)
+            )
+        self._names = [shard["path"] for shard in shards if split in (None, shard["split"])]
+        texts = [f"caption_{language}_{field}" for field in FIELDS]
+        prompts = [f"system_{language}", f"prompt_{language}"]
+        self._columns = ["image", *FACTS, *texts, *prompts, "caption_picture_px", "label", "verdict"]
+        self._shards = [TableRows(inside(folder, name), self._columns) for name in self._names]
+
+    def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]:
+        text = f"caption_{self.language}_reasoning_trace"
+        light = [*PLACE, "frame_index", "sample_id", "caption_window", text]
+        for shard, name in enumerate(self._names):  # a flight stands in one shard, whole
+            path = inside(self.folder, name)
+            _check_columns(path, self.folder, [*self._columns, *light])
+            rows: dict[tuple[str, ...], dict[int, int]] = {}
+            captioned: list[tuple[tuple[str, ...], str, tuple[int, ...]]] = []
+            for number, row in enumerate(rows_of(path, light, tree=self.folder)):
+                flight = tuple(row[part] for part in PLACE)
+                if None in (*flight, row["sample_id"], row["frame_index"]):
+                    raise InputError("a frame without a name", where=f"{path}: row {number}", got=str(flight))
+                rows.setdefault(flight, {})[row["frame_index"]] = number
+                if row[text] and row["caption_window"]:
+                    captioned.append((flight, row["sample_id"], tuple(row["caption_window"])))
+                elif row["caption_window"]:
+                    left_out[f"no_{self.language}"] += 1
+            for flight, sample_id, window in captioned:
+                if all(index in rows[flight] for index in window):
+                    yield WindowPlace(
+                        sample_id, flight, window, (shard, tuple(rows[flight][index] for index in window))
+                    )
+                else:
+                    left_out["missing_frame"] += 1
+
+    def read(self, place: WindowPlace) -> ReadWindow:
+        shard, numbers = place.where
+        rows = [self._shards[shard][number] for number in numbers]
+        pictures = [_picture(row, f"{self._names[shard]}: {place.sample_id}") for row in rows]
+        facts = {name: _column(rows, name, members) for name, members in FACTS.items()}
+        last, language = rows[-1], self.language
+        if not all(isinstance(last[f"{part}_{language}"], str) for part in ("system", "prompt")):
+            raise InputError("a caption without its prompt", where=f"{self._names[shard]}: {place.sample_id}")
+        prompt = Prompt(system=last[f"system_{language}"], user=last[f"prompt_{language}"])
+        width_px, height_px = (last["caption_picture_px"] or pictures[-1].shape[1::-1])[:2]
+        caption = {field: last[f"caption_{language}_{field}"] or "" for field in FIELDS}
+        told = {name: last[name] or "" for name in ("label", "verdict")}
+        size_px = (width_px, height_px)
+        return ReadWindow(pictures, facts, _prompt(prompt, size_px, language), caption | told, size_px)
+
+
+# Types of the columns that are read: all others are texts.
+TYPES: dict[str, pa.DataType] = {
+    name: pa.bool_()
+    if name in FLAGS
+    else pa.float64()
+    if members == ("",)
+    else pa.struct([(m, pa.float64()) for m in members])
+    for name, members in FACTS.items()
+} | {
+    "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
+    "frame_index": pa.int32(),
+    **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.field("element", pa.int32()))),
+}
+
+
+def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
+    """Check that a shard has columns as they are read.
+
+    Raises:
+        InputError: names those that are missing or of another type.
+    """
+    with open_table(path, tree=tree) as table:
+        found = {field.name: field.type for field in table.schema_arrow}
+    if wrong := [name for name in wanted if found.get(name) != TYPES.get(name, pa.string())]:
+        raise InputError(
+            "columns are missing or of another type", where=path, got=", ".join(wrong)[:200],
+            fix="build the release with this version of cosfly, or get it with --modality rgb",
+        )  # fmt: skip
+
+
+def _picture(row: Mapping[str, Any], where: str) -> np.ndarray:
+    data = row["image"] and row["image"]["bytes"]
+    if not data:
+        raise InputError("a frame without its picture", where=where, fix="get the release with --modality rgb")
+    return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
+
+
+def _column(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:
+    if name in FLAGS:
+        return np.array([bool(row[name]) for row in rows])
+    if members == ("",):
+        return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
+    nothing = dict.fromkeys(members, np.nan)
+    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
+
 
 if TYPE_CHECKING:
     import torch.utils.data

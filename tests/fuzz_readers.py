@@ -94,15 +94,15 @@ from distill.inference import merge
 from distill.inference.outcome import make_prediction
 from distill.prepare import dual_track
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
+from distill.prepare.dual_track import RECORD as TRACKS
+from distill.prepare.dual_track import read_track_samples
 from distill.prepare.sources import Source as Prepared
+from distill.prepare.stage import PrepareConfig
 from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
 from distill.student.features import read_features
-from distill.student.taught import taught_by
-from distill.tracks import RECORD as TRACKS
-from distill.tracks import read_track_samples
+from distill.training.stage import taught_by
 from distill.windows import Windows
 from release.export import stage as export
 from release.export.captions import export as export_captions

@@ -15,8 +15,8 @@ from cosfly.products.splits import Split
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source
+from distill.prepare.stage import PrepareConfig
 from distill.schema import Sample, SourceTree, write_training_set
 
 WINDOW = 5

@@ -24,7 +24,7 @@ from cosfly.products.predictions import Prediction
 from cosfly.work.stage_folder import Failed
 from distill.inference import stage as infer
 from distill.inference.outcome import Answered, make_prediction, prediction_of
-from distill.prepare.samples import PrepareConfig, make_sample
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.package import stage as package
 from release.package.captions import index_captions, released

@@ -21,7 +21,7 @@ from cosfly.errors import ConfigError, ResumeError
 from cosfly.products.captions import OWN_PROMPTS, read_captions
 from cosfly.work import in_place
 from distill.schema import open_split
-from distill.student.taught import taught_by
+from distill.training.stage import taught_by
 from specimens import make_playback_tree
 
 OWN_LINE = "Costs $$5 & 100 %: you speak as a coast guard."

@@ -22,7 +22,7 @@ from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, Tea
 from cosfly.products.captions import Caption, read_captions
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
-from distill.student.taught import taught_by
+from distill.training.stage import taught_by
 from specimens import make_playback_tree
 
 SIDE_PX = 40  # smaller than the camera's, so that pictures are scaled

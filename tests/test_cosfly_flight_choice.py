@@ -24,8 +24,8 @@ from cosfly.products.playback import read_flight
 from cosfly.work.config import build
 from cosfly.work.provenance import fingerprint
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
+from distill.prepare.stage import PrepareConfig
 from distill.schema import open_split
 from release.package.sources import NOT_CHOSEN
 from release.record import read_record

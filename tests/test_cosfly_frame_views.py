@@ -23,9 +23,8 @@ from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
-from distill.inference.asking import make_request
-from distill.inference.stage import InferConfig
-from distill.prepare.samples import PrepareConfig, make_sample
+from distill.inference.stage import InferConfig, make_request
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 from distill.student.encoding import load_pictures
 from specimens import PERSON_ID, make_playback_tree

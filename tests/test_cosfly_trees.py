@@ -37,8 +37,8 @@ from cosfly.render import older_trees
 from cosfly.work.stage_folder import read_failures
 from cosfly.work.store import read_checksums, write_checksums, write_json
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
+from distill.prepare.stage import PrepareConfig
 from distill.schema import SPLITS, open_split
 from release.package import stage as package
 from release.package.config import ReleaseConfig

@@ -21,9 +21,9 @@ from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.splits import SPLITS
 from distill.prepare import stage
-from distill.prepare.leaks import check_no_leak
-from distill.prepare.samples import PrepareConfig, make_sample
 from distill.prepare.sources import Source
+from distill.prepare.splitting import check_no_leak
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 

@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 from torch.utils._pytree import tree_leaves  # noqa: E402
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
-from distill.student import decoding, recording  # noqa: E402
+from distill.student import decoding  # noqa: E402
 from distill.student.decoding import Decoded, decode  # noqa: E402
 from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
@@ -288,7 +288,7 @@ def test_a_step_that_cannot_be_recorded_is_computed(student, rows, monkeypatch):
     monkeypatch.setattr(decoding, "recorder_for", lambda student: asked.append)  # gives None, as record_graph does
     assert decode(student, rows, max_tokens=MOST) == generated(student, rows)
     assert len(asked) == 1
-    assert recording.recorder_for(student) is None  # nothing records on a CPU
+    assert decoding.recorder_for(student) is None  # nothing records on a CPU
 
 
 @pytest.mark.gpu
@@ -300,7 +300,7 @@ def test_an_accelerator_plays_what_it_computes(tmp_path, rows, dtype, monkeypatc
     plain = decode(own, rows, max_tokens=MOST, is_recorded=False)
     played = []
     monkeypatch.setattr(
-        decoding, "recorder_for", lambda s: lambda step: played.append(recording.record_graph(step)) or played[-1]
+        decoding, "recorder_for", lambda s: lambda step: played.append(decoding.record_graph(step)) or played[-1]
     )
     assert decode(own, rows, max_tokens=MOST) == plain
     assert played

@@ -18,8 +18,7 @@ from cosfly.products.playback import STATES, read_flight, write_flight
 from cosfly.products.splits import SPLITS
 from cosfly.work.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
-from distill.prepare.dual_track import DualTrackConfig, windows_of
-from distill.tracks import TrackSample, read_track_samples, read_track_set
+from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
 from specimens import make_flight, make_playback_tree
 
 NUM_POINTS = 24

@@ -27,14 +27,23 @@ from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
-from distill.evaluation.figures import differences_of, draw_walks, figures_of, macro_f1
 from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
-from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_judged, read_report, text_of
-from distill.evaluation.scores import VERDICTS, Answer, Scores, read_scores, score_answers, write_scores
-from distill.evaluation.speed import speed_of
+from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_judged, read_report, speed_of, text_of
+from distill.evaluation.scores import (
+    VERDICTS,
+    Answer,
+    Scores,
+    differences_of,
+    draw_walks,
+    figures_of,
+    macro_f1,
+    read_scores,
+    score_answers,
+    write_scores,
+)
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
-from distill.prepare.samples import PrepareConfig, make_sample
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 
 
@@ -86,7 +95,10 @@ def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
 
 
 def test_measured_numbers_by_hand(samples):
-    found, by_decision = figures(scores_of(samples))
+    scores = scores_of(samples)
+    found, by_decision = figures(scores)
+    table = measure({STUDENT: scores}, [], resamples=100, confidence=0.9, seed=0).who[STUDENT].confusion
+    assert table["track_straight"] == {"(unparsed)": 1, "slow_down": 1, "track_straight": 2}
     assert {name: figure.value for name, figure in found.items() if figure.value is not None} == pytest.approx(
         {
             "answered": 1.0,

@@ -20,7 +20,7 @@ from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
 from distill.inference import outcome
 from distill.inference import stage as infer
-from distill.inference.asking import make_request
+from distill.inference.stage import make_request
 from distill.schema import open_split, resolve_trees
 from distill.student.encoding import load_pictures
 from specimens import make_playback_tree

@@ -31,8 +31,12 @@ from distill.student.encoding import IGNORED, encode, encode_text, load_pictures
 from distill.student.random_student import make_tiny_student  # noqa: E402
 from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.settings import TrainConfig  # noqa: E402
-from distill.training.steps import Steps, learning_rate_at, share_of  # noqa: E402
+from distill.training.settings import (  # noqa: E402
+    Steps,
+    TrainConfig,
+    learning_rate_at,
+    share_of,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -25,11 +25,10 @@ from distill.student.encoding import encode, prompt_batch  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
 from distill.training import preflight  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.census import choose_over_all  # noqa: E402
-from distill.training.fit import judged  # noqa: E402
-from distill.training.memory import estimate, saved_bytes_per_token  # noqa: E402
+from distill.training.fit import Validation, judged  # noqa: E402
+from distill.training.loading import choose_over_all  # noqa: E402
+from distill.training.preflight import estimate, saved_bytes_per_token  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
-from distill.training.validation import Validation  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -22,8 +22,7 @@ from specimens_students import TWELVE, log_of, losses_of, make_place  # noqa: E4
 
 from cosfly.errors import ConfigError, InputError  # noqa: E402
 from distill.training.ranks import Ranks, _buckets, joined  # noqa: E402
-from distill.training.settings import TrainConfig  # noqa: E402
-from distill.training.steps import Steps, share_of  # noqa: E402
+from distill.training.settings import Steps, TrainConfig, share_of  # noqa: E402
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
 SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}

@@ -14,8 +14,7 @@ from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name, read_rgb
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
-from distill.window_sources import FACTS
-from distill.windows import Windows
+from distill.windows import FACTS, Windows
 from specimens import make_playback_tree
 
 NUM_POINTS = 9

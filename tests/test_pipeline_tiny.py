@@ -35,8 +35,8 @@ from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import read_failures
 from cosfly.work.store import read_checksums, write_checksums, write_json
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source as Prepared
+from distill.prepare.stage import PrepareConfig
 from release.package import stage as package
 from release.package.sources import Source
 from release.verify.verify import verify

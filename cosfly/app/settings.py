@@ -26,7 +26,7 @@ from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
-from distill.prepare.samples import PrepareConfig
+from distill.prepare.stage import PrepareConfig
 from distill.training.settings import TrainConfig
 from release.package.config import ReleaseConfig
 

@@ -1,7 +1,4 @@
-"""BERTScore on local model folders, one for each language, with the library's traps walked round. Knows texts only, no samples.
-
-The library loads the model and cuts it at the layer. Embedding and matching are here: each text once, in batches of like lengths, and the
-floors beside the answers without a second look at a text; the scores are the library's to rounding.
+"""BERTScore on local model folders, one for each language: the library scores, its traps are avoided here. Knows texts only, no samples.
 
 Source: Zhang et al. 2020, doi:10.48550/arXiv.1904.09675; settings of sec:appendix_f_caption_distillation.
 """
@@ -9,11 +6,9 @@ Source: Zhang et al. 2020, doi:10.48550/arXiv.1904.09675; settings of sec:append
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -28,7 +23,6 @@ from distill.student.model import Device, pick_device, quiet_transformers, requi
 
 log = logging.getLogger(__name__)
 
-Embedded = tuple[Any, Any]  # of one text: (t, d) embeddings of length 1, (t,) weights of its tokens
 FOREIGN_TOKENS = 1.5  # tokens a character of Chinese: bert-base-chinese has 1, a byte-level English vocabulary 2 to 3
 
 
@@ -111,8 +105,8 @@ class Scorer:
         tokenizer = self._library._tokenizer
         limit = min(int(min(tokenizer.model_max_length, 10**9)), positions - 2)
         tokenizer.model_max_length = limit
-        self._idf = self._weights(references) if cfg.idf else None
-        self._batch_size, self._device = cfg.batch_size, pick_device(cfg.device)
+        if cfg.idf:
+            self._library.compute_idf(list(references))  # after the limit is set: it tokenizes
         lengths = [len(tokenizer(text, truncation=False)["input_ids"]) for text in references]
         _warn_of_foreign(language, references, sum(lengths), folder)
         self.metric = Metric(
@@ -126,66 +120,18 @@ class Scorer:
             versions={name: version(name) for name in ("bert-score", "transformers", "torch")},
         )
 
-    def _weights(self, references: Sequence[str]) -> Mapping[int, float]:
-        self._library.compute_idf(list(references))  # after the limit is set: it tokenizes
-        return self._library._idf_dict
-
     def score(self, pairs: Sequence[tuple[str, str]]) -> np.ndarray:
-        """Score candidates against references, (n, 3) precision, recall, F1; an empty text scores 0 and is not read."""
+        """Score candidates against references, (n, 3) precision, recall, F1; an empty text scores 0 and is not read.
+
+        Of the texts of one call the library embeds each once.
+        """
         scores = np.zeros((len(pairs), 3))
         asked = [number for number, pair in enumerate(pairs) if all(text.strip() for text in pair)]
-        texts = {text: number for number, text in enumerate(dict.fromkeys(t for n in asked for t in pairs[n]))}
-        embedded = self._embed(list(texts))
-        asked.sort(key=lambda number: sum(len(embedded[texts[text]][0]) for text in pairs[number]))
-        for start in range(0, len(asked), self._batch_size):
-            batch = asked[start : start + self._batch_size]
-            candidates, references = ([embedded[texts[pairs[number][side]]] for number in batch] for side in (0, 1))
-            scores[batch] = _matched(candidates, references)
-        if self._library.rescale_with_baseline:
-            base = self._library.baseline_vals.numpy()
-            scores[asked] = (scores[asked] - base) / (1 - base)
+        if asked:
+            candidates, references = zip(*(pairs[number] for number in asked), strict=True)
+            found = self._library.score(list(candidates), list(references), batch_size=self._library.batch_size)
+            scores[asked] = np.stack([part.numpy() for part in found], axis=1)
         return scores
-
-    def _embed(self, texts: Sequence[str]) -> list[Embedded]:
-        """Embed each text, longest first, so that a batch has one length and memory runs out at once or not at all."""
-        import torch
-        from bert_score.utils import bert_encode, sent_encode
-
-        tokenizer, found = self._library._tokenizer, [None] * len(texts)
-        ids = [sent_encode(tokenizer, text) for text in texts]
-        weights = self._idf or defaultdict(lambda: 1.0, {tokenizer.sep_token_id: 0.0, tokenizer.cls_token_id: 0.0})
-        order = sorted(range(len(texts)), key=lambda number: -len(ids[number]))
-        for start in range(0, len(order), self._batch_size):
-            batch = order[start : start + self._batch_size]
-            longest = max(len(ids[number]) for number in batch)
-            padded = torch.full((len(batch), longest), tokenizer.pad_token_id)
-            mask = torch.zeros((len(batch), longest), dtype=torch.long)
-            for row, number in enumerate(batch):
-                padded[row, : len(ids[number])] = torch.tensor(ids[number])
-                mask[row, : len(ids[number])] = 1
-            with torch.no_grad():
-                out = bert_encode(self._library._model, padded.to(self._device), attention_mask=mask.to(self._device))
-                out = out / torch.norm(out, dim=-1, keepdim=True)
-            for row, number in enumerate(batch):
-                own = torch.tensor([weights[token] for token in ids[number]], device=out.device)
-                found[number] = (out[row, : len(ids[number])], own)  # type: ignore[call-overload]
-        return found  # type: ignore[return-value]
-
-
-def _matched(candidates: list[Embedded], references: list[Embedded]) -> np.ndarray:
-    """Match tokens greedily, (n, 3) precision, recall, F1. What pads has no embedding, so nothing is like it."""
-    import torch
-    from torch.nn.utils.rnn import pad_sequence
-
-    left, right = (pad_sequence([pair[0] for pair in side], batch_first=True) for side in (candidates, references))
-    likeness = torch.bmm(left, right.transpose(1, 2))
-    sides = []
-    for side, best in ((candidates, likeness.amax(dim=2)), (references, likeness.amax(dim=1))):
-        weights = pad_sequence([pair[1] for pair in side], batch_first=True)
-        sides.append((best * weights).sum(dim=1) / weights.sum(dim=1))
-    precision, recall = sides
-    f1 = torch.nan_to_num(2 * precision * recall / (precision + recall), nan=0.0)
-    return torch.stack([precision, recall, f1], dim=1).cpu().numpy()
 
 
 def score_beside_floors(

@@ -19,7 +19,6 @@ from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_model
-from distill.evaluation.figures import FIGURES, LESS_IS_BETTER, NEITHER, Difference, differences_of
 from distill.evaluation.measure import STUDENT, Measured, Report, read_report
 from distill.evaluation.pages import (
     NOTHING,
@@ -32,7 +31,16 @@ from distill.evaluation.pages import (
     shown,
     table,
 )
-from distill.evaluation.scores import SCORES, Scores, read_scores
+from distill.evaluation.scores import (
+    FIGURES,
+    LESS_IS_BETTER,
+    NEITHER,
+    SCORES,
+    Difference,
+    Scores,
+    differences_of,
+    read_scores,
+)
 
 STAGE = "distill.report"
 FLOORS = ("majority", "shuffled", "constant")

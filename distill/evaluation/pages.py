@@ -9,8 +9,8 @@ from cosfly.escaping import for_html, for_markdown, html_page
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import FIELDS, Coc
 from cosfly.reading.files import read_text
-from distill.evaluation.figures import FIGURES, Figure
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Example, Measured, Measurement, Report
+from distill.evaluation.scores import FIGURES, Figure
 
 STYLE = "\n" + read_text(Path(__file__).with_name("pages.css"))
 COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1", "#b83280", "#4a5568")

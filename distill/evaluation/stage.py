@@ -37,11 +37,11 @@ from distill.evaluation.measure import (
     pair_up,
     read_judged,
     score_language,
+    speed_of,
     text_of,
 )
 from distill.evaluation.pages import markdown_of, page_of
 from distill.evaluation.scores import SCORES, Scores, write_scores
-from distill.evaluation.speed import speed_of
 from distill.schema import Sample, in_its_actions, open_split
 from distill.student.model import require
 

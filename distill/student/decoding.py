@@ -1,14 +1,15 @@
 """Greedy decoding of a batch of prompts over state of a fixed size: what `generate` gives, without what it spends on the way.
 
 All tensors of a step stand at fixed places, sizes change only when rows leave. The positions, the mask and the caches are handed to
-the language model as they are, so it derives nothing of its own. On an accelerator a step is recorded once for a size and played again
-(distill/student/recording.py): most of what a small batch's step takes is the host's telling it what to do.
+the language model as they are, so it derives nothing of its own. On an accelerator a step is recorded once for a size and played again:
+most of what a small batch's step takes is the host's telling it what to do.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -16,7 +17,44 @@ import numpy as np
 
 from distill.student.encoding import Encoded, prompt_batch
 from distill.student.model import Student
-from distill.student.recording import Play, Record, recorder_for
+
+log = logging.getLogger(__name__)
+
+Play = Callable[[], None]
+Record = Callable[[Callable[[], None]], Play | None]
+
+
+def recorder_for(student: Student) -> Record | None:
+    """Give what records the steps of a student; None where nothing can be recorded, as on a CPU."""
+    return record_graph if student.device == "cuda" else None
+
+
+def record_graph(step: Callable[[], None]) -> Play | None:
+    """Record a step as a CUDA graph. Recording computes nothing: only what is given does, and it moves the very tensors that the step named.
+
+    Args:
+        step: has run once with tensors of these sizes. It may neither ask for a value nor wait, and what it keeps it writes in place; a
+            tensor that it makes anew stays where it is, and each time it is played gets new values.
+    Returns:
+        What plays it; None where it cannot be recorded, which is logged: it is then computed plainly.
+    Raises:
+        OutOfMemoryError: of torch, the memory is full.
+    """
+    import torch
+
+    graph = torch.cuda.CUDAGraph()
+    try:
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads read pictures meanwhile
+            step()
+    except torch.OutOfMemoryError:
+        raise
+    except RuntimeError as error:
+        log.warning(
+            "a step of decoding cannot be recorded and is computed plainly: %s", str(error).splitlines()[0][:160]
+        )
+        return None
+    return graph.replay
+
 
 # Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that stay, and has a
 # recorded step recorded anew, which takes as long as some ten steps that are played.

@@ -9,12 +9,13 @@ import logging
 import re
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.chat.student_chat import Taught, write_taught
+from cosfly.chat.student_chat import Look, Taught, write_taught
 from cosfly.errors import ConfigError, InputError
+from cosfly.products.captions import Language, Prompt
 from cosfly.work.chance import rng_for
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import atomic_folder, write_json
@@ -23,15 +24,33 @@ from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, w
 from distill.student.features import PictureReader, VisionFeatures, folder_bytes
 from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
-from distill.student.taught import taught_by
-from distill.training.census import Census, choose_over_all, take_census
 from distill.training.fit import LOG, Lesson, fit, seeded
-from distill.training.loading import Supply, num_workers, reader_errors
-from distill.training.memory import GB, memory_errors
-from distill.training.preflight import findings, tell
+from distill.training.loading import Census, Supply, choose_over_all, num_workers, reader_errors, take_census
+from distill.training.preflight import GB, findings, memory_errors, tell
 from distill.training.ranks import Ranks, joined
-from distill.training.settings import TrainConfig
-from distill.training.steps import STAGE
+from distill.training.settings import STAGE, TrainConfig
+
+
+def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
+    """Tell what samples teach.
+
+    Args:
+        max_pixels: most that the student's image processor keeps of a picture.
+    Raises:
+        InputError: their windows are of different lengths.
+    """
+    prompts: dict[Language, Prompt] = {}
+    looks: set[Look] = set()
+    lengths: set[int] = set()
+    for sample in samples:
+        prompts.setdefault(sample.language, sample.prompt)
+        looks.add(Look(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
+        lengths.add(len(sample.frames))
+    if len(lengths) != 1:
+        raise InputError("a training set of windows of different lengths", got=f"{sorted(lengths)} frames")
+    ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
+    return Taught(prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels)
+
 
 log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from distill.evaluation.floors import coc_of, shuffled_groups, shuffled_places
 from distill.evaluation.measure import text_of
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import make_prediction
-from distill.prepare.samples import PrepareConfig, make_sample
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 
 

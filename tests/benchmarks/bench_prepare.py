@@ -28,8 +28,8 @@ from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.limits import Limits, use_limits
 from distill.prepare import stage as prepare
-from distill.prepare.samples import PrepareConfig
 from distill.prepare.sources import Source
+from distill.prepare.stage import PrepareConfig
 from distill.schema import open_split, split_path
 from specimens import make_flight
 

@@ -31,7 +31,7 @@ from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use
 from distill.student.model import Student, compute_dtype
 from distill.training.fit import make_optimizer
 from distill.training.loss import answer_loss
-from distill.training.memory import used_gb
+from distill.training.preflight import used_gb
 from distill.training.ranks import Ranks, joined
 from distill.training.settings import TrainConfig
 from distill.training.stage import add_adapter
