@@ -1,17 +1,17 @@
 """Captioned windows for training code of one's own: frames, facts, caption, from a playback tree, a run or a release.
 
-`Windows` needs no torch and gives NumPy arrays; `WindowDataset` is the same as a `torch.utils.data.Dataset` of tensors. Both are map-style, pickle, and
+`Windows` needs no torch and gives NumPy arrays; `WindowDataset` the same as tensors. Both are map-style data sets, pickle, and
 open their files anew in each process, so they go into a `DataLoader` with workers as they are. Right-handed axes, as in a release.
 """
 
 from __future__ import annotations
 
-import functools
+import importlib.util
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict, get_args
+from typing import Any, Protocol, TypedDict, get_args
 
 import cv2
 import numpy as np
@@ -300,18 +300,6 @@ def _column(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ..
     return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
 
 
-if TYPE_CHECKING:
-    import torch.utils.data
-
-    class WindowDataset(torch.utils.data.Dataset[dict[str, Any]]):
-        """Captioned windows as tensors; arguments as of `Windows`."""
-
-        left_out: Counter[str]
-
-        def __init__(self, source: str | Path, captions: str | Path | None = None, **options: Any) -> None: ...
-        def __len__(self) -> int: ...
-
-
 class Window(TypedDict):
     """One window of k frames.
 
@@ -383,28 +371,17 @@ def _scaled(picture: np.ndarray, max_side_px: int | None) -> np.ndarray:
     return picture if size == (width_px, height_px) else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-@functools.cache
-def _dataset_class() -> type:
-    """Make the class: its base is PyTorch's, which is loaded when somebody asks for it and not before."""
-    try:
+class WindowDataset(Windows):
+    """Captioned windows as tensors, a map-style data set for PyTorch's `DataLoader`; arguments as of `Windows`."""
+
+    def __init__(self, source: str | Path, captions: str | Path | None = None, **options: Any) -> None:
+        if importlib.util.find_spec("torch") is None:
+            raise EnvironmentMissing("PyTorch is not installed", fix="pip install 'cosfly[distill]'")
+        super().__init__(source, captions, **options)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:  # type: ignore[override]
         import torch
-        from torch.utils.data import Dataset
-    except ImportError:
-        raise EnvironmentMissing("PyTorch is not installed", fix="pip install 'cosfly[distill]'") from None
 
-    class WindowDataset(Windows, Dataset):
-        """Captioned windows as tensors; arguments as of `Windows`."""
-
-        def __getitem__(self, index: int) -> dict[str, Any]:  # type: ignore[override]
-            window = Windows.__getitem__(self, index)
-            facts = {name: torch.from_numpy(value) for name, value in window["facts"].items()}
-            return {**window, "facts": facts, **{name: torch.from_numpy(window[name]) for name in ("window", "frames")}}  # type: ignore[literal-required]
-
-    WindowDataset.__qualname__ = "WindowDataset"  # pickled by this name
-    return WindowDataset
-
-
-def __getattr__(name: str) -> Any:
-    if name == "WindowDataset":
-        return _dataset_class()
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        window = super().__getitem__(index)
+        facts = {name: torch.from_numpy(value) for name, value in window["facts"].items()}
+        return {**window, "facts": facts, **{name: torch.from_numpy(window[name]) for name in ("window", "frames")}}  # type: ignore[literal-required]

@@ -57,6 +57,14 @@ def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subp
     return _held_by_another
 
 
+@pytest.fixture(scope="session")
+def students(tmp_path_factory) -> Path:
+    """A playback tree, a training set and a tiny student, read by many tests; what a test writes has a folder of its own."""
+    from specimens_students import make_place
+
+    return make_place(tmp_path_factory.mktemp("students"))
+
+
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """PyTorch in one thread: sums then do not depend on the machine, and a tiny model is faster so."""

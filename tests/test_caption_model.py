@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    for package in ("torch", "transformers", "fastapi", "uvicorn", "llguidance"):
+    for package in ("torch", "transformers", "llguidance"):
         pytest.importorskip(package, reason=f"{package} is not installed; it comes with cosfly[dev]")
     from model_server import ModelServer
 

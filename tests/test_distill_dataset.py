@@ -10,8 +10,6 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
@@ -131,11 +129,6 @@ def test_a_training_set_of_an_earlier_version_is_refused(tmp_path):
         open_split(tmp_path, "train")
 
 
-def test_file_kinds_are_no_views():
-    with pytest.raises(ValidationError, match="'rgb', 'depth', 'segmentation' or 'middle'"):
-        PrepareConfig.model_validate({"modalities": ("rgb", "instance")})
-
-
 REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 
 
@@ -144,7 +137,6 @@ REPAIRED = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first
     [
         ({"status": "dropped", "drop_reason": "hard_conflict"}, {}, "dropped_hard_conflict"),
         ({"repair": REPAIRED}, {"repaired": "exclude"}, "repaired"),
-        ({"repair": REPAIRED | {"rung": "anchored"}}, {"rungs": ("hint",)}, "repaired_by_anchored"),
         ({"zh": None}, {}, "no_zh"),
     ],
 )
@@ -308,22 +300,6 @@ def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, 
     assert "balance left 4 of 24 training windows out (8 samples)" in caplog.text
 
 
-def test_a_bound_that_nothing_reaches_gives_the_files_of_no_balance(tree, captions, tmp_path):
-    plain = prepared(tree, captions, tmp_path / "plain")
-    wide = prepared(tree, captions, tmp_path / "wide", balance="decisions", balance_ratio=100)
-    for split in SPLITS:
-        assert split_path(plain, split).read_bytes() == split_path(wide, split).read_bytes()
-    facts = [json.loads((folder / "manifest.json").read_text()) for folder in (plain, wide)]
-    assert facts[0]["counts"] == facts[1]["counts"]
-    assert ["balance" in found["splits"]["train"] for found in facts] == [False, True]
-
-
-@pytest.mark.parametrize("ratio", [0, -1, float("inf"), float("nan")], ids=str)
-def test_a_bound_that_is_none_is_refused(ratio):
-    with pytest.raises(ValidationError, match="balance_ratio"):
-        PrepareConfig(balance="decisions", balance_ratio=ratio)
-
-
 def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
     bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
     with pytest.raises(NothingKept, match=r"kept nothing.*missing_image 80.*--data"):
@@ -334,11 +310,6 @@ def test_run_refuses_a_name_that_leads_out(tree, tmp_path):
     write_captions(tmp_path / "captions.jsonl", [make_caption("..", "trajectory_1", "ORI", 4)])
     with pytest.raises(InputError, match="not a folder name"):
         prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
-
-
-def test_settings_that_leave_nothing_are_refused():
-    with pytest.raises(ValidationError, match="nothing is left to train on"):
-        PrepareConfig(val_fraction=0.5, test_fraction=0.5)
 
 
 def test_imports_without_torch():
@@ -390,12 +361,6 @@ def test_trees_that_a_set_was_not_made_of_are_refused_by_name(tree, captions, tm
         resolve_trees(out, [other])
     with pytest.raises(InputError, match=rf"is not given.*{tree.parent.name}"):
         resolve_trees(out, [])
-
-
-def test_two_runs_of_one_name_are_refused(tree, captions, tmp_path):
-    source = Source.of_files(tree, captions)
-    with pytest.raises(InputError, match="two runs have one name"):
-        stage.run(PrepareConfig(unbound="accept"), [source, source], tmp_path / "set")
 
 
 def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
@@ -479,23 +444,6 @@ def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monke
             found = pool.map(_keys, [samples] * 2)
             assert found == [_keys(whole)] * 2
     assert samples[order[0]] == whole[order[0]]
-
-
-def test_an_empty_split_is_empty(tree, captions, tmp_path):
-    samples = open_split(prepared(tree, captions, tmp_path / "set", val_fraction=0), "val")
-    assert (len(samples), list(samples), samples[:5]) == (0, [], [])
-
-
-def test_a_damaged_row_names_file_and_row(tree, captions, tmp_path):
-    out = prepared(tree, captions, tmp_path / "set")
-    path = split_path(out, "train")
-    table = pq.read_table(path)
-    pq.write_table(table.set_column(table.column_names.index("decision"), "decision", pa.array([3] * len(table))), path)
-    with pytest.raises(InputError, match=r"train\.parquet: row 0: decision"):
-        list(open_split(out, "train"))
-    pq.write_table(table.drop_columns(["walk"]), path)
-    with pytest.raises(InputError, match=r"columns are missing.*walk"):
-        len(open_split(out, "train"))
 
 
 def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):

@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -253,17 +251,6 @@ def test_scores_survive_the_disk(tmp_path, samples):
         assert getattr(again, name).dtype == getattr(scores, name).dtype
 
 
-def test_scores_whose_text_is_no_text_are_damaged(tmp_path, samples):
-    path = tmp_path / "scores.parquet"
-    write_scores(path, scores_of(samples, texts=np.zeros((8, 3))))
-    table = pq.read_table(path)
-    place = table.column_names.index("key")
-    broken = pa.array([b"\xff\xfe"] * len(table), pa.binary()).cast(pa.string(), safe=False)
-    pq.write_table(table.set_column(place, "key", broken), path)
-    with pytest.raises(InputError, match=r"scores\.parquet: not a whole parquet file"):
-        read_scores(path)
-
-
 # --- floors -----------------------------------------------------------------------------------------------------------
 
 
@@ -373,14 +360,6 @@ def test_samples_that_were_not_asked_are_counted_apart(place):
     report = read_report(place / "out")
     assert report.not_asked == 12
     assert report.all.who[STUDENT].figures["parsed"].value == 3 / 4
-
-
-@pytest.mark.parametrize("bad", ['{"sample_id": 1}\n', "no json\n", None])
-def test_bad_predictions_name_file_and_line(place, bad):
-    lines = (place / "predictions.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    (place / "bad.jsonl").write_text(lines[0] + (bad or lines[0]), encoding="utf-8")
-    with pytest.raises(InputError, match=r"bad\.jsonl:2"):
-        run(CFG, place / "bad.jsonl", place / "set", place / "out")
 
 
 def test_what_a_verifier_found_in_the_answers_is_read(place, samples):
@@ -571,11 +550,6 @@ def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encode
     other = {"en": "zh", "zh": "en"}[language]
     assert report.metrics[other] is None
     assert report.languages[other].who[STUDENT].figures["bertscore_f1"].value is None
-
-
-def test_each_language_has_its_layer():
-    cfg = EvaluateConfig().bertscore
-    assert (cfg.en.layer, cfg.zh.layer) == (17, 8)
 
 
 @pytest.mark.parametrize("idf", [False, True])

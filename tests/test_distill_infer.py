@@ -169,16 +169,6 @@ def test_flights_that_nobody_asks_about_are_forgotten(monkeypatch):
     assert forgotten == [names[2], names[3], names[0]]  # idle longest; the first was worked on for longer
 
 
-def test_what_a_server_refuses_has_failed(place, tmp_path):
-    with TeacherServer(lambda number, body: "413" if number == 0 else None) as server:
-        path = infer_with(settings(), place, server.url, tmp_path / "out")
-    predictions = read_predictions(path)
-    assert [p.reason for p in predictions if p.coc is None] == ["failed_refused_413"]
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    assert manifest["counts"]["failed"] == {"refused_413": 1}
-    assert "refused_413" in (tmp_path / "out" / "failures.jsonl").read_text()
-
-
 def test_an_answer_that_filled_the_context_is_not_finished(place, tmp_path):
     with TeacherServer(lambda number, body: "no_room" if number == 0 else None) as server:
         path = infer_with(settings(), place, server.url, tmp_path / "out")
@@ -188,13 +178,3 @@ def test_an_answer_that_filled_the_context_is_not_finished(place, tmp_path):
 def test_an_adapter_needs_transformers(place, tmp_path):
     with pytest.raises(ConfigError, match="read by transformers alone"):
         infer_with(settings(), place, "http://127.0.0.1:1", tmp_path / "out", adapter=tmp_path)
-
-
-def test_the_command_takes_a_url(place, tmp_path):
-    with TeacherServer() as server:
-        words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--model", server.url]
-        words += ["--engine", "endpoint", "--out", tmp_path / "out", "--set", "distill.infer.endpoint.concurrency=2"]
-        result = CliRunner().invoke(app, [str(word) for word in words])
-        assert result.exit_code == 0, result.output
-        assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}
-    assert read_predictions(tmp_path / "out" / "predictions.jsonl")

@@ -22,7 +22,7 @@ from typer.testing import CliRunner  # noqa: E402
 
 from cosfly.chat.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.cli import app  # noqa: E402
-from cosfly.errors import InputError, ResumeError  # noqa: E402
+from cosfly.errors import InputError  # noqa: E402
 from cosfly.work.store import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
@@ -245,18 +245,6 @@ def test_a_full_disk_leaves_nothing_half(base, adapter, tmp_path):
     assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
     merge.run(MergeConfig(), base, adapter, tmp_path / "out")
     assert (tmp_path / "out" / "model" / "model.safetensors").exists()
-
-
-def test_merged_twice_is_merged_once(base, adapter, tmp_path):
-    first = merge.run(MergeConfig(), base, adapter, tmp_path / "out")
-    times = {path.name: path.stat().st_mtime_ns for path in first.iterdir()}
-    assert {
-        path.name: path.stat().st_mtime_ns
-        for path in merge.run(MergeConfig(), base, adapter, tmp_path / "out").iterdir()
-    } == times
-    other = make_adapter(base, tmp_path / "adapter", r=2)
-    with pytest.raises(ResumeError, match="other settings or inputs"):
-        merge.run(MergeConfig(), base, other, tmp_path / "out")
 
 
 def test_the_command(base, adapter, tmp_path):

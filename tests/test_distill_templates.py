@@ -14,7 +14,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, load, make_place, samples_of  # noqa: E402
+from specimens_students import FAST, load, samples_of  # noqa: E402
 
 from cosfly.errors import InputError  # noqa: E402
 from distill.student.encoding import END_OF_ANSWER, chat_text, encode_text, prompt_text, special_token_in  # noqa: E402
@@ -97,8 +97,8 @@ TEMPLATES = {
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
-    return make_place(tmp_path_factory.mktemp("templates"))
+def place(students) -> Path:
+    return students
 
 
 @pytest.fixture
@@ -132,17 +132,15 @@ def test_thinking_would_be_another_prompt(place, processor):
         assert ("Reasoning effort is set to xhigh." in text) is (version == "3.8")
 
 
-@pytest.mark.parametrize("field", ["system", "user", "answer"])
-@pytest.mark.parametrize("token", ["<|im_end|>", "<|image_pad|>", "<|im_start|>"])
-def test_tokens_of_the_chat_in_a_text_are_found(place, processor, field, token):
+def test_tokens_of_the_chat_in_a_text_are_found(place, processor):
     sample = samples_of(place)[0]
     assert special_token_in(processor, sample) is None
-    if field == "answer":
-        bad = sample.model_copy(update={"answer": f"{sample.answer}{token}"})
-    else:
-        prompt = sample.prompt.model_copy(update={field: f"a {token} b"})
-        bad = sample.model_copy(update={"prompt": prompt})
-    assert special_token_in(processor, bad) == token
+    for token in ("<|im_end|>", "<|image_pad|>", "<|im_start|>"):
+        changed = [{"answer": f"{sample.answer}{token}"}]
+        changed += [
+            {"prompt": sample.prompt.model_copy(update={field: f"a {token} b"})} for field in ("system", "user")
+        ]
+        assert {special_token_in(processor, sample.model_copy(update=one)) for one in changed} == {token}
 
 
 def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):

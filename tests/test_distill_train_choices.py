@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +15,9 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, make_place, samples_of, trees_of  # noqa: E402
+from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import ConfigError, InputError, ResumeError  # noqa: E402
+from cosfly.errors import InputError, ResumeError  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.encoding import encode, prompt_batch  # noqa: E402
@@ -27,15 +26,15 @@ from distill.training import preflight  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.fit import Validation, judged  # noqa: E402
 from distill.training.loading import choose_over_all  # noqa: E402
-from distill.training.preflight import estimate, saved_bytes_per_token  # noqa: E402
+from distill.training.preflight import estimate, saved_bytes_per_token, used_gb  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
-    return make_place(tmp_path_factory.mktemp("choices"))
+def place(students) -> Path:
+    return students
 
 
 def run(
@@ -193,15 +192,6 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
         run(place, out, **settings)
 
 
-def test_checkpoints_that_a_kill_after_the_last_one_left_are_dropped(place, tmp_path):
-    out, settings = tmp_path / "out", {"save_every_steps": 1, "keep_checkpoints": 1, "max_steps": 2}
-    run(place, out, **settings)
-    shutil.copytree(out / "checkpoints/step_00000002", out / "checkpoints/step_00000001")
-    (out / "manifest.json").unlink()
-    run(place, out, **settings)
-    assert [path.name for path in (out / "checkpoints").iterdir()] == ["step_00000002"]
-
-
 # --- before the first step --------------------------------------------------------------------------------------------
 
 
@@ -237,9 +227,4 @@ def test_what_is_kept_for_the_backward_pass_is_measured(place):
     one, four = (estimate(full, cfg.model_copy(update={"batch_size": size}), 300, 1e5) for size in (1, 4))
     assert four.activations == pytest.approx(4 * one.activations, rel=1e-6)  # each is measured anew
     assert one.optimizer == 2 * one.gradients > 0
-    assert one.needed < one.available
-
-
-def test_no_layer_to_adapt_is_an_error(place):
-    with pytest.raises(ConfigError, match="target_modules"):
-        train.add_adapter(load(place), TrainConfig(target_modules="nothing"), 0)
+    assert used_gb("cpu") * 1e9 <= one.needed < one.available  # the process itself is in it

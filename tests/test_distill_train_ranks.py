@@ -18,26 +18,26 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import TWELVE, log_of, losses_of, make_place  # noqa: E402
+from specimens_students import TWELVE, log_of, losses_of  # noqa: E402
 
 from cosfly.errors import ConfigError, InputError  # noqa: E402
 from distill.training.ranks import Ranks, _buckets, joined  # noqa: E402
-from distill.training.settings import Steps, TrainConfig, share_of  # noqa: E402
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
 SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
-    return make_place(tmp_path_factory.mktemp("ranks"))
+def place(students) -> Path:
+    return students
 
 
 @pytest.fixture(scope="module")
-def alone(place) -> Path:
+def alone(place, tmp_path_factory) -> Path:
     """What one process gives."""
-    assert finish(start(place, place / "alone", 1)) == [0]
-    return place / "alone"
+    out = tmp_path_factory.mktemp("alone") / "out"
+    assert finish(start(place, out, 1)) == [0]
+    return out
 
 
 def free_port() -> int:
@@ -134,30 +134,6 @@ def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_that_fails_is_everybodys_error(place, tmp_path):
-    """The first process finds the folder taken by another one: both end with its words, and what is there stays."""
-    from cosfly.work.folder_lock import hold_folder
-
-    with hold_folder(tmp_path / "out"):
-        processes = start(place, tmp_path / "out", 2)
-        assert finish(processes) == [1, 1]
-        for process in processes:
-            assert process.stderr is not None
-            assert "another process is at work in this folder" in process.stderr.read()
-
-
-@pytest.mark.slow
-def test_two_go_on_with_what_one_began(place, alone, tmp_path):
-    out = tmp_path / "out"
-    processes = start(place, out, 1)
-    wait_for_steps(out, 4)
-    processes[0].send_signal(signal.SIGKILL)
-    assert finish(processes) == [-signal.SIGKILL]
-    assert finish(start(place, out, 2)) == [0, 0]
-    assert losses_of(out) == pytest.approx(losses_of(alone), rel=1e-5)
-
-
-@pytest.mark.slow
 def test_a_launcher_starts_them(place, tmp_path):
     """`torchrun` on the command itself: one folder, one log, status 0; and status 1 where a setting is wrong."""
     command = [
@@ -175,10 +151,3 @@ def test_a_launcher_starts_them(place, tmp_path):
     done = subprocess.run(wrong, env=environment, capture_output=True, text=True, timeout=180, check=False)
     assert done.returncode == 1
     assert "kept nothing" in done.stderr
-
-
-def test_processes_share_a_step_that_is_smaller_than_their_number():
-    last = Steps.make(TrainConfig(samples_per_step=4), 10, 0).samples_of(2)
-    shares = [share_of(last, np.ones(10), rank, 8) for rank in range(8)]
-    assert sorted(index for share in shares for index in share) == sorted(last)
-    assert [] in shares

@@ -7,8 +7,6 @@ The base's files are gone through one tensor after the other, so a model of any 
 from __future__ import annotations
 
 import math
-import os
-import re
 import shutil
 from pathlib import Path
 from typing import Any, Literal
@@ -22,11 +20,10 @@ from cosfly.work.config import Config
 from cosfly.work.console import progress_bar
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import atomic_folder, storage_errors, write_json
-from distill.student.checkpoint import read_adapter_facts
+from distill.student.checkpoint import read_adapter_facts, save_tensors
 from distill.student.model import require, student_folder, weight_files
 
 STAGE = "distill.merge"
-_OS_ERROR = re.compile(r"\(os error (\d+)\)")
 PREFIX = "base_model.model."  # of the names that peft gives
 # Files of a model folder that are neither weights nor code: what the model is, what its processor and its chats are.
 COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")
@@ -183,24 +180,17 @@ def _read_tensors(path: Path) -> tuple[dict[str, str] | None, dict[str, Any]]:
 def _merge_shard(shard: Path, out: Path, updates: Updates, dtype: str) -> int:
     """Write one file of weights with the updates in it; gives the bytes of its tensors."""
     import torch
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file
 
     metadata, tensors = _read_tensors(shard)
     for name in tensors:
         if name in updates:
             merged = updates.add_to(name, tensors[name])
-            tensors[name] = merged.to(tensors[name].dtype if dtype == "base" else torch.float32).contiguous()
+            tensors[name] = merged.to(tensors[name].dtype if dtype == "base" else torch.float32)
     for name in tensors:
         if name in updates and not torch.isfinite(tensors[name]).all():
             raise InputError("a merged weight is not finite", where=shard, got=name, fix="look at the training's loss")
     with storage_errors(out):
-        try:
-            save_file(tensors, out, metadata)
-        except SafetensorError as error:  # in whose words the library hides what the disk says
-            if number := _OS_ERROR.search(str(error)):
-                raise OSError(int(number[1]), os.strerror(int(number[1])), str(out)) from error
-            raise
+        save_tensors(out, tensors, metadata)
     return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
 
 

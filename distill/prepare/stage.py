@@ -34,8 +34,6 @@ from distill.prepare.sources import CaptionedFlight, Flights, Source, check_sour
 from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split, write_training_set
 
-Rung = Literal["hint", "multi_sample", "anchored", "fix_label"]
-
 
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
@@ -58,10 +56,6 @@ class PrepareConfig(SplitConfig):
         "would go unseen",
     )
     repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
-    rungs: tuple[Rung, ...] = Field(
-        ("hint", "multi_sample", "anchored", "fix_label"),
-        description="repaired captions are learnt that one of these asks mended",
-    )
     repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
     verdicts: tuple[Verdict, ...] = Field(
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
@@ -161,8 +155,6 @@ def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfi
         return f"dropped_{caption.drop_reason or 'unknown'}"
     if caption.repair is not None and cfg.repaired == "exclude":
         return "repaired"
-    if caption.repair is not None and caption.repair.rung not in (None, *cfg.rungs):
-        return f"repaired_by_{caption.repair.rung}"
     if caption.verdict not in cfg.verdicts:
         return f"verdict_{str(caption.verdict).lower()}"
     if cfg.contradicted == "exclude" and "contradicted" in (caption.checks.sentences or {}).get(language, []):

@@ -60,20 +60,21 @@ def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Pr
         for key, value in optimizer.state.get(parameter, {}).items()
     }
     with atomic_folder(folder) as partial:
-        _save_tensors(partial / WEIGHTS, weights)
-        _save_tensors(partial / MOMENTS, moments)
+        save_tensors(partial / WEIGHTS, weights)
+        save_tensors(partial / MOMENTS, moments)
         write_model(partial / STATE, progress, schema=CHECKPOINT_SCHEMA, version=VERSION)
         files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
         write_checksums(partial, {str(path.relative_to(partial)): sha256_file(path) for path in files})
 
 
-def _save_tensors(path: Path, tensors: dict[str, Any]) -> None:
+def save_tensors(path: Path, tensors: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors by name; what the system says of the disk is an OSError, as elsewhere."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     try:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path)
-    except SafetensorError as error:  # the library's own name of what the system said
+        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
+    except SafetensorError as error:  # the library hides the system's number in its words
         found = re.search(r"os error (\d+)", str(error))
         if found is None:
             raise

@@ -149,7 +149,7 @@ def read_features(folder: Path, key: str, dtype: Any) -> Any:
     if not path.exists():
         return None
     try:
-        array = read_array(path, dtype=_stored_as(dtype), ndim=2, what="features", tree=folder)
+        array = read_array(path, dtype=np.int16, ndim=2, what="features", tree=folder)
     except InputError:
         return None
     return torch.from_numpy(array).view(dtype)
@@ -157,11 +157,6 @@ def read_features(folder: Path, key: str, dtype: Any) -> Any:
 
 def _feature_file(folder: Path, key: str) -> Path:
     return folder / key[:2] / f"{key}.npy"
-
-
-def _stored_as(dtype: Any) -> type:
-    """NumPy's type for the bits of features: it has no bfloat16."""
-    return np.float32 if dtype.itemsize == 4 else np.int16
 
 
 # --- the cache --------------------------------------------------------------------------------------------------------
@@ -182,14 +177,13 @@ class VisionFeatures:
         folder: Path | None = None,
         memory_bytes: int = 0,
         disk_bytes: int = 0,
-        encode_batch: int = 0,
         is_frozen: bool = True,
     ) -> None:
         self.student, self.is_frozen = student, is_frozen
         self.folder = folder / tower_key(student) if folder is not None and is_frozen else None
         self.memory_bytes, self.disk_bytes = memory_bytes if is_frozen else 0, disk_bytes
         # One at a time, features do not depend on what else is looked at, to the last bit.
-        self.encode_batch = encode_batch or (1 if student.device == "cpu" else 16)
+        self.encode_batch = 1 if student.device == "cpu" else 16
         self._kept: dict[str, Any] = {}  # key -> features
         self._here: dict[str, Any] = {}  # of the step at hand; patches of a tower that learns
         self._keys: dict[Picture, str] = {}
@@ -270,6 +264,8 @@ class VisionFeatures:
 
     def _store(self, key: str, features: Any) -> None:
         """Write to disk, where there is room, what memory has no room for."""
+        import torch
+
         size = features.numel() * features.element_size()
         if self.folder is None or self._stored_bytes + size > self.disk_bytes:
             return
@@ -279,7 +275,7 @@ class VisionFeatures:
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 with open(partial, "xb") as file:  # not synchronized: what a crash damages is made anew
-                    np.save(file, features.contiguous().view(_bits_of(features.dtype)).numpy())
+                    np.save(file, features.contiguous().view(torch.int16).numpy())  # the bits: NumPy has no bfloat16
                 os.replace(partial, path)
             except BaseException:
                 partial.unlink(missing_ok=True)
@@ -304,9 +300,3 @@ class VisionFeatures:
     def end_step(self) -> None:
         """Forget what is not kept."""
         self._here.clear()
-
-
-def _bits_of(dtype: Any) -> Any:
-    import torch
-
-    return torch.float32 if dtype.itemsize == 4 else torch.int16

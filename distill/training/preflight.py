@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -36,21 +36,23 @@ ADAM_COPIES = 2  # first and second moment
 class Memory:
     """Bytes by what they are for; `available` is what the device has for all of it."""
 
+    _PARTS: ClassVar = ("weights", "gradients", "optimizer", "activations", "logits", "pictures", "program")
+
     weights: float
     gradients: float
     optimizer: float
     activations: float
     logits: float
     pictures: float
+    program: float  # what the process takes already beside the weights: libraries, code
     available: float
 
     @property
     def needed(self) -> float:
-        return self.weights + self.gradients + self.optimizer + self.activations + self.logits + self.pictures
+        return sum(getattr(self, name) for name in self._PARTS)
 
     def __str__(self) -> str:
-        parts = ("weights", "gradients", "optimizer", "activations", "logits", "pictures")
-        told = ", ".join(f"{name} {getattr(self, name) / GB:.2f}" for name in parts)
+        told = ", ".join(f"{name} {getattr(self, name) / GB:.2f}" for name in self._PARTS)
         return f"{self.needed / GB:.2f} GB of {self.available / GB:.1f} ({told})"
 
 
@@ -89,15 +91,16 @@ def estimate(student: Student, cfg: TrainConfig, longest: int, picture_bytes: fl
     """
     parameters = list(student.model.parameters())
     learning = sum(p.numel() * p.element_size() for p in parameters if p.requires_grad)
-    config = student.core.config.text_config
-    rows = cfg.batch_size
+    weights = float(sum(p.numel() * p.element_size() for p in parameters))
+    config, rows = student.core.config.text_config, cfg.batch_size
     return Memory(
-        weights=sum(p.numel() * p.element_size() for p in parameters),
+        weights=weights,
         gradients=learning,
         optimizer=ADAM_COPIES * learning,
         activations=saved_bytes_per_token(student, cfg) * longest * rows,
         logits=float(TABLES * cfg.logit_chunk * config.vocab_size * 4),
         pictures=rows * picture_bytes,
+        program=max(0.0, used_gb(student.device) * GB - weights),
         available=available_bytes(student.device),
     )
 
@@ -177,7 +180,7 @@ def findings(
     """
     return [
         *_about_data(cfg, census, validation, steps),
-        *_about_decisions(cfg, census, validation),
+        *_about_decisions(census, validation),
         _about_chat(student, sample),
         *_about_memory(cfg, student, census, features),
         *_about_features(cfg, census, validation, features),
@@ -201,26 +204,20 @@ def _about_data(cfg: TrainConfig, census: Census, validation: Census, steps: Ste
     return [*found, Finding("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions")]
 
 
-def _about_decisions(cfg: TrainConfig, census: Census, validation: Census) -> list[Finding]:
+def _about_decisions(census: Census, validation: Census) -> list[Finding]:
     """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
     missing = [action for action in action_tokens() if not census.decisions[action]]
     asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
     if not asked:
         return [Finding("decisions", f"no sample of {', '.join(missing)}")] if missing else []
-    level: Any = "error" if cfg.empty_decision == "refuse" else "warning"
-    told = ", ".join(f"{action} {count}" for action, count in asked.items())
-    never = (
-        f"; nor does it show {', '.join(rest)}"
-        if (rest := [action for action in missing if action not in asked])
-        else ""
-    )
-    count = sum(asked.values())
+    counts = ", ".join(f"{action} {count}" for action, count in asked.items())
+    rest = ", ".join(action for action in missing if action not in asked)
     return [
         Finding(
             "decisions",
-            f"val asks for what train never shows, and {count} of its {len(validation)} samples will be wrong: {told}{never}; "
-            "more walks or towns in train have them, another seed splits otherwise",
-            level,
+            f"val asks for what train never shows, and {sum(asked.values())} of its {len(validation)} samples will be wrong: {counts}"
+            f"{f'; nor does it show {rest}' if rest else ''}; more walks or towns in train have them, another seed splits otherwise",
+            "warning",
         )
     ]
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -28,10 +28,6 @@ TARGET_MODULES = (
 
 class TrainConfig(Config):
     """Settings of `distill train`. Those that are MayDiffer change how it is computed and, but for rounding, not what."""
-
-    formerly: ClassVar[dict[str, str]] = {
-        "accumulate": "samples_per_step says how many samples make an optimizer step, batch_size how many are computed together",
-    }
 
     method: Literal["lora", "full"] = Field(
         "lora", description="lora: matrices of low rank beside frozen weights; full: all weights of the language model"
@@ -68,9 +64,6 @@ class TrainConfig(Config):
     )
     max_tokens: int = Field(
         4096, ge=16, description="longest sample, images and answer included; a longer one is skipped and counted"
-    )
-    empty_decision: Literal["warn", "refuse"] = Field(
-        "warn", description="what becomes of a training where val asks for a decision that no sample of train makes"
     )
     dtype: Dtype = Field(
         "auto",
@@ -113,9 +106,6 @@ class TrainConfig(Config):
     )
     feature_folder: MayDiffer[Path | None] = Field(
         None, description="where features stay for further runs; none: in the output folder until the training is done"
-    )
-    encode_batch: MayDiffer[int] = Field(
-        0, ge=0, description="pictures that the vision tower looks at together; 0: 1 on a CPU, 16 on an accelerator"
     )
     data_workers: MayDiffer[int] = Field(
         -1, ge=-1, description="processes that read pictures, for each that trains; -1: one a core, at most 16; 0: none"

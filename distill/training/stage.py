@@ -207,7 +207,7 @@ def _lesson(
 
 def _features(cfg: TrainConfig, student: Student, out: Path, ranks: Ranks) -> VisionFeatures:
     if not cfg.feature_cache or cfg.train_vision:
-        return VisionFeatures(student, encode_batch=cfg.encode_batch, is_frozen=not cfg.train_vision)
+        return VisionFeatures(student, is_frozen=not cfg.train_vision)
     folder = cfg.feature_folder or out / FEATURES
     room = max(0.0, cfg.feature_disk_gb * GB - folder_bytes(folder)) / ranks.size
     return VisionFeatures(
@@ -215,7 +215,6 @@ def _features(cfg: TrainConfig, student: Student, out: Path, ranks: Ranks) -> Vi
         folder=folder,
         memory_bytes=int(cfg.feature_memory_gb * GB),
         disk_bytes=int(room),
-        encode_batch=cfg.encode_batch,
     )
 
 
