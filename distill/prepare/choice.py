@@ -168,78 +168,41 @@ def _dealt(total: int, wishes: Mapping[str, tuple[float, int]]) -> dict[str, int
 # --- what it cost -----------------------------------------------------------------------------------------------------
 
 
-class BeforeAfter(BaseModel):
-    """A number of the training split before and after the cut."""
-
-    model_config = ConfigDict(frozen=True)
-
-    before: float
-    after: float
-
-
-class DecisionCost(BaseModel):
-    """What the cut did to one decision; shares are of all windows of the split."""
-
-    model_config = ConfigDict(frozen=True)
-
-    windows: int
-    windows_left_out: int
-    samples_left_out: int
-    share: BeforeAfter
-
-
 class Cost(BaseModel):
-    """What balance cost the training split: `balance` of the manifest."""
+    """What balance cost the training split: `balance` of the manifest. effective_decisions: before and after, as many equally frequent
+    decisions have the same entropy; absent: decisions that no window of the split has."""
 
     model_config = ConfigDict(frozen=True)
 
     ratio: float
     most_windows: int
-    windows: int
-    windows_left_out: int
+    windows: dict[str, int]  # of each decision that occurs, before
+    windows_left_out: dict[str, int]
     samples_left_out: int
-    effective_decisions: BeforeAfter  # as many equally frequent decisions have the same entropy
-    decisions: dict[str, DecisionCost]  # those that occur
-    absent: list[str]  # decisions that no window of the split has
+    effective_decisions: tuple[float, float]
+    absent: list[str]
 
     def __str__(self) -> str:
-        cuts = [
-            f"{decision} {cost.windows} -> {cost.windows - cost.windows_left_out}"
-            f" ({cost.share.before:.1%} -> {cost.share.after:.1%})"
-            for decision, cost in self.decisions.items()
-            if cost.windows_left_out
-        ]
-        whole = [f"{decision} {cost.windows}" for decision, cost in self.decisions.items() if not cost.windows_left_out]
+        counts = [f"{name} {n} -> {n - self.windows_left_out.get(name, 0)}" for name, n in self.windows.items()]
+        before, after = self.effective_decisions
         return (
-            f"balance left {self.windows_left_out} of {self.windows} training windows out ({self.samples_left_out} samples),"
-            f" at most {self.most_windows} a decision: {', '.join(cuts) or 'none was above'}; whole: {', '.join(whole) or 'none'};"
-            f" absent: {', '.join(self.absent) or 'none'}; effective decisions"
-            f" {self.effective_decisions.before:.1f} -> {self.effective_decisions.after:.1f}"
+            f"balance left {sum(self.windows_left_out.values())} of {sum(self.windows.values())} training windows out "
+            f"({self.samples_left_out} samples), at most {self.most_windows} a decision: {', '.join(counts)}; "
+            f"absent: {', '.join(self.absent) or 'none'}; effective decisions {before:.1f} -> {after:.1f}"
         )
 
 
-def cost_of(cut: Cut, samples_left_out: Mapping[str, int]) -> Cost:
-    """Say what a cut cost; `samples_left_out` counts the samples of the windows that it left out, by decision."""
-    before = cut.windows
-    after = {decision: min(count, cut.most_windows) for decision, count in before.items()}
-    num_before, num_after = sum(before.values()), sum(after.values())
+def cost_of(cut: Cut, samples_left_out: int) -> Cost:
+    """Say what a cut cost, which left out so many samples of its windows."""
+    after = {decision: min(count, cut.most_windows) for decision, count in cut.windows.items()}
     return Cost(
         ratio=cut.ratio,
         most_windows=cut.most_windows,
-        windows=num_before,
-        windows_left_out=num_before - num_after,
-        samples_left_out=sum(samples_left_out.values()),
-        effective_decisions=BeforeAfter(before=_effective(before), after=_effective(after)),
-        decisions={
-            decision: DecisionCost(
-                windows=count,
-                windows_left_out=count - after[decision],
-                samples_left_out=samples_left_out.get(decision, 0),
-                share=BeforeAfter(before=round(count / num_before, 4), after=round(after[decision] / num_after, 4)),
-            )
-            for decision, count in before.items()
-        },
-        absent=[action for action in action_tokens() if action not in before],
+        windows=dict(cut.windows),
+        windows_left_out={name: n - after[name] for name, n in cut.windows.items() if n > after[name]},
+        samples_left_out=samples_left_out,
+        effective_decisions=(_effective(cut.windows), _effective(after)),
+        absent=[action for action in action_tokens() if action not in cut.windows],
     )
 
 

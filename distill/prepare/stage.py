@@ -290,10 +290,9 @@ def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int
         facts, left_out = _write(windows, chosen, writer)
     writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
     counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
-    for (reason, _), count in left_out.items():
-        excluded[reason] += count
+    excluded += left_out
     if chosen.cut is not None:
-        cost = cost_of(chosen.cut, {d: count for (reason, d), count in left_out.items() if reason == "balance"})
+        cost = cost_of(chosen.cut, left_out["balance"])
         facts["train"]["balance"] = cost.model_dump()
         log.info("%s: %s", STAGE, cost)
     _warn(facts)
@@ -336,23 +335,23 @@ def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _
 
 def _write(
     windows: _Windows, chosen: _Chosen, writer: TrainingSetWriter
-) -> tuple[dict[str, dict[str, Any]], Counter[tuple[str, str]]]:
+) -> tuple[dict[str, dict[str, Any]], Counter[str]]:
     """Write the samples.
 
     Returns:
-        split -> counts of its samples, by language, by decision, repaired; (reason, decision) -> samples that were not chosen.
+        split -> counts of its samples, by language, by decision, repaired; reason -> samples that were not chosen.
     """
     names = ("language", "decision", "repair")
     counters: dict[str, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
     flights: dict[str, set[str]] = {split: set() for split in SPLITS}
-    left_out = Counter[tuple[str, str]]()
+    left_out = Counter[str]()
     with progress_bar(f"{STAGE}: writing", total=windows.count) as advance:
         for window in windows:
             advance(1)
             reason = chosen.left_out(window) if window.samples else None
             for sample in window.samples:
                 if reason is not None:
-                    left_out[reason, window.decision] += 1
+                    left_out[reason] += 1
                     continue
                 split = chosen.split(window)
                 writer.add(split, sample)
