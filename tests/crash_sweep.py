@@ -106,14 +106,6 @@ def _evaluated(place: Place) -> Path:
     return place.do("distill evaluate", place.root / "evaluated")
 
 
-def _older(place: Place) -> Path:
-    from test_cosfly_trees import make_older
-
-    from specimens import make_playback_tree
-
-    return make_older(make_playback_tree(place.root / "newer", num_flights=1, num_points=7), place.root / "older")
-
-
 def _chat_server(place: Place) -> TeacherServer:
     from teacher_server import TeacherServer
 
@@ -146,7 +138,7 @@ def _served(place: Place) -> str:
 
 
 INPUTS: dict[str, Callable[[Place], object]] = {
-    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "older": _older, "teacher": _teacher, "judge": _judge, "served": _served,
+    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "teacher": _teacher, "judge": _judge, "served": _served,
 }  # fmt: skip
 
 TRAINING = [
@@ -189,11 +181,10 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
     "plan": [["plan", "--map", SIMPLE, "--paths", WALKS, "--out", "{out}", *SETTINGS]],
     "plan compare": [["plan", "compare", SIMPLE, WALKS, "--out", "{out}", *SETTINGS, "--planner", "foresight", "--planner", "track_astar"]],
     "render": [["render", *THREE, "--out", "{out}", "--set", "render.width_px=64", "--set", "render.height_px=36"]],
-    "weather-gallery": [["render", "weather-gallery", "--map", MAPS, "--traces", TRACES, "--out", "{out}", *SETTINGS]],
-    "zoom-study": [["render", "zoom-study", *THREE, "--out", "{out}", "--every", "10"]],
+    "study weather": [["study", "weather", "--map", MAPS, "--traces", TRACES, "--out", "{out}", *SETTINGS]],
+    "study zoom": [["study", "zoom", *THREE, "--out", "{out}", "--every", "10"]],
     "render sample": [["render", "sample", "--data", TREE, "--map", MAPS, "--out", "{out}/sample.png"]],
     "gallery": [["gallery", "--data", TREE, "--out", "{out}"]],
-    "convert-tree": [["convert-tree", "--data", "{older}", "--out", "{out}", "--workers", "1"]],
     "inspect": [["inspect", "--map", SIMPLE, "--traces", TRACES, "--data", TREE, "--out", "{out}", *SETTINGS]],
     "inspect review": [
         lambda place, out: copy_stage(place, out, "inspect"),
@@ -204,7 +195,7 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
         lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
         ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS, "--set", "pedestrians.ground=paved", "--repair"],
     ],
-    "depth-study": [["depth-study", "--data", TREE, "--out", "{out}"]],
+    "study depth": [["study", "depth", "--data", TREE, "--out", "{out}"]],
     "caption": [["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
     "caption, limited": [["caption", "--data", TREE, "--out", "{out}", "--limit", "2", *SETTINGS], ["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
     "caption, served": [["caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--set", "caption.endpoint.concurrency=1", "--no-check", *SETTINGS]],

@@ -43,7 +43,6 @@ from cosfly.chat.refusals import kind_of
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
-from cosfly.depth_study.study import run as study_depth
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
@@ -75,11 +74,11 @@ from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.reading.meshes import Mesh, read_meshes
-from cosfly.render import older_trees
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import read_pools
 from cosfly.simplify import stage as simplify
 from cosfly.simplify.passes import SimplifyConfig
+from cosfly.studies.depth import run as study_depth
 from cosfly.work import in_place, provenance
 from cosfly.work.config import apply_overrides, build
 from cosfly.work.items import Item
@@ -697,7 +696,6 @@ READERS: dict[str, Reader] = {
     "flight's checksums": Reader((f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True),
     "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),
     "inspect": Reader((*FLIGHT, *PICTURES, f"{TREE}/ORI/{FRAME}/meta.json", f"{TREE}/ORI/{CHECKSUMS}", "drone_trace.json", "boxes_3d.json"), _inspected, share=0.2, hashes=True),
-    "convert-tree": Reader(FLIGHT, lambda root, scratch: older_trees.convert_flight(root / TREE / "ORI", scratch / "ORI"), share=0.5),
     "caption": Reader(FLIGHT, _captioned, share=0.1, hashes=True),
     "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2, hashes=True),
     "captions": _one("captions.jsonl", lambda path: list(read_captions(path))),

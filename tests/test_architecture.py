@@ -23,12 +23,11 @@ MUTUAL = {
     ("caption", "caption/writing"),
     ("caption/teachers", "caption/truth"),
     ("cosfly/planners", "cosfly/planners/styles"),
-    ("cosfly/render", "cosfly/render/zoom"),
     ("release", "release/export"),
     ("release", "release/get"),
     ("release", "release/verify"),
 }
-ASSEMBLY = ("app", "bench", "depth_study")  # what may know all stages and siblings
+ASSEMBLY = ("app", "bench", "studies")  # what may know all stages and siblings
 HEAVY = {
     "torch",
     "transformers",

@@ -1,4 +1,4 @@
-"""`cosfly depth-study`: the paper's table where it can be worked out by hand, codings that come back, frames that have nothing to study."""
+"""`cosfly study depth`: the paper's table where it can be worked out by hand, codings that come back, frames that have nothing to study."""
 
 from __future__ import annotations
 
@@ -10,12 +10,21 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.depth_study.picture import PROFILE_STEPS, steady_stretch
-from cosfly.depth_study.study import BITS, ENTROPY_BINS, Study, edge_correlation, entropy_bits, quantised, run
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name
 from cosfly.reading.documents import read_json
+from cosfly.studies.depth import (
+    BITS,
+    ENTROPY_BINS,
+    PROFILE_STEPS,
+    Study,
+    edge_correlation,
+    entropy_bits,
+    quantised,
+    run,
+    steady_stretch,
+)
 from specimens import make_playback_tree
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
@@ -62,13 +71,13 @@ def test_float32_against_float64(tmp_path):
 def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 3, with_augmented=False)
     frame = find_flights(tree)[0] / frame_name(1)
-    answer = CliRunner().invoke(app, ["depth-study", "--data", str(tree), "--out", str(tmp_path / "any")])
+    answer = CliRunner().invoke(app, ["study", "depth", "--data", str(tree), "--out", str(tmp_path / "any")])
     assert answer.exit_code == 0, answer.output
     assert "32-bit float" in (tmp_path / "any/depth_study.md").read_text()
-    answer = CliRunner().invoke(app, ["depth-study", "--frame", str(frame), "--out", str(tmp_path / "out")])
+    answer = CliRunner().invoke(app, ["study", "depth", "--frame", str(frame), "--out", str(tmp_path / "out")])
     assert answer.exit_code == 0, answer.output
     named = ["--data", str(tree), "--frame", frame.relative_to(tree).as_posix(), "--out", str(tmp_path / "named")]
-    assert CliRunner().invoke(app, ["depth-study", *named]).exit_code == 0
+    assert CliRunner().invoke(app, ["study", "depth", *named]).exit_code == 0
     assert (tmp_path / "named/depth_study.md").read_text() == (tmp_path / "out/depth_study.md").read_text()
     study = Study.model_validate(
         {k: v for k, v in read_json(tmp_path / "out/depth_study.json").items() if not k.startswith("schema")}

@@ -33,9 +33,8 @@ from cosfly.products.places import Place, flight_ids, stand, town_folder
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
-from cosfly.render import older_trees
 from cosfly.work.stage_folder import read_failures
-from cosfly.work.store import read_checksums, write_checksums, write_json
+from cosfly.work.store import write_checksums, write_json
 from distill.prepare import stage as prepare
 from distill.prepare.sources import Source as Prepared
 from distill.prepare.stage import PrepareConfig
@@ -152,77 +151,11 @@ def same_flight(one: Path, two: Path) -> None:
             assert_array_equal(getattr(second, name), value, err_msg=name)
 
 
-def test_a_tree_of_before_is_read_and_converted(ours, older, tmp_path):
+def test_a_tree_of_before_is_read(ours, older):
     with pytest.raises(Refused):
         read_public(older)
-    new = older_trees.run(older, tmp_path / "new")
-    assert list(read_public(new)) == ["Town_delft/trajectory_1776047127"]
-    assert (new / "Town_delft/map.json").exists()
-    for theirs, mine, first in zip(find_flights(older), find_flights(new), find_flights(ours), strict=True):
+    for theirs, mine in zip(find_flights(older), find_flights(ours), strict=True):
         same_flight(theirs, mine)
-        same_flight(first, mine)
-        assert read_meta(mine / "frames_playback/frame_00003").town == "Town_delft"
-        assert read_meta(theirs / "frames_playback/frame_00003").town == "delft", "the older tree stays as it is"
-        digests = read_checksums(mine)
-        assert len(digests) == 1 + 4 * 6
-        assert all(sha256_file(mine / name) == digest for name, digest in digests.items())
-        picture = "frames_playback/frame_00000/rgb.png"
-        assert (mine / picture).stat().st_ino == (theirs / picture).stat().st_ino, "linked, not copied"
-    assert json.loads((new / "manifest.json").read_text())["counts"]["kept"] == 2
-
-
-def test_a_conversion_takes_nothing_through_a_link_out_of_the_tree(older, tmp_path):
-    tree, private = copied(older, tmp_path / "tree"), tmp_path / "private"
-    private.write_bytes(b"mine")
-    picture = next(tree.glob("delft/*/aug_001/frames_playback/frame_00002/depth.npy"))
-    picture.unlink()
-    picture.symlink_to(private)
-    new = older_trees.run(tree, tmp_path / "new")
-    assert "a link leads out of its folder" in (new / "failures.jsonl").read_text()
-    assert [folder.name for folder in find_flights(new)] == ["ORI"]
-
-
-def test_a_conversion_that_was_killed_goes_on(older, tmp_path, monkeypatch):
-    whole = older_trees.convert_flight
-
-    def die(source: Path, target: Path) -> int:
-        if source.name == "aug_001":
-            (target / "half").write_text("")
-            raise KeyboardInterrupt
-        return whole(source, target)
-
-    monkeypatch.setattr(older_trees, "convert_flight", die)
-    with pytest.raises(KeyboardInterrupt):
-        older_trees.run(older, tmp_path / "new")
-    assert not (tmp_path / "new/manifest.json").exists()
-    assert not list((tmp_path / "new").rglob("aug_001"))
-    monkeypatch.setattr(older_trees, "convert_flight", whole)
-    assert read_public(older_trees.run(older, tmp_path / "new"))
-    assert not list((tmp_path / "new").rglob("half"))
-
-
-def test_what_is_no_older_tree_is_refused(ours, older, tmp_path):
-    with pytest.raises(InputError, match="nothing to convert"):
-        older_trees.run(ours, tmp_path / "a")
-    with pytest.raises(InputError, match=r"no trajectory\.json"):
-        older_trees.run(tmp_path, tmp_path.parent / "b")
-    with pytest.raises(InputError, match="into itself"):
-        older_trees.run(older, older / "inside")
-    with pytest.raises(InputError, match="not a tree that cosfly wrote"):
-        older_trees.run(copied(older, tmp_path / "above/run").parent, tmp_path / "c")
-    twice = copied(older, tmp_path / "twice")
-    shutil.copytree(twice / "delft", twice / "Town_delft")
-    with pytest.raises(InputError, match="two towns would have one name"):
-        older_trees.run(twice, tmp_path / "d")
-    assert not any((tmp_path / name).exists() for name in "acd")
-
-
-def test_a_trajectory_without_its_twin_is_told(older, tmp_path, caplog):
-    tree = copied(older, tmp_path / "tree")
-    for path in sorted((tree / "delft/trajectory_1776047127/aug_001").rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    older_trees.run(tree, tmp_path / "new")
-    assert "1 trajectories lack a flight" in caplog.text
 
 
 # --- names --------------------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
-from cosfly.render.weather_gallery import run as draw_gallery
+from cosfly.studies.weather import run as draw_gallery
 from cosfly.work.config import build
 
 SIZE = (320, 180)

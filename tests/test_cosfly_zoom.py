@@ -1,4 +1,4 @@
-"""cosfly/render/zoom/: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be drawn."""
+"""cosfly/render/lens.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be drawn."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Segment
 from cosfly.products.traces import DroneTrace
-from cosfly.render import weather_gallery
+from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.render.zoom.lens import ZoomConfig, cameras_of, zoomed_deg
+from cosfly.studies import weather
 from cosfly.work.config import build
 from cosfly.work.stage_folder import read_failures, read_manifest
 from release.columns import INTRINSICS, Placed, matrices_of, scalar_row
@@ -269,7 +269,7 @@ def test_a_map_without_ground_is_an_error(tmp_path):
     for begin in (
         lambda: make_map(of_these_boxes, tmp_path / "maps"),  # before anybody walks or flies there
         lambda: run(RenderConfig.model_validate(SMALL), *inputs, tmp_path / "render"),
-        lambda: weather_gallery.run(RenderConfig(), inputs[0], inputs[2], tmp_path / "gallery"),
+        lambda: weather.run(RenderConfig(), inputs[0], inputs[2], tmp_path / "gallery"),
     ):
         with pytest.raises(InputError, match=r"boxes_3d\.json: the map has no ground.*ground_z_m"):
             begin()

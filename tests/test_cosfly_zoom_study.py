@@ -1,4 +1,4 @@
-"""cosfly/render/zoom/study.py and fidelity.py: the same flights at every level, and optical against digital zoom."""
+"""cosfly/studies/zoom.py: the same flights at every level, and optical against digital zoom."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.frames import Camera
-from cosfly.render.zoom.fidelity import compare, digital_zoom, enlarged_camera, ssim
-from cosfly.render.zoom.study import ZoomStudyConfig, spread, text_rows
+from cosfly.studies.zoom import ZoomStudyConfig, compare, digital_zoom, enlarged_camera, spread, ssim, text_rows
 from cosfly.work.stage_folder import read_manifest
 
 LEVELS = [110.0, 60.0, 30.0]
@@ -104,7 +103,7 @@ def studied(tmp_path_factory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("study")
     boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), IN_THE_WALL])
     result = CliRunner().invoke(app, [
-        "render", "zoom-study", "--map", str(boxes), "--simplified", str(simplified), "--traces", str(traces), "--out", str(folder / "out"),
+        "study", "zoom", "--map", str(boxes), "--simplified", str(simplified), "--traces", str(traces), "--out", str(folder / "out"),
         "--every", "2", "--workers", "0", "--set", "max_failed=1", "--set", f"render.fovs_deg={LEVELS}", "--set", "render.width_px=640",
         "--set", "render.height_px=360",
     ])  # fmt: skip

@@ -58,13 +58,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, render_app, bench_app, studies_app):
+for group in (run_app, stages_app, render_app, bench_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (
     ("caption", caption_app),
     ("distill", distill_app),
     ("export", export_app),
     ("release", release_app),
+    ("study", studies_app),
 ):
     app.add_typer(named_group, name=name)
 

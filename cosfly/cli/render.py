@@ -1,4 +1,4 @@
-"""The commands of step 5 and of pictures that are there: `cosfly render ...`, `gallery`, `convert-tree`."""
+"""The commands of step 5 and of pictures that are there: `cosfly render ...`, `gallery`."""
 
 from __future__ import annotations
 
@@ -60,79 +60,6 @@ def render(
     options.tell_product(product, folder, cfg)
 
 
-@render_app.command("weather-gallery")
-def weather_gallery(
-    map_: options.Map,
-    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: Annotated[Path, typer.Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
-    trajectory: Annotated[int, typer.Option(help="Which flight of the traces, counted from 0.")] = 0,
-    frame: Annotated[
-        int | None, typer.Option(help="Which of its frames. [default: the one that looks down least]")
-    ] = None,
-    fov: Annotated[float, typer.Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
-    weather_pool: options.WeatherPool = None,
-    tod_pool: options.TimePool = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-) -> None:
-    """One view under every weather and time of day: nine pictures, and a sheet of all."""
-    from cosfly.render import weather_gallery
-    from cosfly.render.weather import read_pools
-    from cosfly.work.console import progress_bar
-
-    pools = {"render.weather_pool": weather_pool, "render.tod_pool": tod_pool}
-    mode = {"render.weather_mode": "random_per_path"} if any(pools.values()) else {}
-    cfg = options.resolve(config, overrides, {"seed": seed, **mode, **pools})
-    presets = read_pools(cfg.render)
-    with progress_bar("weather-gallery: pictures", len(presets.weathers) * len(presets.times)) as advance:
-        product = weather_gallery.run(
-            cfg.render, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=cfg.seed, advance=lambda: advance(1),
-        )  # fmt: skip
-    for path in product:
-        typer.echo(path)
-
-
-@render_app.command("zoom-study")
-def render_zoom_study(
-    map_: options.Map,
-    simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
-    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: options.Out,
-    flights: Annotated[int | None, typer.Option(help="Flights at most. [default: 50]")] = None,
-    every: Annotated[int | None, typer.Option(help="Every how many frames of a flight are drawn. [default: 2]")] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
-) -> None:
-    """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
-    from rich.table import Table
-
-    from cosfly.reading.documents import read_object
-    from cosfly.render.zoom import study
-    from cosfly.work.config import build
-    from cosfly.work.console import console
-
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(out, repair)
-    options.verify_first(verify, map_, simplified, traces, out)
-    given = {"num_flights": flights, "every": every}
-    settings = cfg.render.model_dump() | {name: value for name, value in given.items() if value is not None}
-    studied = build(study.ZoomStudyConfig, settings, "--flights, --every")
-    product = study.run(studied, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
-    table = Table(title="Zoom (mean ± standard deviation over flights)", title_justify="left")
-    for column in ("level", "deg", "35 mm", "target px", "visibility %", "IoU"):
-        table.add_column(column)
-    for row in study.text_rows(read_object(product, what="zoom study")):
-        table.add_row(*row)
-    console.print(table)
-    options.tell_product(product, out, cfg)
-
-
 @render_app.command("sample")
 def render_sample(
     out: Annotated[Path, typer.Option(help="PNG to write.")],
@@ -180,23 +107,3 @@ def gallery(
     contact_sheet(tree, out / "contact_sheet.png", choice)
     preview_gif(tree, out / "preview.gif", choice)
     typer.echo(out)
-
-
-@app.command("convert-tree")
-def convert_tree(
-    data: Annotated[Path, typer.Option(help="Playback tree of an earlier cosfly; it stays as it is.")],
-    out: Annotated[Path, typer.Option(help="Folder of the converted tree.")],
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
-) -> None:
-    """An older playback tree to one that public readers of CosFly-Track take; pictures are linked, not copied."""
-    from cosfly.render import older_trees
-
-    cfg = options.resolve(config, overrides, {"workers": workers})
-    options.set_aside(out, repair)
-    options.verify_first(verify, data, out)
-    options.tell_product(older_trees.run(data, out, **options.manner(cfg, resume)), out, cfg)

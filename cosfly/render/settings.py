@@ -8,9 +8,9 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
 from cosfly.products.places import folder_name
+from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.weather import WeatherConfig
-from cosfly.render.zoom.lens import ZoomConfig
 from cosfly.work.config import MayDiffer
 
 

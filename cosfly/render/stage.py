@@ -27,13 +27,13 @@ from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, render_flight
+from cosfly.render.lens import cameras_of
 from cosfly.render.others import NOBODY, Cast, cast_of
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Perturbed, Poses, Surroundings, perturb
 from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
-from cosfly.render.zoom.lens import cameras_of
 from cosfly.work.chance import rng_for
 from cosfly.work.provenance import checked_inputs, fingerprint
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items

@@ -1,4 +1,4 @@
-"""`cosfly render zoom-study`: the same flights at every level of zoom (tab:zoom_eval), and optical against digital zoom.
+"""`cosfly study zoom`: the same flights at every level of zoom (tab:zoom_eval), and optical against digital zoom.
 
 Every flight is flown clean at each level, so that differences are the lens's alone. What is measured of a frame: the size of the target's
 projected 3D box, its rendered visibility, and the IoU of that box with the box of the person's pixels (track quality). Means are taken over
@@ -8,16 +8,18 @@ the frames of a flight that show some of the target, then over flights; the spre
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
 from cosfly.geometry import box_iou, intrinsic_matrix
+from cosfly.look.topview import add_caption
 from cosfly.products.boxes import check_ground, read_boxes
-from cosfly.products.frames import Camera, level_name
+from cosfly.products.frames import Camera, level_name, rgb_bytes
 from cosfly.products.traces import read_traces
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, draw_frame
@@ -25,7 +27,6 @@ from cosfly.render.perturbation import Surroundings
 from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
-from cosfly.render.zoom.fidelity import KERNELS, compare, digital_zoom, enlarged_camera
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
@@ -41,6 +42,12 @@ PAPER = {
     60: (32, 64, 71.3, 0.88),
     30: (68, 136, 52.1, 0.93),
 }  # tab:zoom_eval
+KERNELS = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
+# Structural similarity of Wang, Bovik, Sheikh and Simoncelli 2004: an 11 px Gaussian window of 1.5 px, and its two constants.
+WINDOW_PX, SIGMA_PX, K1, K2 = 11, 1.5, 0.01, 0.03
+MOST_FLIGHTS = 4
+TILE_WIDTH_PX, PANEL_WIDTH_PX = 480, 960
+BOX_COLOR = (255, 40, 40)
 
 
 class ZoomStudyConfig(RenderConfig):
@@ -88,6 +95,67 @@ def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
 def at_level(script: FlightScript, camera: Camera) -> FlightScript:
     """The same flight through another lens."""
     return replace(script, cameras=(camera,) * len(script.cameras))
+
+
+# --- optical against digital zoom (fig:zoom_fidelity) -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """A digital picture against the optical one of the same view. psnr_db of all three channels; ssim of brightness; sharpness: its mean
+    squared gradient of brightness as a share of the optical one's, 1 where it is as sharp.
+    """
+
+    psnr_db: float
+    ssim: float
+    sharpness: float
+
+    def as_json(self) -> dict[str, float]:
+        return {name: round(value, 4) for name, value in asdict(self).items()}
+
+
+def enlarged_camera(camera: Camera, magnification: float) -> Camera:
+    """The camera whose picture shows the middle of another's so many times as large."""
+    intrinsic = camera.intrinsic.copy()
+    intrinsic[[0, 1], [0, 1]] *= magnification
+    return replace(camera, intrinsic=intrinsic)
+
+
+def digital_zoom(rgb: np.ndarray, magnification: float, kernel: str) -> np.ndarray:
+    """Enlarge the middle of a picture, (h, w, 3) uint8, to all of it, as exactly as `enlarged_camera` does."""
+    height, width = rgb.shape[:2]
+    # Pixel (u, v) of the result samples the place that the same ray has in the wide picture; centres lie at + 0.5.
+    offsets = [(side - 1) / 2.0 * (1.0 - 1.0 / magnification) for side in (width, height)]
+    matrix = np.array([[1.0 / magnification, 0.0, offsets[0]], [0.0, 1.0 / magnification, offsets[1]]])
+    return cv2.warpAffine(rgb, matrix, (width, height), flags=KERNELS[kernel] | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+
+
+def compare(digital: np.ndarray, optical: np.ndarray) -> Fidelity:
+    """Measure a digital picture against an optical one, (h, w, 3) uint8 each."""
+    error = float(np.mean((digital.astype(np.float64) - optical.astype(np.float64)) ** 2))
+    psnr_db = float("inf") if error == 0 else 10.0 * np.log10(255.0**2 / error)
+    mine, theirs = (cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float64) for rgb in (digital, optical))
+    edges = _edges(theirs)
+    return Fidelity(min(psnr_db, 99.0), ssim(mine, theirs), _edges(mine) / edges if edges else 1.0)
+
+
+def ssim(one: np.ndarray, two: np.ndarray) -> float:
+    """Mean structural similarity of two grey pictures, (h, w) float64 from 0 to 255; 1 for equal ones."""
+
+    def blurred(picture: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(picture, (WINDOW_PX, WINDOW_PX), SIGMA_PX)
+
+    mean_one, mean_two = blurred(one), blurred(two)
+    var_one, var_two = blurred(one * one) - mean_one**2, blurred(two * two) - mean_two**2
+    shared = blurred(one * two) - mean_one * mean_two
+    c1, c2 = (K1 * 255.0) ** 2, (K2 * 255.0) ** 2
+    above = (2.0 * mean_one * mean_two + c1) * (2.0 * shared + c2)
+    below = (mean_one**2 + mean_two**2 + c1) * (var_one + var_two + c2)
+    return float((above / below).mean())
+
+
+def _edges(grey: np.ndarray) -> float:
+    return float(np.mean(np.diff(grey, axis=0)[:, :-1] ** 2 + np.diff(grey, axis=1)[:-1] ** 2))
 
 
 # --- one flight -------------------------------------------------------------------------------------------------------
@@ -190,8 +258,6 @@ def run(
     Raises:
         NothingKept: no flight could be drawn.
     """
-    from cosfly.render.zoom.figures import draw_fidelity, draw_levels
-
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "zoom_study.json"
@@ -205,7 +271,7 @@ def run(
     steps = len(cfg.levels_deg)
     items = [Item(t.path_id, k, steps * len(range(0, len(t.time_s), cfg.every))) for k, t in passed]
     arguments = (cfg, boxes, simplified, traces, seed)
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="zoom-study: frames")
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="study zoom: frames")
     if not finished.kept:
         raise stage.nothing_kept(finished.tally, expected="a flight that can be drawn")
     studied = {record.id: result_of(record, Studied) for record in finished.kept}
@@ -281,3 +347,55 @@ def _cell(found: dict[str, float | None], digits: int, scale: float = 1.0) -> st
     if found["mean"] is None or found["std"] is None:
         return "-"
     return f"{scale * found['mean']:.{digits}f} ± {scale * found['std']:.{digits}f}"
+
+
+# --- pictures: flights by levels (fig:zoom_demo), optical beside digital zoom ---------------------------------------------
+
+
+def draw_levels(renderer: Renderer, shown: Sequence[tuple[FlightScript, int]], cfg: ZoomStudyConfig) -> bytes:
+    """Draw one frame of up to four flights, a row each, at every level, widest first; a PNG.
+
+    Args:
+        shown: flights, and which of their frames.
+    """
+    rows = []
+    picked = np.unique(np.linspace(0, len(shown) - 1, min(len(shown), MOST_FLIGHTS)).round().astype(int))
+    for script, i in (shown[k] for k in picked.tolist()):
+        ready(renderer, script)
+        tiles = []
+        for fov in cfg.levels_deg:
+            drawn = at_level(script, camera_of(cfg, fov))
+            frame, seen = draw_frame(renderer, drawn, i, script.perturbed.poses, cfg.visible_threshold)
+            rgb = frame.rgb.copy()
+            if seen.view.in_view:
+                x0, y0, x1, y1 = seen.view.bbox_px.round().astype(int).tolist()
+                cv2.rectangle(rgb, (x0, y0), (x1, y1), (255, 214, 10), max(1, cfg.width_px // 640))
+            size = "" if not seen.view.in_view else f", target {x1 - x0} x {y1 - y0} px"
+            tiles.append(add_caption(_scaled(rgb, TILE_WIDTH_PX), f"{level_name(fov)} {fov:g} deg{size}"))
+        rows.append(np.hstack(tiles))
+    return rgb_bytes(np.vstack(rows))
+
+
+def draw_fidelity(renderer: Renderer, script: FlightScript, i: int, cfg: ZoomStudyConfig) -> bytes:
+    """Draw the widest picture with the part that is enlarged most, the digital enlargements of it, and what a longer lens shows; a PNG."""
+    ready(renderer, script)
+    wide = at_level(script, camera_of(cfg, cfg.levels_deg[0]))
+    rgb = draw_frame(renderer, wide, i, script.perturbed.poses, 0.0)[0].rgb.copy()
+    most = max(cfg.magnifications)
+    optical, digital = optical_and_digital(renderer, script, i, cfg)[f"{most:g}"]
+    (width, height), half = (cfg.width_px, cfg.height_px), 0.5 / most
+    corner, other = (round(width * (0.5 - half)), round(height * (0.5 - half))), (round(width * (0.5 + half)), round(height * (0.5 + half)))  # fmt: skip
+    cv2.rectangle(rgb, corner, other, BOX_COLOR, max(2, width // 400))
+    panels = [(rgb, f"{cfg.levels_deg[0]:g} deg, 1.0x")]
+    for kernel, picture in digital.items():
+        found = compare(picture, optical)
+        panels.append((picture, f"digital {most:g}x, {kernel}: {found.psnr_db:.1f} dB, SSIM {found.ssim:.2f}, sharpness {found.sharpness:.2f}"))  # fmt: skip
+    panels.append((optical, f"optical {most:g}x"))
+    tiles = [add_caption(_scaled(picture, PANEL_WIDTH_PX), title) for picture, title in panels]
+    return rgb_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
+
+
+def _scaled(rgb: np.ndarray, width_px: int) -> np.ndarray:
+    height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
+    method = cv2.INTER_AREA if rgb.shape[1] > width_px else cv2.INTER_NEAREST
+    return cv2.resize(rgb, (width_px, height_px), interpolation=method)

@@ -1,1 +1,0 @@
-"""Zoom: levels, changes between them, and what they cost (app:zoom)."""
