@@ -22,7 +22,6 @@ MUTUAL = {
     ("caption", "caption/truth"),
     ("caption", "caption/writing"),
     ("caption/teachers", "caption/truth"),
-    ("cosfly/planners", "cosfly/planners/styles"),
     ("release", "release/export"),
     ("release", "release/get"),
     ("release", "release/verify"),

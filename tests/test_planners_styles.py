@@ -12,11 +12,11 @@ from caption.truth.actions import label_of, measure
 from cosfly.errors import InputError, NoPathError
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.planners.courses import wish_of
+from cosfly.planners.intent import draw_intent
+from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import make_scenario, plan_flight, run, style_rng
-from cosfly.planners.styles.courses import wish_of
-from cosfly.planners.styles.drawing import draw_intent
-from cosfly.planners.styles.reacquire import finds_again, screens_of
-from cosfly.planners.styles.table import (
+from cosfly.planners.styles import (
     ALTITUDE_LEAST_M,
     FOLLOW,
     HIDING,

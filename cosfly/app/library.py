@@ -75,7 +75,7 @@ def plan(
     Raises:
         ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight that is free of collisions.
     """
-    from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
 
     walking = build(PedestriansConfig, walk or {}, "plan: walk")

@@ -183,7 +183,7 @@ class CompareConfig(PlanConfig):
 
 def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk with each of the planners."""
-    from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)

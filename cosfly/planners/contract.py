@@ -21,7 +21,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import nearest
 from cosfly.geometry import DT_S
-from cosfly.planners.styles.table import NAMES
+from cosfly.planners.styles import NAMES
 from cosfly.products.segments import FOLLOW
 from cosfly.space.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,

@@ -27,7 +27,7 @@ from cosfly.work.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
 from cosfly.work.store import write_bytes
 
 if TYPE_CHECKING:
-    from cosfly.planners.styles.drawing import Intent
+    from cosfly.planners.intent import Intent
     from cosfly.space.kernels import BoxIndex
 
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
@@ -81,7 +81,7 @@ def plan_flight(
     Raises:
         NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
     """
-    from cosfly.planners.styles.drawing import Intent, draw_intent
+    from cosfly.planners.intent import Intent, draw_intent
 
     scenario = make_scenario(walk, obstacles, cfg)
     screens = obstacles if screens is None else screens
@@ -109,8 +109,8 @@ def style_rng(walk: Walk, seed: int) -> np.random.Generator:
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
-    from cosfly.planners.styles.camera import view_of
-    from cosfly.planners.styles.drawing import why_not_held
+    from cosfly.planners.camera import view_of
+    from cosfly.planners.intent import why_not_held
     from cosfly.space.kernels import segments_hit, signed_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)
@@ -169,7 +169,7 @@ def drop_reason(
 
 def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk."""
-    from cosfly.planners.styles.reacquire import screens_of
+    from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.geometry import look_at
-from cosfly.planners.styles.drawing import Intent
+from cosfly.planners.intent import Intent
 
 TURNS_S = 0.8  # standard deviation of the smoothing of a turn while it searches
 HOME_PITCH_DEG, HOME_TURN_DPS = -15.0, 45.0  # how fast the view turns at most, on the way home

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.courses import wish_of
-from cosfly.planners.styles.mission import wish_of_mission
-from cosfly.planners.styles.reacquire import finds_again, wish_of_reacquire
-from cosfly.planners.styles.table import REACQUIRE, RETURN_HOME, WHOLE
+from cosfly.planners.courses import wish_of
+from cosfly.planners.mission import wish_of_mission
+from cosfly.planners.reacquire import finds_again, wish_of_reacquire
+from cosfly.planners.styles import REACQUIRE, RETURN_HOME, WHOLE
 from cosfly.products.segments import FOLLOW, Mission, Segment
 from cosfly.work.chance import draw_by_share
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.table import ALTITUDE_LEAST_M, TABLE, Range, Style
+from cosfly.planners.styles import ALTITUDE_LEAST_M, TABLE, Range, Style
 from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.courses import ROUNDING_S
-from cosfly.planners.styles.table import ALTITUDE_LEAST_M
+from cosfly.planners.courses import ROUNDING_S
+from cosfly.planners.styles import ALTITUDE_LEAST_M
 from cosfly.products.segments import MISSION_KINDS, Mission
 
 BREAKS_OFF_S = 4.0

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles.courses import places_of, without_jumps
-from cosfly.planners.styles.table import HIDING
+from cosfly.planners.courses import places_of, without_jumps
+from cosfly.planners.styles import HIDING
 from cosfly.products.kinds import KINDS
 
 if TYPE_CHECKING:

@@ -1,1 +1,0 @@
-"""Styles of a flight: what it should be at each waypoint, drawn from a table."""
