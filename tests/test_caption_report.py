@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import pytest
 
 from caption.run.ledger import NUM_CARDS, CaptionReport, Shelf
-from caption.run.report import STATES, page_html
+from caption.run.report import page_html
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.budget import BudgetConfig
@@ -85,7 +85,7 @@ def test_text_of_a_teacher_cannot_become_markup(done):
     report = report_of(done)
     caption = next(read_captions(done / "captions.jsonl"))
     evil = caption.en.model_copy(update={"reasoning_trace": "<script>alert(1)</script> & so on"})
-    page = page_html(report, [caption.model_copy(update={"en": evil})], {}, BudgetConfig())
+    page = page_html(report, [caption.model_copy(update={"en": evil})], {}, BudgetConfig(), "x")
     assert "<script" not in page
     assert "&lt;script&gt;" in page
     assert page.count(">no picture<") == 5
@@ -94,9 +94,9 @@ def test_text_of_a_teacher_cannot_become_markup(done):
 def test_cost_is_told_when_there_are_prices(done):
     used = {"prompt_tokens": 2_000_000, "completion_tokens": 100_000}
     report = report_of(done).model_copy(update={"tokens": used})
-    page = page_html(report, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0))
+    page = page_html(report, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0), "x")
     assert ">1.30<" in page
-    assert "no prices set" in page_html(report, [], {}, BudgetConfig())
+    assert "no prices set" in page_html(report, [], {}, BudgetConfig(), "x")
 
 
 def test_cards_do_not_depend_on_the_order_and_show_every_kind(done):
@@ -118,6 +118,8 @@ def test_sentences_are_marked_by_what_was_read_of_them(done):
         update={"critical_components": "It is near. It is <red>!", "reasoning_trace": "So be it."}
     )
     checks = caption.checks.model_copy(update={"sentences": {"en": ["proved", "unread", "contradicted"]}})
-    page = page_html(report_of(done), [caption.model_copy(update={"en": answer, "checks": checks})], {}, BudgetConfig())
+    page = page_html(
+        report_of(done), [caption.model_copy(update={"en": answer, "checks": checks})], {}, BudgetConfig(), "x"
+    )
     for text, state in (("It is near.", "proved"), ("It is &lt;red&gt;!", "unread"), ("So be it.", "contradicted")):
-        assert f'solid {STATES[state]}">{text}</span>' in page
+        assert f'class="sentence {state}">{text}</span>' in page

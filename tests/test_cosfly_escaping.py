@@ -23,7 +23,7 @@ from caption.run.stage import run as caption
 from caption.schema import CaptionConfig
 from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import InputError
-from cosfly.escaping import LONGEST, cut, for_html, for_markdown, for_terminal, markdown_code
+from cosfly.escaping import LONGEST, cut, for_markdown, for_terminal, markdown_code
 from cosfly.inspection.report import FlightView, report_html
 from cosfly.inspection.stage import run as inspect
 from cosfly.products.captions import Caption, read_captions
@@ -190,7 +190,9 @@ def check_page(page: str, honest: str) -> None:
 def test_the_page_of_an_inspection_shows_forged_records(inspection):
     honest = read_inspection(inspection)
     false = forged(Inspection, honest, 8)
-    check_page(report_html(false, {}, page_mb=25.0), (inspection.parent / "report.html").read_text(encoding="utf-8"))
+    check_page(
+        report_html(HOSTILE, false, {}, page_mb=25.0), (inspection.parent / "report.html").read_text(encoding="utf-8")
+    )
 
 
 def test_a_forged_journal_of_an_inspection_is_refused():
@@ -205,7 +207,7 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     value = read_json(done / "caption_report.json")
     report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
     cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
-    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig())
+    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
 
@@ -246,7 +248,3 @@ def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
     assert "alert(1)" in page
     assert not {"script", "img", "a"} & {tag for tag, *_ in Tags(page).seen}
     assert not OBEYED.search(card.replace("\n", ""))
-
-
-def test_html_is_shown_as_it_is():
-    assert for_html('<a href="b">\'&') == "&lt;a href=&quot;b&quot;&gt;&#x27;&amp;"

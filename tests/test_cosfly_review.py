@@ -261,7 +261,7 @@ def test_a_page_of_hundreds_of_flights_is_bounded(product):
         for i in range(300)
     ]
     shown = {flight.folder: views[one.folder] for flight in many}
-    page = report_html(inspection.model_copy(update={"flights": many}), shown, page_mb=1.0)
+    page = report_html("x", inspection.model_copy(update={"flights": many}), shown, page_mb=1.0)
     assert len(page) < 1.6e6
     kept = page.count('class="look"')
     assert 5 <= kept < 300

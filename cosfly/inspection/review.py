@@ -7,18 +7,18 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
-from cosfly.escaping import for_html, html_page, json_block
 from cosfly.inspection.flight import Inspected
-from cosfly.inspection.report import HEAD, LEGEND, STYLE, cards
+from cosfly.inspection.report import COLUMNS, STYLE, cards
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
-from cosfly.products.inspection import FlightInspection, read_inspection
+from cosfly.look.page import page, run_name
+from cosfly.products.inspection import read_inspection
 from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions, undecided
 from cosfly.reading.documents import read_model
 from cosfly.reading.files import read_text, sha256_file
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Failed, read_item, result_of
-from cosfly.work.store import dump_json, write_bytes
+from cosfly.work.store import write_bytes
 
 SCHEMA, VERSION = "cosfly.review", "1.0"
 FILLED = "decisions.json"  # as the page saves it
@@ -84,39 +84,16 @@ def write_page(inspected: Path) -> Path:
 
 
 def page_html(inspected: Path) -> str:
-    """Give the page's text. It works without a network, and saves a file that `cosfly inspect review --decisions` takes."""
-    inspection, decisions = read_inspection(inspected), read_decisions(inspected)
+    """Give the page. It works without a network, and saves a file that `cosfly inspect review --decisions` takes."""
+    inspection = read_inspection(inspected)
     queue = [flight for flight in inspection.flights if flight.result == "review"]
     page_mb = float(inspection.settings.get("page_mb", InspectConfig().page_mb))
-    rows, left_out = cards(
-        queue, _views(inspected), page_mb, lambda flight: _choice(flight, decisions.get(flight.folder))
-    )
-    about = f"{len(queue)} flights are in review." + (
-        f" {left_out} of them without pictures: the page is held to {page_mb:g} MB." if left_out else ""
-    )
-    body = f"""<h1>Review</h1>
-<p class="lead">{for_html(about)} Accept or reject each, say why, and save: the file goes to <code>cosfly inspect review --inspect ... --decisions FILE</code>.
-Flights that are left open stay in review.</p>
-<p><label>decided by <input id="by" maxlength="200" placeholder="your name"></label> <button id="save" type="button">save decisions</button> <span id="state"></span></p>
-<p class="lead">{LEGEND}</p>
-{HEAD}
-{rows}
-<p><textarea id="text" readonly hidden rows="8"></textarea></p>
-{json_block("data", dump_json({"schema": SCHEMA, "schema_version": VERSION, "inspection": sha256_file(inspected), "file": FILLED}))}"""
-    return html_page("cosfly: review", STYLE, body, SCRIPT)
-
-
-def _choice(flight: FlightInspection, decision: Decision | None) -> str:
-    """Give the fields of one flight; a decision that stands is told, and filled in."""
-    verdict = decision.verdict if decision else None
-    name = for_html(flight.folder)
-    radios = "".join(
-        f'<label><input type="radio" name="{name}" value="{value}"{" checked" if value == verdict else ""}> {word}</label> '
-        for value, word in (("accepted", "accept"), ("rejected", "reject"))
-    )
-    told = f"<small>{decision.verdict} by {for_html(decision.by)}, {for_html(decision.at)}</small>" if decision else ""
-    reason = for_html(decision.reason) if decision else ""
-    return f'<p class="choice" data-folder="{name}">{radios}<input class="reason" maxlength="2000" placeholder="why" value="{reason}"> {told}</p>'
+    rows, left_out = cards(queue, _views(inspected), page_mb, read_decisions(inspected))
+    data = {"schema": SCHEMA, "schema_version": VERSION, "inspection": sha256_file(inspected), "file": FILLED}
+    return page(
+        "cosfly/inspection/review.html", title=run_name(inspected.parent), style=STYLE, script=SCRIPT, columns=COLUMNS, cards=rows,
+        left_out=left_out, page_mb=page_mb, data=data,
+    )  # fmt: skip
 
 
 def _views(inspected: Path) -> dict[str, FlightView]:

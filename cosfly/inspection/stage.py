@@ -12,9 +12,10 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
-from cosfly.inspection.report import write_report
+from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
+from cosfly.look.page import run_name
 from cosfly.products.boxes import read_boxes
 from cosfly.products.coverage import Coverage
 from cosfly.products.flights import find_flights
@@ -35,6 +36,7 @@ from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.work.provenance import recorded_digests
 from cosfly.work.runner import Finished, Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, result_of
+from cosfly.work.store import write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +93,7 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
-    write_report(out / "report.html", inspection, views, cfg.page_mb)
+    write_bytes(out / "report.html", report_html(run_name(out), inspection, views, cfg.page_mb).encode())
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     _tell_review(inspection.funnel.flights, out)
     return product

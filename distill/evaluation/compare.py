@@ -12,7 +12,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
-from cosfly.escaping import for_html, for_markdown, html_page
+from cosfly.escaping import for_markdown
+from cosfly.look.page import page
 from cosfly.products.actions import one_set
 from cosfly.work import in_place
 from cosfly.work.chance import rng_for
@@ -21,6 +22,7 @@ from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_model
 from distill.evaluation.measure import STUDENT, Measured, Report, read_report
 from distill.evaluation.pages import (
+    COLORS,
     NOTHING,
     STYLE,
     decision_bars,
@@ -251,27 +253,17 @@ def _how(comparison: Comparison, pairing: Pairing) -> str:
 def page_of(comparison: Comparison, reports: Names) -> str:
     """Give the comparison as a page that needs nothing but itself."""
     header, rows = _rows(comparison, reports)
-    body = ["<h1>Students side by side</h1>", _html_table(header, rows)]
-    body += [f"<p>{for_html(name)}: {for_html(model)}</p>" for name, model in comparison.models.items()]
-    body += [f'<p class="lead">Not comparable: {for_html(words)}</p>' for words in comparison.not_comparable]
-    body.append(f'<div class="panel"><h3>Accuracy by decision</h3>{decision_bars(comparison.students)}</div>')
+    charts = [("Accuracy by decision", decision_bars(comparison.students))]
     histograms = {name: found for name, report in reports.items() if (found := report.all.histogram_f1) is not None}
     if histograms:
-        body.append(f'<div class="panel"><h3>BERTScore F1 of parsed answers</h3>{histogram(histograms)}</div>')
-        body.append(f'<div class="panel"><h3>BERTScore, all answers</h3>{score_bars(comparison.students)}</div>')
-    for name, own in comparison.students.items():
-        body.append(f'<div class="panel"><h3>{for_html(name)}: reference against answer</h3>{heat_map(own)}</div>')
-    for pairing in comparison.pairings:
-        body.append(f"<h2>{for_html(pairing.first)} less {for_html(pairing.second)}</h2>")
-        body.append(f'<p class="lead">{for_html(_how(comparison, pairing))}</p>{_html_table(_HEADER, _said(pairing))}')
-    body.append("<h2>All figures</h2>" + figure_table(everyone_of(comparison)))
-    return html_page("cosfly: students side by side", STYLE, "\n".join(body))
-
-
-def _html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    heads = "".join(f"<th>{for_html(cell)}</th>" for cell in header)
-    lines = "".join(
-        f"<tr><th>{for_html(row[0])}</th>{''.join(f'<td>{for_html(cell)}</td>' for cell in row[1:])}</tr>"
-        for row in rows
-    )
-    return f'<div class="panel"><table class="figures"><tr>{heads}</tr>{lines}</table></div>'
+        charts.append(("BERTScore F1 of parsed answers", histogram(histograms)))
+        charts.append(("BERTScore, all answers", score_bars(comparison.students)))
+    charts += [(f"{name}: reference against answer", heat_map(own)) for name, own in comparison.students.items()]
+    pairings = [
+        {"title": f"{one.first} less {one.second}", "how": _how(comparison, one), "rows": _said(one)}
+        for one in comparison.pairings
+    ]
+    return page(
+        "distill/evaluation/comparison.html", title=", ".join(comparison.students), style=STYLE, colors=COLORS, comparison=comparison,
+        header=header, rows=rows, figures=charts, pairings=pairings, difference_header=_HEADER, everyone=figure_table(everyone_of(comparison)),
+    )  # fmt: skip

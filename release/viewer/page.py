@@ -9,9 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from cosfly.escaping import for_html, for_terminal, html_page, json_block
+from cosfly.escaping import for_terminal
+from cosfly.look.page import page
 from cosfly.reading.files import read_text
-from cosfly.work.store import dump_json, write_bytes
+from cosfly.work.store import write_bytes
 from release.viewer.of_release import show_release
 from release.viewer.of_run import show_run
 from release.viewer.schema import Shown, ViewerConfig
@@ -36,15 +37,10 @@ def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None
 def page_html(shown: Shown) -> str:
     """Give the page's text."""
     style, script = (read_text(Path(__file__).with_name(name)) for name in ("viewer.css", "viewer.js"))
-    title = for_html(f"{shown.title}")
-    notes = "".join(f"<p>{for_html(note)}</p>" for note in shown.notes)
-    data = json_block("data", dump_json(_printable(shown.model_dump(mode="json", exclude_defaults=False))))
-    body = f"""<header><h1>{title}</h1><p id="lead"></p><details id="notes"{"" if notes else " hidden"}><summary>What this page leaves out</summary>{notes}</details>
-<form id="filters"></form></header>
-<main><nav id="flights" aria-label="flights"></nav><section id="stage"></section><aside id="map"></aside><section id="caption"></section></main>
-<noscript><p>This page needs JavaScript: everything it shows is in it, nothing is loaded.</p></noscript>
-{data}"""
-    return html_page(f"cosfly: {shown.title}", style, body, script)
+    data = _printable(shown.model_dump(mode="json", exclude_defaults=False))
+    return page(
+        "release/viewer/viewer.html", title=shown.title, style=style, script=script, notes=shown.notes, data=data
+    )
 
 
 def _printable(value: Any) -> Any:

@@ -1,0 +1,71 @@
+"""HTML pages: templates of the rooms that write them, all on one base page with one style; they stand alone, without a network.
+
+Every text that a template prints is cut and escaped (autoescape); only markup of templates themselves, the style and the script are not.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+import cosfly
+from cosfly.escaping import for_terminal
+from cosfly.reading.files import read_text
+from cosfly.work.store import dump_json
+
+ROOT = Path(cosfly.__file__).parents[1]  # cosfly, caption, distill and release stand side by side
+
+
+def page(template: str, *, title: str, style: str = "", script: str = "", **values: Any) -> str:
+    """Give a page.
+
+    Args:
+        template: its path from the folder of the packages. title: the name of what it shows. style, script: our own, beside the base page's.
+    """
+    style = read_text(Path(__file__).with_name("templates") / "page.css") + style
+    return _environment().get_template(template).render(
+        title=title, style=Markup(style), script=Markup(script), policy=Markup(_policy(script)), **values
+    )  # fmt: skip
+
+
+def fragment(template: str, **values: Any) -> str:
+    """Give a part of a page, which another template prints as it is."""
+    return Markup(_environment().get_template(template).render(**values))
+
+
+def run_name(folder: Path) -> str:
+    """Give the name that a person knows a stage's folder by: the run's, where it stands in one."""
+    folder = folder.resolve()
+    return folder.parent.name if (folder.parent / "run.yaml").is_file() else folder.name
+
+
+def _policy(script: str) -> str:
+    """Let a page show itself and run the one script of ours, named by its hash: no other script, request or form, even where an escape fails."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    allowed = f"script-src 'sha256-{digest}'; " if script else ""
+    return f"default-src 'none'; {allowed}img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+
+@lru_cache(maxsize=1)
+def _environment() -> Environment:
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, finalize=_printed, trim_blocks=True, lstrip_blocks=True,
+        loader=FunctionLoader(lambda name: read_text(ROOT / name)),
+    )  # fmt: skip
+    environment.filters["words"] = lambda name: str(name).replace("_", " ")
+    environment.filters["thousands"] = "{:,}".format
+    environment.policies["json.dumps_function"] = lambda value, **_: dump_json(value)
+    return environment
+
+
+def _printed(value: Any) -> Any:
+    """Cut texts and take control characters out of them before they are escaped; a value that is not known is a dash."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return for_terminal(value)
+    return "–" if value is None else value
