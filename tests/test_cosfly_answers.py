@@ -127,16 +127,17 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("body", "outcome"), [case[1:] for case in BODIES], ids=[case[0] for case in BODIES])
-def test_bodies(body, outcome):
-    found = completed(body)
-    if isinstance(outcome, str):
-        assert isinstance(found, Reply), found
-        assert found.text == outcome
-        found.text.encode()  # can stand in a journal
-    else:
-        assert isinstance(found, str), found
-        assert outcome[0] in found
+def test_bodies(subtests):
+    for name, body, outcome in BODIES:
+        with subtests.test(name=name):
+            found = completed(body)
+            if isinstance(outcome, str):
+                assert isinstance(found, Reply), found
+                assert found.text == outcome
+                found.text.encode()  # can stand in a journal
+            else:
+                assert isinstance(found, str), found
+                assert outcome[0] in found
 
 
 # "ab", pictures of 640 x 360 and 8 x 8, the answer.
@@ -406,18 +407,17 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "outcome"), [case[1:] for case in TEXTS], ids=[f"{i}: {case[0]}" for i, case in enumerate(TEXTS)]
-)
-def test_texts(text, outcome):
-    parsed = parse_answer(text)
-    if isinstance(outcome, tuple):
-        assert parsed.coc == Coc(**GOOD) or "control_characters" in outcome, parsed
-        assert parsed.recovered == outcome
-    elif parsed.coc is None:
-        assert parsed.reason == outcome
-    else:
-        assert parsed.coc.reasoning_trace == outcome
+def test_texts(subtests):
+    for name, text, outcome in TEXTS:
+        with subtests.test(name=name):
+            parsed = parse_answer(text)
+            if isinstance(outcome, tuple):
+                assert parsed.coc == Coc(**GOOD) or "control_characters" in outcome, parsed
+                assert parsed.recovered == outcome
+            elif parsed.coc is None:
+                assert parsed.reason == outcome
+            else:
+                assert parsed.coc.reasoning_trace == outcome
 
 
 # The same of Chinese answers; None: the object as it stands.
@@ -468,9 +468,10 @@ DECISIONS: list[tuple[str, str | None]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "token"), DECISIONS, ids=[ascii(text) for text, _ in DECISIONS])
-def test_decisions(text, token):
-    assert normalize_action(text) == token
+def test_decisions(subtests):
+    for text, token in DECISIONS:
+        with subtests.test(text=text):
+            assert normalize_action(text) == token
 
 
 # Why the server says that the text ended; what comes of it.

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import itertools
 import json
 import os
 import socket
@@ -113,43 +114,47 @@ PAIRS = [
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize(("reader", "content"), PAIRS)
-def test_hostile_contents_are_one_clear_line(tmp_path, reader, content):
-    name, read = READERS[reader]
-    path = tmp_path / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(CONTENTS[content])
-    tracemalloc.start()
-    try:
-        with pytest.raises((InputError, ConfigError)) as caught:
-            read(path)
-        assert tracemalloc.get_traced_memory()[1] < 100e6
-    finally:
-        tracemalloc.stop()
-    assert path.name in str(caught.value)
-    assert len(str(caught.value)) < 5000
+def test_hostile_contents_are_one_clear_line(tmp_path, subtests):
+    for number, (reader, content) in enumerate(PAIRS):
+        with subtests.test(reader=reader, content=content):
+            name, read = READERS[reader]
+            path = tmp_path / str(number) / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(CONTENTS[content])
+            tracemalloc.start()
+            try:
+                with pytest.raises((InputError, ConfigError)) as caught:
+                    read(path)
+                assert tracemalloc.get_traced_memory()[1] < 100e6
+            finally:
+                tracemalloc.stop()
+            assert path.name in str(caught.value)
+            assert len(str(caught.value)) < 5000
+
+
+KINDS_OF_FILES = ("pipe", "device", "folder", "socket", "missing", "link to itself")
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "socket", "missing", "link to itself"])
-@pytest.mark.parametrize("reader", [name for name in READERS if name != "town"])  # a tree may have no map.json
-def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch, reader, kind):
-    name, read = READERS[reader]
-    path = tmp_path / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    monkeypatch.chdir(path.parent)  # the path of a socket may have 100 bytes
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "socket":
-        socket.socket(socket.AF_UNIX).bind(path.name)
-    elif kind == "link to itself":
-        path.symlink_to(path)
-    with pytest.raises((InputError, ConfigError), match=path.name):
-        read(path)
+def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monkeypatch, subtests):
+    for reader, kind in itertools.product([name for name in READERS if name != "town"], KINDS_OF_FILES):
+        with subtests.test(reader=reader, kind=kind):
+            name, read = READERS[reader]
+            path = tmp_path / f"{reader} {kind}" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            monkeypatch.chdir(path.parent)  # the path of a socket may have 100 bytes
+            if kind == "pipe":
+                os.mkfifo(path)
+            elif kind == "device":
+                path.symlink_to("/dev/zero")
+            elif kind == "folder":
+                path.mkdir()
+            elif kind == "socket":
+                socket.socket(socket.AF_UNIX).bind(path.name)
+            elif kind == "link to itself":
+                path.symlink_to(path)
+            with pytest.raises((InputError, ConfigError), match=path.name):
+                read(path)
 
 
 # --- JSON -------------------------------------------------------------------------------------------------------------

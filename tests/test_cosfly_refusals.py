@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import pytest
@@ -18,10 +19,10 @@ BODIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("body", BODIES)
-@pytest.mark.parametrize(("server", "status", "text", "kind"), REFUSALS, ids=[row[0] for row in REFUSALS])
-def test_a_refusal_is_read_as_what_it_means(server, status, text, kind, body):
-    assert kind_of(status, BODIES[body](text, status)) == kind
+def test_a_refusal_is_read_as_what_it_means(subtests):
+    for (server, status, text, kind), body in itertools.product(REFUSALS, BODIES):
+        with subtests.test(server=server, body=body):
+            assert kind_of(status, BODIES[body](text, status)) == kind
 
 
 def test_every_meaning_is_in_the_table_and_every_server_once():

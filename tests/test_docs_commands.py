@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 import typer
 
 from cosfly.cli import app, options_first
@@ -71,10 +70,11 @@ def test_the_commands_are_found():
     assert any(text.startswith("distill train --dataset work/dataset") for _, text in ALL)
 
 
-@pytest.mark.parametrize(("page", "text"), ALL, ids=lambda value: value if value.endswith(".md") else "")
-def test_every_command_parses(page, text):
-    command, words = parsed(text)
-    command.make_context("cosfly", list(words))
+def test_every_command_parses(subtests):
+    for page, text in ALL:
+        with subtests.test(page=page, text=text):
+            command, words = parsed(text)
+            command.make_context("cosfly", list(words))
 
 
 def test_no_option_in_running_text_is_unknown():
