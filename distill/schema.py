@@ -13,7 +13,7 @@ import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, overload
+from typing import Any, Literal, ParamSpec, Self, TypeVar, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -131,16 +131,16 @@ def read_training_set(dataset: Path) -> TrainingSet:
     return read_model(path, TrainingSet, schema=RECORD_SCHEMA, version=VERSION, what="training set", tree=dataset)
 
 
-Given = ParamSpec("Given")
+Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def in_its_actions(step: Callable[Given, Result]) -> Callable[Given, Result]:
+def in_its_actions(step: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Have a step, which takes a training set as `dataset`, work with the set of actions that this was made with."""
     arguments = inspect.signature(step)
 
     @functools.wraps(step)
-    def in_actions(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+    def in_actions(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         record = read_training_set(arguments.bind(*args, **kwargs).arguments["dataset"])
         with in_place.put(actions=record.actions):
             return step(*args, **kwargs)
@@ -251,8 +251,8 @@ def open_split(dataset: Path, split: Split) -> Samples:
 class SplitFiles:
     """Rows to one parquet file a split, one by one; of each split at most a row group waits in memory. paths: what was written."""
 
-    def __init__(self, out: Path, columns: pa.Schema, stack: contextlib.ExitStack) -> None:
-        self._out, self._columns, self._stack = out, columns, stack
+    def __init__(self, out: Path, columns: pa.Schema) -> None:
+        self.out, self._columns, self._stack = out, columns, contextlib.ExitStack()
         self.paths: list[Path] = []
         self.counts: dict[Split, int] = dict.fromkeys(SPLITS, 0)
         self._rows: dict[Split, list[dict[str, Any]]] = {}
@@ -265,14 +265,18 @@ class SplitFiles:
         if len(waiting) == ROWS_AT_ONCE:
             self._write(split)
 
-    def flush(self) -> None:
-        for split, waiting in self._rows.items():
-            if waiting:
-                self._write(split)
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[Self]:
+        """Hold the files open; they appear when the block ends without an error."""
+        with self._stack:
+            yield self
+            for split, waiting in self._rows.items():
+                if waiting:
+                    self._write(split)
 
     def _write(self, split: Split) -> None:
         if split not in self._writers:
-            path = split_path(self._out, split)
+            path = split_path(self.out, split)
             file = self._stack.enter_context(atomic_file(path))
             # Least and greatest values help nobody here, and those of whole prompts make a footer of 8 kB a row group.
             writer = pq.ParquetWriter(file, self._columns, compression="zstd", write_statistics=False)
@@ -282,49 +286,32 @@ class SplitFiles:
         self._rows[split] = []
 
 
-@contextlib.contextmanager
-def write_splits(out: Path, columns: pa.Schema) -> Iterator[SplitFiles]:
-    """Write rows by split; the files appear when the block ends without an error."""
-    with contextlib.ExitStack() as stack:
-        files = SplitFiles(out, columns, stack)
-        yield files
-        files.flush()
+class TrainingSetWriter(SplitFiles):
+    """Takes the samples of a training set one by one. files: what was written."""
 
-
-@contextlib.contextmanager
-def write_training_set(out: Path) -> Iterator[TrainingSetWriter]:
-    """Write the splits of a training set; their files appear when the block ends without an error."""
-    with write_splits(out, COLUMNS) as splits:
-        yield TrainingSetWriter(out, splits)
-
-
-class TrainingSetWriter:
-    """Takes the samples one by one. files: what was written."""
-
-    def __init__(self, out: Path, splits: SplitFiles) -> None:
-        self._out, self._splits = out, splits
+    def __init__(self, out: Path) -> None:
+        super().__init__(out, COLUMNS)
         self.files: list[Path] = []
         self._systems: dict[str, int] = {}
 
-    def add(self, split: Split, sample: Sample) -> None:
+    def add_sample(self, split: Split, sample: Sample) -> None:
         row = sample.model_dump(mode="json")
         row["system"] = self._systems.setdefault(sample.prompt.system, len(self._systems))
         row["prompt"] = sample.prompt.user
-        self._splits.add(split, row)
+        self.add(split, row)
 
     def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
         """Write the record and the page, after the block ended and the splits stand."""
-        samples = self._splits.counts
         record = TrainingSet(
             split_by=split_by,
             trees=list(trees),
-            samples=samples,
+            samples=self.counts,
             systems=list(self._systems),
             actions=in_place.given("actions"),
         )
-        write_model(self._out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
-        write_bytes(self._out / PAGE, _page(record))
-        self.files = [*self._splits.paths, self._out / RECORD, self._out / PAGE]
+        write_model(self.out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
+        write_bytes(self.out / PAGE, _page(record))
+        self.files = [*self.paths, self.out / RECORD, self.out / PAGE]
         return record
 
 

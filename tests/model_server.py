@@ -19,7 +19,7 @@ from PIL import Image
 from teacher_server import TeacherServer, refusal
 from transformers import LogitsProcessor, LogitsProcessorList
 
-from distill.student.encoding import Encoded, prompt_batch
+from distill.student.encoding import EncodedSample, prompt_batch
 from distill.student.model import IMAGE_TOKEN, load_student
 
 CONTEXT = 16_384
@@ -87,7 +87,7 @@ class ModelServer(TeacherServer):
         usage = {"prompt_tokens": length, "completion_tokens": len(ids)}
         return 200, {"object": "chat.completion", "model": body["model"], "choices": [choice], "usage": usage}
 
-    def _encode(self, messages: list[dict]) -> Encoded:
+    def _encode(self, messages: list[dict]) -> EncodedSample:
         """Make token ids and patches of a chat: each image mark becomes as many tokens as its picture has patches."""
         images: list[Image.Image] = []
         for message in messages:
@@ -104,4 +104,4 @@ class ModelServer(TeacherServer):
         for count in (grids.prod(axis=1) // self.student.image_processor.merge_size**2).tolist():
             text = text.replace(IMAGE_TOKEN, "\x00" * count, 1)
         ids = self.student.tokenizer(text.replace("\x00", IMAGE_TOKEN), add_special_tokens=False)["input_ids"]
-        return Encoded("", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
+        return EncodedSample("", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)

@@ -17,7 +17,7 @@ from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
 from distill.prepare.sources import Source
 from distill.prepare.stage import PrepareConfig
-from distill.schema import Sample, SourceTree, write_training_set
+from distill.schema import Sample, SourceTree, TrainingSetWriter
 
 WINDOW = 5
 DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")
@@ -83,10 +83,10 @@ def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings
 def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:
     """Write a training set of given samples; the trees are of the run that each stands in."""
     out.mkdir(parents=True, exist_ok=True)
-    with write_training_set(out) as writer:
+    with TrainingSetWriter(out).writing() as writer:
         for split, samples in splits.items():
             for sample in samples:
-                writer.add(split, sample)
+                writer.add_sample(split, sample)
     writer.finish("walk", [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees])
     return out
 

@@ -38,14 +38,6 @@ def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, ra
     assert set(kept(windows[::-1], ratio, seed)) == set(found)
 
 
-def test_what_goes_is_drawn_by_seed_and_not_by_place():
-    windows = windows_of({"track_straight": 100, "hover": 20})
-    first, second = kept(windows, 1.0), kept(windows, 1.0, seed=1)
-    assert first == kept(windows, 1.0)
-    assert set(first) != set(second)
-    assert first != windows[:60] + windows[100:]
-
-
 def test_who_stays_at_a_low_bound_stays_at_a_higher_one():
     windows = windows_of({"track_straight": 100, "hover": 20})
     assert set(kept(windows, 0.2)) < set(kept(windows, 0.9))

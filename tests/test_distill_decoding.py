@@ -18,8 +18,8 @@ from torch.utils._pytree import tree_leaves  # noqa: E402
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
 from distill.student import decoding  # noqa: E402
-from distill.student.decoding import Decoded, decode  # noqa: E402
-from distill.student.encoding import Encoded, prompt_batch  # noqa: E402
+from distill.student.decoding import Completion, decode  # noqa: E402
+from distill.student.encoding import EncodedSample, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 
@@ -35,13 +35,13 @@ def student(tmp_path_factory) -> Student:
 
 
 @pytest.fixture(scope="module")
-def rows(student) -> list[Encoded]:
+def rows(student) -> list[EncodedSample]:
     """Prompts of 1 to 140 tokens with 0 to 5 pictures of two sizes."""
     rng = np.random.default_rng(4)
     return [make_row(student, rng, *size) for size in [(5, 2), (40, 1), (120, 5), (17, 3), (1, 0), (60, 0), (2, 1)]]
 
 
-def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pictures: int) -> Encoded:
+def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pictures: int) -> EncodedSample:
     start, image, end = student.tokenizer.convert_tokens_to_ids(["<|vision_start|>", IMAGE_TOKEN, "<|vision_end|>"])
     patches, grids = np.zeros((0, 1536), np.float32), np.zeros((0, 3), np.int64)
     if num_pictures:
@@ -53,10 +53,10 @@ def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pic
     for count in (grids.prod(axis=1) // 4).tolist():
         ids += [int(rng.integers(20, 200)), start, *[image] * count, end]
     ids += rng.integers(20, 200, num_words).tolist()
-    return Encoded("row", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
+    return EncodedSample("row", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
 
 
-def generated(student: Student, rows: Sequence[Encoded], most: int = MOST, **more) -> list[Decoded]:
+def generated(student: Student, rows: Sequence[EncodedSample], most: int = MOST, **more) -> list[Completion]:
     """The same by the library."""
     inputs = prompt_batch(student, rows)
     if not len(inputs["image_grid_thw"]):
@@ -70,11 +70,11 @@ def generated(student: Student, rows: Sequence[Encoded], most: int = MOST, **mor
     for ids in output[:, inputs["input_ids"].shape[1] :].tolist():
         is_finished = student.end_token_id in ids
         kept = ids[: ids.index(student.end_token_id)] if is_finished else ids
-        found.append(Decoded(student.tokenizer.decode(kept), len(kept), is_finished))
+        found.append(Completion(student.tokenizer.decode(kept), len(kept), is_finished))
     return found
 
 
-def ending_at(student: Student, rows: Sequence[Encoded], most: int = MOST) -> Student:
+def ending_at(student: Student, rows: Sequence[EncodedSample], most: int = MOST) -> Student:
     """The same student with another end token, such that its answers to `rows` end here and there."""
     inputs = prompt_batch(student, rows)
     with torch.inference_mode():
@@ -307,19 +307,3 @@ def test_an_accelerator_plays_what_it_computes(tmp_path, rows, dtype, monkeypatc
     assert all(played)
     if dtype == "float32":
         assert plain == generated(own, rows)
-
-
-def test_a_step_can_be_recorded(student, rows):
-    """Nothing in a step asks the host: a compiler takes it whole, and what it made moves the same state on."""
-    with torch.inference_mode():
-        one, two = (decoding._Batch(student, rows, MOST, None) for _ in range(2))
-        for batch in (one, two):
-            batch.take(batch.logits.argmax(dim=-1))
-        places = [tensor.data_ptr() for tensor in (two._tokens, two._positions, two._mask, two._place)]
-        compiled = torch.compile(two.step, backend="eager", fullgraph=True)
-        for _ in range(3):
-            one.step()
-            compiled()
-            torch.testing.assert_close(two.logits, one.logits)
-            assert one.take(one.logits.argmax(dim=-1)) == two.take(two.logits.argmax(dim=-1))
-        assert places == [tensor.data_ptr() for tensor in (two._tokens, two._positions, two._mask, two._place)]

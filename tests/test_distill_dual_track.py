@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -61,13 +59,6 @@ def test_the_papers_windows(num_frames, expected):
     assert (len(found) if isinstance(expected, int) else found) == expected
 
 
-@given(st.integers(0, 300), st.integers(1, 12), st.integers(0, 12), st.integers(1, 9))
-def test_windows_are_those_that_fit(num_frames, observed, predicted, stride):
-    cfg = DualTrackConfig(observed=observed, predicted=predicted, stride=stride)
-    slow = [i for i in range(num_frames) if i % stride == 0 and i + observed + predicted <= num_frames]
-    assert list(windows_of(num_frames, cfg)) == slow
-
-
 # --- what stands in them ----------------------------------------------------------------------------------------------
 
 
@@ -100,16 +91,6 @@ def test_no_walk_is_in_two_splits(dataset):
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 4
     assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}
-
-
-def test_datasets_opens_it(dataset, tmp_path):
-    datasets = pytest.importorskip("datasets")
-    opened = datasets.load_dataset(str(dataset), cache_dir=str(tmp_path))
-    own = samples(dataset)
-    assert {name: len(rows) for name, rows in opened.items()} == {
-        "train": len(own["train"]), "validation": len(own["val"]), "test": len(own["test"]),
-    }  # fmt: skip
-    assert opened["train"][0]["observed_position_m"] == [list(row) for row in own["train"][0].observed_position_m]
 
 
 def test_the_same_again_and_other_settings(tree, dataset, tmp_path):

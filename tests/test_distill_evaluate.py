@@ -203,14 +203,6 @@ def test_intervals_agree_with_the_bootstrap_of_scipy():
     assert found.value == right.mean()
 
 
-def test_intervals_over_walks_are_wider_than_over_windows():
-    scores = made_up(40, np.random.default_rng(4), size=30)
-    alone = replace(scores, walk=scores.key)
-    (clumped, _), (single, _) = figures(scores, 1000), figures(alone, 1000)
-    widths = [found["accuracy"].high - found["accuracy"].low for found in (clumped, single)]
-    assert widths[0] > 2 * widths[1]
-
-
 def test_one_walk_has_no_interval(samples):
     found = figures(scores_of(samples))[0]["accuracy"]
     assert (found.value, found.low, found.high) == (0.5, None, None)
@@ -254,12 +246,6 @@ def test_scores_survive_the_disk(tmp_path, samples):
 # --- floors -----------------------------------------------------------------------------------------------------------
 
 
-def test_majority_and_ties():
-    assert majority(["hover", "slow_down", "hover"]) == "hover"
-    assert majority(["slow_down", "track_straight"]) == "track_straight"  # the first of the action table
-    assert majority([]) is None
-
-
 @given(st.integers(2, 5000), st.integers(0, 10))
 @settings(max_examples=30)
 def test_shuffling_leaves_nothing_in_its_place(count, seed):
@@ -278,6 +264,7 @@ def test_floors_by_hand(samples):
     assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
     assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
     assert list(Floors([], "en", 0).answers([coc_of(samples[0])])) == []
+    assert majority(["slow_down", "track_straight"]) == "track_straight"  # a tie goes to the first of the action table
 
 
 def test_floors_are_predictions_that_a_verifier_can_judge(place):
@@ -530,8 +517,8 @@ def evaluated(place: Path, encoder: Path, language: str = "en", **settings: obje
     return read_report(out)
 
 
-@pytest.mark.parametrize("language", ["en", "zh"])
-def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encoder, language):
+def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encoder):
+    language = "zh"
     report = evaluated(place, encoder, language)
     who = report.languages[language].who
     scores = {name: own.figures for name, own in who.items()}
@@ -602,8 +589,5 @@ def test_rescaling_uses_the_baseline_file(place, encoder):
 def test_settings_that_do_not_fit_the_encoder(place, encoder, settings, words):
     with pytest.raises(ConfigError, match=words):
         evaluated(place, encoder, **settings)
-
-
-def test_a_folder_without_an_encoder_is_named(place, tmp_path):
     with pytest.raises(InputError, match="BERTScore model"):
-        evaluated(place, tmp_path / "nothing")
+        evaluated(place, place / "nothing")

@@ -16,11 +16,19 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from specimens_students import FAST, TWELVE, load, losses_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import ConfigError  # noqa: E402
-from distill.student.encoding import Encoded, encode, padded, prompt_batch  # noqa: E402
-from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, content_key, pictures_of, tower_key  # noqa: E402
+from distill.student.encoding import EncodedSample, encode, padded, prompt_batch  # noqa: E402
+from distill.student.features import (  # noqa: E402
+    Picture,
+    PictureData,
+    PictureReader,
+    VisionFeatures,
+    content_key,
+    pictures_of,
+    tower_key,
+)
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.loading import Packed  # noqa: E402
+from distill.training.loading import PictureBatch  # noqa: E402
 from distill.training.loss import answer_loss, chunked_loss, output_head  # noqa: E402
 from distill.training.settings import TARGET_MODULES, TrainConfig  # noqa: E402
 
@@ -36,12 +44,12 @@ def place(students) -> Path:
     return students
 
 
-def features_of(own: Student, rows: Sequence[Encoded]) -> torch.Tensor:
+def features_of(own: Student, rows: Sequence[EncodedSample]) -> torch.Tensor:
     inputs = prompt_batch(own, rows)
     return torch.cat(own.core.get_image_features(inputs["pixel_values"], inputs["image_grid_thw"]).pooler_output)
 
 
-def rows_of(place: Path, own: Student, count: int) -> list[Encoded]:
+def rows_of(place: Path, own: Student, count: int) -> list[EncodedSample]:
     return [encode(own, sample, trees_of(place)) for sample in samples_of(place)[:count]]
 
 
@@ -206,9 +214,9 @@ def test_pictures_go_from_process_to_process_as_two_tensors(place):
             torch.randn(number % 5, 6, generator=generator),
         )
         kind = {"features": values[:, :3]} if number % 3 == 0 else {"patches": values}
-        loaded.append(Loaded(picture, f"key{number}", **kind))
+        loaded.append(PictureData(picture, f"key{number}", **kind))
     for chosen in (loaded, loaded[1:3], loaded[:1], []):
-        packed = Packed.of(chosen)
+        packed = PictureBatch.of(chosen)
         assert not any(isinstance(value, torch.Tensor) for facts in packed.pictures for value in facts)
         for item, wanted in zip(packed.loaded(), chosen, strict=True):
             assert (item.picture, item.key) == (wanted.picture, wanted.key)

@@ -87,7 +87,7 @@ REPORT, REPORT_SCHEMA, REPORT_VERSION = "report.json", "cosfly.distill_report", 
 STAGE = "distill.evaluate"
 STUDENT = "student"
 UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
-Judged = Mapping[str, Mapping[str, Sequence[SentenceState]]]  # who -> sample's key -> states of the sentences
+SentenceStates = Mapping[str, Mapping[str, Sequence[SentenceState]]]  # who -> sample's key -> states of the sentences
 TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
 
 
@@ -218,7 +218,7 @@ def text_of(coc: Coc | None) -> str:
 
 
 def score_language(
-    pairs: Sequence[tuple[Sample, Prediction]], floors: Floors, scorer: TextScorer | None, judged: Judged
+    pairs: Sequence[tuple[Sample, Prediction]], floors: Floors, scorer: TextScorer | None, judged: SentenceStates
 ) -> dict[str, Scores]:
     """Score the student and the floors on the samples of one language: who -> scores."""
     samples = [sample for sample, _ in pairs]

@@ -28,9 +28,9 @@ from distill.evaluation.measure import (
     REPORT_VERSION,
     STAGE,
     STUDENT,
-    Judged,
     Measurement,
     Report,
+    SentenceStates,
     examples_of,
     join,
     measure,
@@ -114,7 +114,7 @@ def _evaluate(
     pairs: Sequence[tuple[Sample, Prediction]],
     dataset: Path,
     models: Mapping[Language, Path],
-    judged: Judged,
+    judged: SentenceStates,
     seed: int,
 ) -> tuple[Report, Scores]:
     given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "seed": seed}

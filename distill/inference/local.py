@@ -25,11 +25,11 @@ from cosfly.products.places import flight_of
 from cosfly.work.console import Advance
 from cosfly.work.stage_folder import Failed
 from cosfly.work.store import dump_json, sha256_bytes
-from distill.inference.outcome import Answered, OpenFlights
+from distill.inference.outcome import OpenFlights, Outcome
 from distill.schema import Sample
-from distill.student.decoding import Constraint, Decoded, decode
-from distill.student.encoding import Encoded, encode_text
-from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, pictures_of
+from distill.student.decoding import Completion, Constraint, decode
+from distill.student.encoding import EncodedSample, encode_text
+from distill.student.features import Picture, PictureData, PictureReader, VisionFeatures, pictures_of
 from distill.student.model import Processor, Student, require
 
 log = logging.getLogger(__name__)
@@ -45,8 +45,8 @@ class _Shelf:
 
     def __init__(self, samples: list[Sample], features: VisionFeatures) -> None:
         self.samples, self.features = samples, features
-        self.found: dict[str, Answered] = {}  # by key of the sample
-        self.rows: dict[str, Encoded] = {}
+        self.found: dict[str, Outcome] = {}  # by key of the sample
+        self.rows: dict[str, EncodedSample] = {}
         self.damaged: dict[Picture, InputError] = {}
         self.plan = features.plan()
         self._num_told = 0
@@ -93,7 +93,7 @@ class LocalAnswers:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Answered, None]:
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Outcome, None]:
         """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time.
 
         Raises:
@@ -114,7 +114,7 @@ class LocalAnswers:
         for sample in shelf.samples:
             known = self.book.get(self._flights.begun(sample), self._key(sample))
             if known is not None:
-                shelf.found[sample.key] = Answered(sample, known)
+                shelf.found[sample.key] = Outcome(sample, known)
 
     def _key(self, sample: Sample) -> str:
         """Name what the answer depends on beside what the folder's records hold: weights, pictures and settings."""
@@ -156,15 +156,15 @@ class LocalAnswers:
 
     # --- pictures ---
 
-    def _load(self, shelf: _Shelf, batch: Sequence[Sample]) -> dict[Picture, Future[Loaded]]:
+    def _load(self, shelf: _Shelf, batch: Sequence[Sample]) -> dict[Picture, Future[PictureData]]:
         """Have pictures read that are not known."""
         pictures = [picture for sample in batch for picture in pictures_of(sample) if picture not in shelf.damaged]
         wanted = shelf.features.wanted(shelf.plan, pictures)
         return {picture: self._threads.submit(self._reader.read, picture) for picture in wanted}
 
-    def _look(self, shelf: _Shelf, loading: Mapping[Picture, Future[Loaded]]) -> None:
+    def _look(self, shelf: _Shelf, loading: Mapping[Picture, Future[PictureData]]) -> None:
         """Have the vision tower look at what was read."""
-        loaded: list[Loaded] = []
+        loaded: list[PictureData] = []
         for picture, future in loading.items():
             try:
                 loaded.append(future.result())
@@ -181,7 +181,7 @@ class LocalAnswers:
 
     # --- answers ---
 
-    def _decode(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Decoded]:
+    def _decode(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Completion]:
         """Answer samples together, in halves where the memory does not hold them all.
 
         Raises:
@@ -189,7 +189,7 @@ class LocalAnswers:
         """
         import torch
 
-        answers: list[Decoded] = []
+        answers: list[Completion] = []
         while len(answers) < len(samples):
             chosen = samples[len(answers) : len(answers) + self.most_rows]
             try:
@@ -215,7 +215,7 @@ class LocalAnswers:
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
 
-    def _decode_together(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Decoded]:
+    def _decode_together(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Completion]:
         return decode(
             self.student,
             [shelf.rows[sample.key] for sample in samples],
@@ -225,18 +225,20 @@ class LocalAnswers:
             is_recorded=self._is_recorded,
         )
 
-    async def _keep(self, shelf: _Shelf, samples: Sequence[Sample], decoded: Sequence[Decoded], begun_s: float) -> None:
+    async def _keep(
+        self, shelf: _Shelf, samples: Sequence[Sample], decoded: Sequence[Completion], begun_s: float
+    ) -> None:
         """Journal new answers; they are on the disk when this returns."""
         latency_s = round(time.monotonic() - begun_s, 3)
         for sample, answer in zip(samples, decoded, strict=True):
             if sample.key not in shelf.found:
                 new = self._answer_of(sample, shelf.rows[sample.key], answer, latency_s)
-                shelf.found[sample.key] = Answered(sample, new, is_new=True)
+                shelf.found[sample.key] = Outcome(sample, new, is_new=True)
         found = [shelf.found[sample.key] for sample in samples]
         new_ones = [each.found for each in found if each.is_new and isinstance(each.found, Answer)]
         await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new_ones))
 
-    def _answer_of(self, sample: Sample, row: Encoded, decoded: Decoded, latency_s: float) -> Answer:
+    def _answer_of(self, sample: Sample, row: EncodedSample, decoded: Completion, latency_s: float) -> Answer:
         return Answer(
             key=self._key(sample),
             sample_id=sample.sample_id,
@@ -251,8 +253,8 @@ class LocalAnswers:
         )
 
 
-def _failed(sample: Sample, error: InputError) -> Answered:
-    return Answered(sample, Failed(id=sample.key, code=error.code, message=str(error)))
+def _failed(sample: Sample, error: InputError) -> Outcome:
+    return Outcome(sample, Failed(id=sample.key, code=error.code, message=str(error)))
 
 
 class SchemaConstraint:

@@ -23,7 +23,7 @@ MOST_FLIGHTS = 32  # whose answers stay in memory when nothing is asked about th
 
 
 @dataclass(frozen=True)
-class Answered:
+class Outcome:
     """A sample with its answer, or with why there is none."""
 
     sample: Sample
@@ -54,7 +54,7 @@ def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
 
 
-def prediction_of(answered: Answered, split: Split) -> Prediction:
+def prediction_of(answered: Outcome, split: Split) -> Prediction:
     """Give the record of a sample."""
     found = answered.found
     if isinstance(found, Failed):
@@ -74,7 +74,7 @@ class Results:
         self.new = Counter[str]()  # answers of this run and their tokens
         self.speed: dict[str, float] = {}
 
-    def add(self, answered: Answered) -> None:
+    def add(self, answered: Outcome) -> None:
         found = answered.found
         prediction = prediction_of(answered, self.split).model_copy(update={"model": self.model})
         self._file.write((dump_json(prediction.model_dump(mode="json")) + "\n").encode())

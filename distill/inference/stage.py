@@ -27,7 +27,7 @@ from cosfly.work.console import Advance, progress_bar
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, read_manifest
 from cosfly.work.store import sha256_bytes
 from distill.inference.local import AnswerSchemas, LocalAnswers
-from distill.inference.outcome import ANSWERS, Answered, OpenFlights, Results, writing_results
+from distill.inference.outcome import ANSWERS, OpenFlights, Outcome, Results, writing_results
 from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.encoding import load_pictures, most_pixels
@@ -74,13 +74,13 @@ class Asking:
         self._flights = OpenFlights(book)
         self._failed_in_row = 0
 
-    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Answered, None]:
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Outcome, None]:
         """Yield what becomes of each sample, in their order; `advance` is told of them as they come.
 
         Raises:
             TeacherError: the engine cannot be used, or too many samples in a row got no answer.
         """
-        waiting: deque[asyncio.Task[Answered]] = deque()
+        waiting: deque[asyncio.Task[Outcome]] = deque()
         try:
             for sample in samples:
                 waiting.append(asyncio.create_task(self._answer(sample, advance)))
@@ -93,32 +93,32 @@ class Asking:
                 task.cancel()
             await asyncio.gather(*waiting, return_exceptions=True)
 
-    async def _next(self, waiting: deque[asyncio.Task[Answered]]) -> Answered:
+    async def _next(self, waiting: deque[asyncio.Task[Outcome]]) -> Outcome:
         answered = await waiting[0]
         waiting.popleft()
         self._flights.done(answered.sample)
         return answered
 
-    async def _answer(self, sample: Sample, advance: Advance) -> Answered:
+    async def _answer(self, sample: Sample, advance: Advance) -> Outcome:
         answered = await self._asked(sample)
         advance(1)
         return answered
 
-    async def _asked(self, sample: Sample) -> Answered:
+    async def _asked(self, sample: Sample) -> Outcome:
         flight = self._flights.begun(sample)
         async with self._slots:
             try:
                 request = await asyncio.to_thread(make_request, sample, self.trees, self.sampling, self.max_pixels)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
-                return Answered(sample, Failed(id=sample.key, code=error.code, message=str(error)))
+                return Outcome(sample, Failed(id=sample.key, code=error.code, message=str(error)))
             except NoAnswer as error:
                 self._note_failure(error)
-                return Answered(sample, Failed(id=sample.key, code=error.cause, message=str(error)))
+                return Outcome(sample, Failed(id=sample.key, code=error.cause, message=str(error)))
         self._failed_in_row = 0
         found = self.book.get(flight, answer_key(self.engine.model, request))
         assert isinstance(found, Answer), "what was asked is kept"
-        return Answered(sample, found, is_new=not reply.is_kept)
+        return Outcome(sample, found, is_new=not reply.is_kept)
 
     def _note_failure(self, error: NoAnswer) -> None:
         if error.is_final:  # the server answers, if only with a refusal
@@ -212,7 +212,7 @@ class Inputs:
 @contextlib.asynccontextmanager
 async def _answering(
     cfg: InferConfig, inputs: Inputs, book: AnswerBook, advance: Advance
-) -> AsyncIterator[AsyncGenerator[Answered, None]]:
+) -> AsyncIterator[AsyncGenerator[Outcome, None]]:
     """Start who answers; gives what becomes of the samples, in their order."""
     if cfg.engine == "transformers":
         with _local(cfg, inputs, book) as local:

@@ -29,7 +29,7 @@ from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
 from cosfly.work.store import write_bytes, write_model
 from distill.prepare.splitting import SplitConfig, check_no_leak
-from distill.schema import PAGE, SourceTree, SplitFiles, page_of, split_path, write_splits
+from distill.schema import PAGE, SourceTree, SplitFiles, page_of, split_path
 
 RECORD, RECORD_SCHEMA, VERSION = "tracks.json", "cosfly.track_windows", "1.0"
 AXES = "right-handed: metres, x east, y north, z up; degrees, yaw counter-clockwise from east, pitch nose-up"
@@ -141,12 +141,6 @@ def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
             yield TrackSample.model_validate(row)
 
 
-def add_sample(files: SplitFiles, split: Split, sample: TrackSample) -> None:
-    """Write a sample into its split's file."""
-    row: dict[str, Any] = sample.model_dump(mode="json")
-    files.add(split, row)
-
-
 STAGE = "distill.dual_track"
 NO_TWIN, OTHER_FRAMES, SHORT = "no_clean_flight", "clean_flight_of_other_frames", "shorter_than_a_window"
 UNEVEN = "uneven_steps"
@@ -167,7 +161,7 @@ class DualTrackConfig(SplitConfig):
 
 
 @dataclass(frozen=True)
-class _Paired:
+class _PairedFlight:
     """A perturbed flight that gives windows: where it stands, and its id among all flights."""
 
     folder: Path
@@ -197,7 +191,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     paired, courses, tally = _survey(stage, cfg, runs)
     walks = walks_of(courses)
     split_of = _splits(cfg, paired, walks, seed)
-    with write_splits(out, COLUMNS) as files:
+    with SplitFiles(out, COLUMNS).writing() as files:
         facts = _write(files, cfg, paired, walks, split_of)
     trees_of = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     record = TrackSet(
@@ -222,18 +216,18 @@ def _runs(trees: Sequence[Path]) -> dict[str, Path]:
 
 def _survey(
     stage: StageFolder, cfg: DualTrackConfig, runs: Mapping[str, Path]
-) -> tuple[list[_Paired], list[Course], Tally]:
+) -> tuple[list[_PairedFlight], list[Course], Tally]:
     """Find the perturbed flights that give windows, the walks' courses, and what becomes of the others."""
     folders = [(folder, place_of(folder, run)) for run, tree in runs.items() for folder in find_flights(tree)]
     ids = flight_ids([place for _, place in folders])
-    paired: list[_Paired] = []
+    paired: list[_PairedFlight] = []
     courses: list[Course] = []
     dropped: Counter[str] = Counter()
     failures: list[Failed] = []
     with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
         for folder, place in folders:
             advance(1)
-            found = _Paired(folder, place, ids[place])
+            found = _PairedFlight(folder, place, ids[place])
             try:
                 pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
             except InputError as error:
@@ -273,7 +267,9 @@ def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
     return range(0, num_frames - cfg.length + 1, cfg.stride)
 
 
-def _splits(cfg: DualTrackConfig, paired: Sequence[_Paired], walks: Mapping[str, str], seed: int) -> dict[str, Split]:
+def _splits(
+    cfg: DualTrackConfig, paired: Sequence[_PairedFlight], walks: Mapping[str, str], seed: int
+) -> dict[str, Split]:
     """Give each flight's key its split; walks (or towns) are ranked as those of captions are."""
     group_of = {
         flight.key: town_family(flight.place.town) if cfg.split_by == "town" else walks[flight.key] for flight in paired
@@ -287,7 +283,7 @@ def _splits(cfg: DualTrackConfig, paired: Sequence[_Paired], walks: Mapping[str,
 
 
 def _write(
-    files: SplitFiles, cfg: DualTrackConfig, paired: Sequence[_Paired], walks: Mapping[str, str], split_of: Mapping[str, Split]
+    files: SplitFiles, cfg: DualTrackConfig, paired: Sequence[_PairedFlight], walks: Mapping[str, str], split_of: Mapping[str, Split]
 ) -> dict[str, Any]:  # fmt: skip
     """Write the windows; gives the facts of the manifest: of each split, and how many windows were left out."""
     facts: dict[str, dict[str, Any]] = {split: {"samples": 0, "flights": 0, "walks": set(), "observed_frames": Counter()} for split in SPLITS}  # fmt: skip
@@ -304,7 +300,7 @@ def _write(
                 if sample is None:
                     left_out += 1
                     continue
-                add_sample(files, split, sample)
+                files.add(split, sample.model_dump(mode="json"))
                 own["samples"] += 1
                 own["observed_frames"].update(str(state) for state in sample.states)
     for own in facts.values():
@@ -313,7 +309,7 @@ def _write(
 
 
 def samples_of(
-    found: _Paired, flight: Flight, twin: Flight, walk: str, cfg: DualTrackConfig
+    found: _PairedFlight, flight: Flight, twin: Flight, walk: str, cfg: DualTrackConfig
 ) -> Iterator[TrackSample | None]:
     """Cut a pair of flights into windows; None for one whose frames are not evenly apart in time."""
     step = step_s(flight.time_s)

@@ -32,7 +32,7 @@ from cosfly.work.store import dump_json
 from distill.prepare.choice import Cut, Limit, Ranks, cost_of, limit_to
 from distill.prepare.sources import CaptionedFlight, Flights, Source, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
-from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split, write_training_set
+from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split
 
 
 class PrepareConfig(SplitConfig):
@@ -235,7 +235,7 @@ class _Windows:
 
 
 @dataclass(frozen=True)
-class _Chosen:
+class _Selection:
     """What goes where: walks (or towns) to splits, and which windows stay."""
 
     cfg: PrepareConfig
@@ -286,7 +286,7 @@ def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int
         raise stage.nothing_kept(tally, expected="accepted captions whose images stand below --data")
     chosen = _choose(cfg, windows, ranks, seed)
     del ranks  # of a million windows they take as much as the writing
-    with write_training_set(out) as writer:
+    with TrainingSetWriter(out).writing() as writer:
         facts, left_out = _write(windows, chosen, writer)
     writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
     counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
@@ -314,9 +314,9 @@ def _survey(windows: _Windows, seed: int) -> tuple[Ranks, Counter[str]]:
     return ranks, excluded
 
 
-def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _Chosen:
+def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _Selection:
     windows.walks = windows.flights.walks()
-    chosen = _Chosen(cfg, windows.walks, {}, None, None)
+    chosen = _Selection(cfg, windows.walks, {}, None, None)
     group_of = {}
     for flight in ranks.flights:
         key = flight.rpartition("/")[0]
@@ -330,11 +330,11 @@ def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _
     cut = ranks.cut(train, cfg.balance_ratio) if cfg.balance == "decisions" else None
     cuts = {flight: cut if split_of[group] == "train" else None for flight, group in group_of.items()}
     limit = limit_to(ranks, cfg.limit, cuts) if cfg.limit else None
-    return _Chosen(cfg, windows.walks, split_of, cut, limit)
+    return _Selection(cfg, windows.walks, split_of, cut, limit)
 
 
 def _write(
-    windows: _Windows, chosen: _Chosen, writer: TrainingSetWriter
+    windows: _Windows, chosen: _Selection, writer: TrainingSetWriter
 ) -> tuple[dict[str, dict[str, Any]], Counter[str]]:
     """Write the samples.
 
@@ -354,7 +354,7 @@ def _write(
                     left_out[reason] += 1
                     continue
                 split = chosen.split(window)
-                writer.add(split, sample)
+                writer.add_sample(split, sample)
                 flights[split].add(f"{window.flight.key}/{window.flight.variant}")
                 counter = counters[split]
                 counter["language"][sample.language] += 1

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from distill.student.encoding import Encoded, prompt_batch
+from distill.student.encoding import EncodedSample, prompt_batch
 from distill.student.model import Student
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ LEAVING_SHARE_RECORDED = 0.5
 
 
 @dataclass(frozen=True)
-class Decoded:
+class Completion:
     """An answer. num_tokens: its end token is not counted. is_finished: it ended by itself."""
 
     text: str
@@ -83,13 +83,13 @@ class Constraint(Protocol):
 
 def decode(
     student: Student,
-    rows: Sequence[Encoded],
+    rows: Sequence[EncodedSample],
     *,
     max_tokens: int,
     constraint: Constraint | None = None,
     features: Any = None,
     is_recorded: bool = True,
-) -> list[Decoded]:
+) -> list[Completion]:
     """Answer a batch of prompts greedily; their answers in `rows` are not looked at.
 
     Args:
@@ -119,7 +119,7 @@ def decode(
         cut = {batch.rows[place]: batch.tokens_of(place) for place in range(len(batch.rows)) if batch.is_live(place)}
     texts = ended | cut
     return [
-        Decoded(student.tokenizer.decode(texts[row], skip_special_tokens=False), len(texts[row]), row in ended)
+        Completion(student.tokenizer.decode(texts[row], skip_special_tokens=False), len(texts[row]), row in ended)
         for row in range(len(rows))
     ]
 
@@ -162,7 +162,12 @@ class _Batch:
     """
 
     def __init__(
-        self, student: Student, rows: Sequence[Encoded], max_tokens: int, features: Any, record: Record | None = None
+        self,
+        student: Student,
+        rows: Sequence[EncodedSample],
+        max_tokens: int,
+        features: Any,
+        record: Record | None = None,
     ) -> None:
         import torch
         from transformers import StaticCache

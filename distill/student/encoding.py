@@ -29,7 +29,7 @@ IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch'
 
 
 @dataclass(frozen=True)
-class Encoded:
+class EncodedSample:
     """One sample as arrays: prompt_ids, answer_ids (n,) int64, the end token included in the answer; patches of all images
     (p, d) float32, None where a cache has their features, and their grids (k, 3) int64."""
 
@@ -130,12 +130,12 @@ def picture_grid(processor: Processor, size_px: tuple[int, int]) -> tuple[int, i
     return 1, rows_px // images.patch_size, columns_px // images.patch_size
 
 
-def encode_text(processor: Processor, sample: Sample) -> Encoded:
+def encode_text(processor: Processor, sample: Sample) -> EncodedSample:
     """Make the arrays of one sample without looking at a pixel."""
     grid = picture_grid(processor, sample.picture_px)
     count = math.prod(grid) // processor.image_processor.merge_size**2
     text = prompt_text(processor, sample, [count] * len(sample.images))
-    return Encoded(
+    return EncodedSample(
         key=sample.key,
         prompt_ids=np.array(processor.tokenizer(text, add_special_tokens=False)["input_ids"], dtype=np.int64),
         answer_ids=_answer_ids(processor, sample),
@@ -153,7 +153,7 @@ def patches_of(processor: Processor, pictures: Sequence[np.ndarray]) -> np.ndarr
     return np.asarray(processor.image_processor(images, return_tensors="np")["pixel_values"], dtype=np.float32)
 
 
-def encode(processor: Processor, sample: Sample, trees: Mapping[str, Path]) -> Encoded:
+def encode(processor: Processor, sample: Sample, trees: Mapping[str, Path]) -> EncodedSample:
     """Make the arrays of one sample, its pictures among them.
 
     Raises:
@@ -185,7 +185,7 @@ def positions_of(processor: Processor, ids: np.ndarray, grids: np.ndarray) -> np
 # --- batches ----------------------------------------------------------------------------------------------------------
 
 
-def padded(student: Student, rows: Sequence[Encoded]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def padded(student: Student, rows: Sequence[EncodedSample]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pad samples on the right: (tokens (b, n), labels (b, n) with IGNORED outside the answers, rotary positions (3, b, n)).
 
     Causal layers, of either kind of attention, never see what stands on the right, so no mask is needed.
@@ -202,7 +202,7 @@ def padded(student: Student, rows: Sequence[Encoded]) -> tuple[np.ndarray, np.nd
     return ids, labels, positions
 
 
-def prompt_batch(student: Student, rows: Sequence[Encoded]) -> dict[str, Any]:
+def prompt_batch(student: Student, rows: Sequence[EncodedSample]) -> dict[str, Any]:
     """Pad prompts on the left, so that all continue at the same place."""
     length = max(len(row.prompt_ids) for row in rows)
     ids = np.full((len(rows), length), student.pad_token_id, dtype=np.int64)
@@ -213,7 +213,7 @@ def prompt_batch(student: Student, rows: Sequence[Encoded]) -> dict[str, Any]:
     return _inputs(student, rows, ids, mask)
 
 
-def _inputs(student: Student, rows: Sequence[Encoded], ids: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
+def _inputs(student: Student, rows: Sequence[EncodedSample], ids: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
     import torch
 
     arrays = {
@@ -228,7 +228,7 @@ def _inputs(student: Student, rows: Sequence[Encoded], ids: np.ndarray, mask: np
     return tensors
 
 
-def patches_of_rows(rows: Sequence[Encoded]) -> np.ndarray:
+def patches_of_rows(rows: Sequence[EncodedSample]) -> np.ndarray:
     """Put the patches of the pictures of all rows below each other: (p, d) float32."""
     found = [row.pixel_values for row in rows if row.pixel_values is not None and len(row.pixel_values)]
     return np.concatenate(found) if found else np.zeros((0, 1), np.float32)

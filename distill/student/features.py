@@ -44,7 +44,7 @@ class Picture(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Loaded:
+class PictureData:
     """A picture that was read: patches (p, d), or features (t, width) where they were found on disk; both torch tensors."""
 
     picture: Picture
@@ -125,7 +125,7 @@ class PictureReader:
     features: Path | None
     dtype: Any
 
-    def read(self, picture: Picture) -> Loaded:
+    def read(self, picture: Picture) -> PictureData:
         """Read a picture.
 
         Raises:
@@ -135,10 +135,10 @@ class PictureReader:
 
         key = content_key(picture, self.trees)
         if self.features is not None and (found := read_features(self.features, key, self.dtype)) is not None:
-            return Loaded(picture, key, features=found)
+            return PictureData(picture, key, features=found)
         shown = Pictures((picture.view,), picture.size_px, "separate", picture.depth_range_m)
         values = patches_of(self.processor, shown.read(inside(self.trees[picture.run], picture.frame)))
-        return Loaded(picture, key, patches=torch.from_numpy(values).to(self.dtype))
+        return PictureData(picture, key, patches=torch.from_numpy(values).to(self.dtype))
 
 
 def read_features(folder: Path, key: str, dtype: Any) -> Any:
@@ -219,9 +219,9 @@ class VisionFeatures:
                 plan.add(picture)
         return wanted
 
-    def take(self, loaded: Sequence[Loaded]) -> None:
+    def take(self, loaded: Sequence[PictureData]) -> None:
         """Take what was read: look at what is new, and keep it."""
-        new: dict[str, Loaded] = {}
+        new: dict[str, PictureData] = {}
         for item in loaded:
             key = self._keys[item.picture] = item.key
             if key in self._kept or key in self._here:
@@ -240,7 +240,7 @@ class VisionFeatures:
             elif item.key in new and item.key not in self._kept:
                 self._store(item.key, self._here[item.key])
 
-    def _look_at_all(self, items: Sequence[Loaded]) -> None:
+    def _look_at_all(self, items: Sequence[PictureData]) -> None:
         import torch
 
         with torch.no_grad():
@@ -250,7 +250,7 @@ class VisionFeatures:
                     self._here[item.key] = features.cpu()
         self.num_encoded += len(items)
 
-    def _look_at(self, items: Sequence[Loaded]) -> Sequence[Any]:
+    def _look_at(self, items: Sequence[PictureData]) -> Sequence[Any]:
         """Have the tower look at pictures: for each (t, width)."""
         import torch
 

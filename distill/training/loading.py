@@ -23,8 +23,8 @@ from cosfly.work.console import progress_bar
 from cosfly.work.store import inside
 from cosfly.work.worker import end_with_parent
 from distill.schema import Sample
-from distill.student.encoding import Encoded, encode_text, image_size, special_token_in
-from distill.student.features import Loaded, Picture, PictureReader, VisionFeatures, pictures_of
+from distill.student.encoding import EncodedSample, encode_text, image_size, special_token_in
+from distill.student.features import Picture, PictureData, PictureReader, VisionFeatures, pictures_of
 from distill.student.model import Processor
 from distill.training.ranks import Ranks
 
@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 ORDERS_AHEAD = 2  # for each worker
 MOST_WORKERS = 16
 
-Asked = TypeVar("Asked")
-Given = TypeVar("Given")
+OrderT = TypeVar("OrderT")
+ResultT = TypeVar("ResultT")
 
 
 # --- workers ----------------------------------------------------------------------------------------------------------
@@ -46,14 +46,14 @@ def num_workers(wanted: int) -> int:
 
 
 @dataclass(frozen=True)
-class _Work(Generic[Asked, Given]):
+class _Work(Generic[OrderT, ResultT]):
     """What torch's loader takes for a data set whose items are named by orders. An error comes back as a value: the loader would
     raise another in its place."""
 
-    function: Callable[[Asked], Given]
+    function: Callable[[OrderT], ResultT]
     limits: Limits
 
-    def __getitem__(self, order: Asked) -> Given | CosflyError:
+    def __getitem__(self, order: OrderT) -> ResultT | CosflyError:
         use_limits(self.limits)
         try:
             return self.function(order)
@@ -75,7 +75,7 @@ def _as_it_is(given: Any) -> Any:
     return given
 
 
-def in_order(function: Callable[[Asked], Given], orders: Iterable[Asked], workers: int) -> Iterator[Given]:
+def in_order(function: Callable[[OrderT], ResultT], orders: Iterable[OrderT], workers: int) -> Iterator[ResultT]:
     """Yield function(order) for each order, in their order; an order is taken only a few before it is its turn.
 
     Args:
@@ -129,7 +129,7 @@ def reader_errors() -> Iterator[None]:
 class Row:
     """A sample ready to be computed, but for the features of its pictures."""
 
-    encoded: Encoded
+    encoded: EncodedSample
     pictures: tuple[Picture, ...]
     sample: Sample
 
@@ -144,7 +144,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Packed:
+class PictureBatch:
     """Pictures that were read, their patches in one tensor and their features in another: a tensor on its way from one process to
     another holds a file open, and a step may have hundreds of pictures.
 
@@ -156,7 +156,7 @@ class Packed:
     features: Any
 
     @classmethod
-    def of(cls, loaded: Sequence[Loaded]) -> Packed:
+    def of(cls, loaded: Sequence[PictureData]) -> PictureBatch:
         import torch
 
         has_features = [item.features is not None for item in loaded]
@@ -168,25 +168,25 @@ class Packed:
         facts = zip(loaded, has_features, arrays, strict=True)
         return cls([(item.picture, item.key, found, len(array)) for item, found, array in facts], *joined)
 
-    def loaded(self) -> list[Loaded]:
+    def loaded(self) -> list[PictureData]:
         found, begin = [], {False: 0, True: 0}
         for picture, key, has_features, count in self.pictures:
             rows = slice(begin[has_features], begin[has_features] + count)
             begin[has_features] += count
             if has_features:  # of its own, since it may be kept when the others are let go
-                found.append(Loaded(picture, key, features=self.features[rows].clone()))
+                found.append(PictureData(picture, key, features=self.features[rows].clone()))
             else:
-                found.append(Loaded(picture, key, patches=self.patches[rows]))
+                found.append(PictureData(picture, key, patches=self.patches[rows]))
         return found
 
 
 @dataclass(frozen=True)
-class Made:
+class StepData:
     """What a worker made. unreadable: picture -> why it cannot be read."""
 
     step: int
     rows: list[Row]
-    packed: Packed
+    packed: PictureBatch
     unreadable: dict[Picture, str]
 
 
@@ -197,7 +197,7 @@ class Maker:
     samples: Sequence[Sample]
     reader: PictureReader
 
-    def __call__(self, order: Order) -> Made:
+    def __call__(self, order: Order) -> StepData:
         samples = [self.samples[index] for index in order.samples]
         rows = [Row(encode_text(self.reader.processor, s), tuple(pictures_of(s)), s) for s in samples]
         loaded, unreadable = [], {}
@@ -206,7 +206,7 @@ class Maker:
                 loaded.append(self.reader.read(picture))
             except InputError as error:
                 unreadable[picture] = str(error)
-        return Made(order.step, rows, Packed.of(loaded), unreadable)
+        return StepData(order.step, rows, PictureBatch.of(loaded), unreadable)
 
 
 @dataclass(frozen=True)
@@ -268,22 +268,32 @@ SAMPLES_AT_ONCE = 64  # what a worker is given
 TOO_LONG, SPECIAL_TOKEN, UNFIT_PICTURE = "too_long", "special_token", "unfit_picture"
 
 
+@dataclass
+class Counts:
+    """What was seen of some samples, each picture once, so that a million samples take little. rows: (index, prompt, answer tokens)."""
+
+    rows: list[tuple[int, int, int]] = field(default_factory=list)
+    of_samples: list[np.ndarray] = field(default_factory=list)  # places of the pictures of each row
+    places: dict[Picture, int] = field(default_factory=dict)
+    decisions: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+    examples: dict[str, tuple[int, str]] = field(default_factory=dict)  # reason -> index and words of the first
+
+    def places_of(self, pictures: Iterable[Picture]) -> np.ndarray:
+        return np.array([self.places.setdefault(picture, len(self.places)) for picture in pictures], np.int32)
+
+    def add(self, part: Counts) -> None:
+        new_place = self.places_of(part.places)
+        self.of_samples += [new_place[places] for places in part.of_samples]
+        self.rows += part.rows
+        self.decisions += part.decisions
+        self.skipped += part.skipped
+        for reason, example in part.examples.items():
+            self.examples[reason] = min(example, self.examples.get(reason, example))
+
+
 @dataclass(frozen=True)
-class Counted:
-    """What was seen of one sample. reason: why it is left out, with `detail`; None: it is learnt from."""
-
-    index: int
-    key: str
-    prompt_tokens: int
-    answer_tokens: int
-    decision: str
-    pictures: tuple[Picture, ...]
-    reason: str | None = None
-    detail: str = ""
-
-
-@dataclass(frozen=True)
-class Looker:
+class Counting:
     """Looks at samples; goes to worker processes."""
 
     samples: Sequence[Sample]
@@ -291,33 +301,39 @@ class Looker:
     trees: Mapping[str, Path]
     max_tokens: int
 
-    def __call__(self, indices: Sequence[int]) -> list[Counted]:
-        sizes: dict[Picture, str] = {}
-        return [self._count(index, self.samples[index], sizes) for index in indices]
+    def __call__(self, indices: Sequence[int]) -> Counts:
+        seen, checked = Counts(), dict[Picture, str]()
+        for index in indices:
+            sample = self.samples[index]
+            row = None if (token := special_token_in(self.processor, sample)) else encode_text(self.processor, sample)
+            if row is None:
+                reason, detail = SPECIAL_TOKEN, f"{token} stands in a text"
+            elif len(row) > self.max_tokens:
+                counts = f"{len(row.prompt_ids)} prompt + {len(row.answer_ids)} answer tokens"
+                reason, detail = TOO_LONG, f"{counts}, at most {self.max_tokens}"
+            elif detail := self._why_unfit(sample, checked):
+                reason = UNFIT_PICTURE
+            else:
+                seen.rows.append((index, len(row.prompt_ids), len(row.answer_ids)))
+                seen.of_samples.append(seen.places_of(pictures_of(sample)))
+                seen.decisions[sample.decision] += 1
+                continue
+            seen.skipped[reason] += 1
+            seen.examples.setdefault(reason, (index, f"{sample.key}: {detail}"))
+        return seen
 
-    def _count(self, index: int, sample: Sample, checked: dict[Picture, str]) -> Counted:
-        found = special_token_in(self.processor, sample)
-        if found is not None:
-            return Counted(index, sample.key, 0, 0, sample.decision, (), SPECIAL_TOKEN, f"{found} stands in a text")
-        row, pictures = encode_text(self.processor, sample), tuple(pictures_of(sample))
-        counts = len(row.prompt_ids), len(row.answer_ids)
-        if len(row) > self.max_tokens:
-            detail = f"{counts[0]} prompt + {counts[1]} answer tokens, at most {self.max_tokens}"
-            return Counted(index, sample.key, *counts, sample.decision, (), TOO_LONG, detail)
-        for picture in pictures:
+    def _why_unfit(self, sample: Sample, checked: dict[Picture, str]) -> str:
+        """Compare the headers of the pictures' files with the prompt; the empty string: they fit."""
+        for picture in pictures_of(sample):
             if picture not in checked:
-                checked[picture] = self._why_unfit(sample, picture)
+                checked[picture] = ""
+                try:
+                    path = inside(self.trees[picture.run], picture.frame) / VIEW_FILES[picture.view]
+                    sample.pictures.check_size(path, image_size(path))
+                except InputError as error:
+                    checked[picture] = str(error)
             if checked[picture]:
-                return Counted(index, sample.key, *counts, sample.decision, (), UNFIT_PICTURE, checked[picture])
-        return Counted(index, sample.key, *counts, sample.decision, pictures)
-
-    def _why_unfit(self, sample: Sample, picture: Picture) -> str:
-        """Compare the header of a picture's file with the prompt; the empty string: it fits."""
-        try:
-            path = inside(self.trees[picture.run], picture.frame) / VIEW_FILES[picture.view]
-            sample.pictures.check_size(path, image_size(path))
-        except InputError as error:
-            return str(error)
+                return checked[picture]
         return ""
 
 
@@ -367,54 +383,16 @@ def take_census(
         InputError: the training set cannot be read.
     """
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
-    mine, looker = chunks[ranks.rank :: ranks.size], Looker(samples, processor, trees, max_tokens)
-    seen = _Seen()
+    mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens)
+    seen, whole = Counts(), Counts()
     with progress_bar(label, total=sum(map(len, mine))) as advance:
-        for counted in in_order(looker, mine, max(0, min(workers, len(mine) - 1))):
-            seen.add(counted)
-            advance(len(counted))
-    return _census(ranks.gathered(seen))
-
-
-@dataclass
-class _Seen:
-    """What one process saw, each picture once, so that a million samples take little. rows: (index, prompt, answer tokens)."""
-
-    rows: list[tuple[int, int, int]] = field(default_factory=list)
-    of_samples: list[np.ndarray] = field(default_factory=list)  # places of the pictures of each row
-    places: dict[Picture, int] = field(default_factory=dict)
-    decisions: Counter[str] = field(default_factory=Counter)
-    skipped: Counter[str] = field(default_factory=Counter)
-    examples: dict[str, tuple[int, str]] = field(default_factory=dict)  # reason -> index and words of the first
-
-    def add(self, everything: Sequence[Counted]) -> None:
-        for counted in everything:
-            if counted.reason is not None:
-                self.skipped[counted.reason] += 1
-                self.examples.setdefault(counted.reason, (counted.index, f"{counted.key}: {counted.detail}"))
-                continue
-            self.rows.append((counted.index, counted.prompt_tokens, counted.answer_tokens))
-            self.of_samples.append(self.places_of(counted.pictures))
-            self.decisions[counted.decision] += 1
-
-    def places_of(self, pictures: Sequence[Picture]) -> np.ndarray:
-        return np.array([self.places.setdefault(picture, len(self.places)) for picture in pictures], np.int32)
-
-
-def _census(parts: Sequence[_Seen]) -> Census:
-    """Put together what the processes saw, in the order of the split."""
-    whole = _Seen()
-    of_samples: list[np.ndarray] = []
-    for part in parts:
-        new_place = whole.places_of(list(part.places))
-        of_samples += [new_place[places] for places in part.of_samples]
-        whole.rows += part.rows
-        whole.decisions += part.decisions
-        whole.skipped += part.skipped
-        for reason, example in part.examples.items():
-            whole.examples[reason] = min(example, whole.examples.get(reason, example))
+        for counts in in_order(counting, mine, max(0, min(workers, len(mine) - 1))):
+            seen.add(counts)
+            advance(len(counts.rows) + counts.skipped.total())
+    for part in ranks.gathered(seen):
+        whole.add(part)
     rows = np.array(whole.rows, np.int64).reshape(-1, 3)
-    order = np.argsort(rows[:, 0])
+    order = np.argsort(rows[:, 0])  # that of the split
     return Census(
         indices=rows[order, 0],
         prompt_tokens=rows[order, 1],
@@ -424,7 +402,7 @@ def _census(parts: Sequence[_Seen]) -> Census:
         skipped=whole.skipped,
         examples={reason: words for reason, (_, words) in whole.examples.items()},
         pictures=list(whole.places),
-        _places=[of_samples[place] for place in order],
+        _places=[whole.of_samples[place] for place in order],
     )
 
 

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from cosfly.errors import ConfigError
-from distill.student.encoding import IGNORED, Encoded, padded
+from distill.student.encoding import IGNORED, EncodedSample, padded
 from distill.student.model import Student
 
 
@@ -94,7 +94,7 @@ def output_head(student: Student) -> Any:
     return head.weight
 
 
-def answer_loss(student: Student, rows: Sequence[Encoded], features: Any, chunk: int) -> tuple[Any, Any]:
+def answer_loss(student: Student, rows: Sequence[EncodedSample], features: Any, chunk: int) -> tuple[Any, Any]:
     """Run samples forward, padded on the right.
 
     Args:

@@ -19,7 +19,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import action_tokens
 from cosfly.work.store import write_json
 from distill.schema import Sample
-from distill.student.encoding import END_OF_ANSWER, Encoded, chat_text, prompt_text
+from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
 from distill.student.features import VisionFeatures
 from distill.student.model import Processor, Student
 from distill.training.loading import Census
@@ -76,7 +76,7 @@ def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
             return tensor
 
         half = np.full(length // 2, student.end_token_id, np.int64)
-        row = Encoded("probe", half, half, None, np.zeros((0, 3), np.int64), 1.0)
+        row = EncodedSample("probe", half, half, None, np.zeros((0, 3), np.int64), 1.0)
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
             answer_loss(student, [row], torch.zeros((0, 1)), cfg.logit_chunk)
         found.append(sum(storage.nbytes() for storage in storages.values()))

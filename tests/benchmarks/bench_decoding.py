@@ -24,7 +24,7 @@ import torch
 from bench_training import END, PAD, SHAPES, Words, make_rows, make_student, noise_of
 
 from distill.student.decoding import decode
-from distill.student.encoding import Encoded, prompt_batch
+from distill.student.encoding import EncodedSample, prompt_batch
 from distill.student.kernels import fuse_norms
 from distill.student.model import Student, compute_dtype
 
@@ -36,7 +36,7 @@ class Numbers(Words):
         return " ".join(map(str, ids))
 
 
-def make_batch(student: Student, shape: dict[str, Any], count: int) -> tuple[list[Encoded], Any]:
+def make_batch(student: Student, shape: dict[str, Any], count: int) -> tuple[list[EncodedSample], Any]:
     """Give prompts with their patches, and what the tower makes of these."""
     rows = []
     for row, pictures in make_rows(shape, count, seed=1):
@@ -52,7 +52,7 @@ def make_batch(student: Student, shape: dict[str, Any], count: int) -> tuple[lis
         return rows, torch.cat(seen)
 
 
-def generate(student: Student, rows: list[Encoded], num_tokens: int) -> list[str]:
+def generate(student: Student, rows: list[EncodedSample], num_tokens: int) -> list[str]:
     """Answer by the library's own way."""
     inputs = prompt_batch(student, rows)
     with torch.inference_mode():

@@ -25,8 +25,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from distill.student.encoding import Encoded, padded
-from distill.student.features import Loaded, Picture, VisionFeatures
+from distill.student.encoding import EncodedSample, padded
+from distill.student.features import Picture, PictureData, VisionFeatures
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 from distill.student.model import Student, compute_dtype
 from distill.training.fit import make_optimizer
@@ -89,7 +89,7 @@ def make_student(shape: dict[str, Any], device: str, dtype: Any, seed: int = 0) 
     return Student(Words(), images, model, device, dtype)
 
 
-def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[Encoded, list[Picture]]]:
+def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[EncodedSample, list[Picture]]]:
     """Samples whose lengths differ by a few per cent, as captions' do; a frame stands in five windows."""
     rng, (width_px, height_px) = np.random.default_rng(seed), shape["size_px"]
     grid = (1, height_px // 16, width_px // 16)
@@ -101,7 +101,7 @@ def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[Encode
             ids += [5, *[IMAGE] * (grid[1] * grid[2] // 4), 6]
         ids += rng.integers(FIRST_WORD, shape["vocab_size"], prompt).tolist()
         answers = rng.integers(FIRST_WORD, shape["vocab_size"], answer)
-        encoded = Encoded(
+        encoded = EncodedSample(
             str(number),
             np.array(ids, np.int64),
             np.append(answers, END),
@@ -121,13 +121,13 @@ def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[Encode
     return rows
 
 
-def noise_of(picture: Picture, dtype: Any) -> Loaded:
+def noise_of(picture: Picture, dtype: Any) -> PictureData:
     width_px, height_px = picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
-    return Loaded(picture, picture.frame, patches=torch.from_numpy(values).to(dtype))
+    return PictureData(picture, picture.frame, patches=torch.from_numpy(values).to(dtype))
 
 
-def plain_loss(student: Student, rows: list[Encoded], patches: Any) -> Any:
+def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any:
     """What plain transformers does: every token's logits, the tower in every step, a padding mask."""
     ids, labels, _ = padded(student, rows)
     mask = np.zeros_like(ids)
