@@ -258,13 +258,36 @@ def test_shuffling_leaves_nothing_in_its_place(count, seed):
 
 def test_floors_by_hand(samples):
     train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
-    answers = Floors(train, "en", 0).answers([coc_of(sample) for sample in samples])
+    answers = Floors(train, "en", 0).answers(samples, [coc_of(sample) for sample in samples])
     decisions = {name: [answer.coc.flight_decision for answer in own] for name, own in answers.items()}
     assert set(decisions["majority"]) == {"hover"}
     assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
     assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
-    assert list(Floors([], "en", 0).answers([coc_of(samples[0])])) == []
+    assert list(Floors([], "en", 0).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
     assert majority(["slow_down", "track_straight"]) == "track_straight"  # a tie goes to the first of the action table
+
+
+def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
+    """What two comparisons of numbers tell is no merit of a student: decisions by speed and distance, among numbers that mean nothing."""
+    rng = np.random.default_rng(0)
+
+    def told(count: int) -> list[Sample]:
+        found = []
+        for distance, speed in rng.uniform(0, 10, (count, 2)).round(2).tolist():
+            decision = "slow_down" if speed <= 4 else "hover" if distance <= 3 else "track_straight"
+            text = f"Frame {rng.integers(99)}: {distance} m away at {speed} m/s, {rng.integers(99)} s."
+            prompt = samples[0].prompt.model_copy(update={"user": text})
+            found.append(samples[0].model_copy(update={"prompt": prompt, "decision": decision}))
+        return found
+
+    floors, asked = Floors(told(400), "en", 0), told(100)
+    answers = floors.answers(asked, [coc_of(sample) for sample in asked])
+    right = {
+        name: sum(a.coc.flight_decision == s.decision for a, s in zip(answers[name], asked, strict=True))
+        for name in ("rule", "majority")
+    }
+    assert right["rule"] >= 97
+    assert right["majority"] < 60
 
 
 def test_floors_are_predictions_that_a_verifier_can_judge(place):
@@ -317,7 +340,13 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
     assert (student["parsed"].value, student["bertscore_f1"].value) == (0.75, None)
     assert report.all.who[STUDENT].figures["accuracy"].value == 8 / 16
     assert report.all.who["majority"].figures["accuracy"].value == 8 / 16
-    assert set(report.all.who) == {STUDENT, "majority", "shuffled", "constant"}
+    assert set(report.all.who) == {STUDENT, "teacher", "majority", "shuffled", "constant", "rule"}
+    teacher = report.all.who["teacher"].figures
+    assert (teacher["accuracy"].value, teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (
+        1,
+        1,
+        None,
+    )
     page = (place / "out" / "evaluation.md").read_text()
     assert "BERTScore of en: not computed, no model folder" in page
     assert re.search(r"\| answers that parse \| 75\.00% \(.*to.*\) \| 100\.00% \|", page)

@@ -45,7 +45,7 @@ from distill.evaluation.scores import (
 )
 
 STAGE = "distill.report"
-FLOORS = ("majority", "shuffled", "constant")
+FLOORS = ("majority", "rule", "shuffled", "constant", "teacher")
 Names = dict[str, Report]
 
 

@@ -3,13 +3,16 @@
 majority    the decision that train has most often; no text
 shuffled    the reference of another sample of the split
 constant    one answer of train, with the majority's decision, for every sample
+rule        a decision tree of depth two on the numbers of the prompt, fitted on train (CART, Breiman et al. 1984); no text
+teacher     no floor but the reference itself: what the teacher reaches in figures that are measured against the geometry
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +25,16 @@ from cosfly.products.splits import Split
 from cosfly.reading.documents import parse_document, validation_errors
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json, write_bytes
-from distill.evaluation.scores import Answer
+from distill.evaluation.scores import Answer, number_of
 from distill.schema import Sample, in_its_actions, open_split
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
 WRITTEN = ("shuffled", "constant")  # floors that have texts
+RULE_SAMPLES = 20_000  # of train that the rule is fitted on, drawn by their names
+_NUMERAL = re.compile(r"-?\d+(?:\.\d+)?")
+Rule = (
+    int | tuple[int, float, "Rule", "Rule"]
+)  # a decision's number, or column, threshold, and what holds up to it and above
 
 
 def coc_of(sample: Sample) -> Coc:
@@ -58,35 +66,90 @@ def shuffled_places(groups: Sequence[np.ndarray]) -> np.ndarray:
     return others
 
 
+def numbers_of(samples: Iterable[Sample], width: int | None = None) -> np.ndarray:
+    """Give the numbers of each prompt in their order, (n, width), inf where it has fewer; None: as many as the longest has."""
+    rows = [list(map(float, _NUMERAL.findall(sample.prompt.user)))[:width] for sample in samples]
+    table = np.full((len(rows), max(map(len, rows), default=0) if width is None else width), np.inf)
+    for place, row in enumerate(rows):
+        table[place, : len(row)] = row
+    return table
+
+
+def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
+    """Fit a decision tree: at each node the threshold that leaves the least Gini impurity; labels: (n,) numbers of decisions."""
+    counts, best = np.bincount(labels), (-1.0, 0, 0.0)
+    if depth == 0 or (counts > 0).sum() < 2:
+        return int(counts.argmax())
+    is_label, sizes = np.eye(len(counts))[labels], np.arange(1, len(labels))[:, None]
+    for column in range(table.shape[1]):
+        order = np.argsort(table[:, column])
+        values, below = table[order, column], np.cumsum(is_label[order], axis=0)[:-1]
+        purity = (below**2 / sizes + (counts - below) ** 2 / (len(labels) - sizes)).sum(axis=1)
+        purity[values[1:] == values[:-1]] = -1.0  # no threshold lies between equals
+        place = int(purity.argmax())
+        best = max(best, (float(purity[place]), column, float(values[place])))
+    if best[0] < 0:
+        return int(counts.argmax())
+    _, column, threshold = best
+    low = table[:, column] <= threshold
+    return (
+        column,
+        threshold,
+        fit_rule(table[low], labels[low], depth - 1),
+        fit_rule(table[~low], labels[~low], depth - 1),
+    )
+
+
+def decide(rule: Rule, row: np.ndarray) -> int:
+    """Give the number of the decision that a rule makes of the numbers of a prompt."""
+    while isinstance(rule, tuple):
+        column, threshold, low, high = rule
+        rule = low if row[column] <= threshold else high
+    return rule
+
+
+def _bare(decision: str) -> Answer:
+    return Answer(Coc(critical_components="", reasoning_trace="", flight_decision=decision))
+
+
 class Floors:
     """The floors of one language, from the training split."""
 
-    def __init__(self, train: Iterable[Sample], language: Language, seed: int) -> None:
+    def __init__(self, train: Collection[Sample], language: Language, seed: int) -> None:
         self._seed = seed
-        counts, typical = Counter[str](), dict[str, tuple[bytes, Sample]]()
+        counts, typical, drawn = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
+        share = RULE_SAMPLES / max(1, len(train))
         for sample in train:
             if sample.language == language:
                 counts[sample.decision] += 1
                 rank = hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
                 if sample.decision not in typical or rank < typical[sample.decision][0]:
                     typical[sample.decision] = rank, sample
+                if int.from_bytes(rank[:8]) <= share * 2**64:
+                    drawn.append(sample)
         self.decision = majority(counts.elements())
         self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
+        table = numbers_of(drawn)
+        self._width = table.shape[1]
+        labels = np.array([number_of(sample.decision, sample) for sample in drawn], dtype=int)
+        self.rule = fit_rule(table, labels) if drawn else None
 
     def groups(self, count: int) -> list[np.ndarray]:
         """Deal samples into groups, within which references are shuffled; the same in both languages of the same windows."""
         return shuffled_groups(count, rng_for(self._seed, "distill.floor", "shuffled"))
 
-    def answers(self, references: Sequence[Coc]) -> dict[str, list[Answer]]:
-        """Give what each floor answers to samples with these references, of which there is one at least."""
-        found: dict[str, list[Answer]] = {}
+    def answers(self, samples: Sequence[Sample], references: Sequence[Coc]) -> dict[str, list[Answer]]:
+        """Give what each floor answers to samples with their references, of which there is one at least."""
+        found: dict[str, list[Answer]] = {"teacher": [Answer(reference) for reference in references]}
         if self._constant is not None and self.decision is not None:
-            bare = Coc(critical_components="", reasoning_trace="", flight_decision=self.decision)
-            found["majority"] = [Answer(bare)] * len(references)
+            found["majority"] = [_bare(self.decision)] * len(references)
             found["constant"] = [Answer(self._constant)] * len(references)
         if len(references) > 1:
             places = shuffled_places(self.groups(len(references))).tolist()
             found["shuffled"] = [Answer(references[place]) for place in places]
+        if self.rule is not None:
+            bare = [_bare(token) for token in action_tokens()]
+            found["rule"] = [bare[decide(self.rule, row)] for row in numbers_of(samples, self._width)]
         return found
 
 
@@ -107,7 +170,9 @@ def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path
     for language in languages:
         own = [sample for sample in samples if sample.language == language]
         if own:
-            floors = Floors(open_split(dataset, "train"), language, seed).answers([coc_of(sample) for sample in own])
+            floors = Floors(open_split(dataset, "train"), language, seed).answers(
+                own, [coc_of(sample) for sample in own]
+            )
             for name in WRITTEN:
                 for sample, answer in zip(own, floors.get(name, ()), strict=False):
                     lines[name].append(_prediction(sample, split, name, answer).model_dump_json() + "\n")

@@ -23,7 +23,7 @@ from cosfly.work.journal import Journal
 from cosfly.work.provenance import MANIFEST_SCHEMA
 from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
-from distill.evaluation.floors import Floors, coc_of
+from distill.evaluation.floors import WRITTEN, Floors, coc_of
 from distill.evaluation.scores import UNPARSED, Answer, Figure, Scores, draw_walks, figures_of, score_answers
 from distill.schema import Sample
 
@@ -149,6 +149,7 @@ NOTES = [
     "reference: the teacher's accepted answer; an answer that does not parse is a wrong one and scores 0 in BERTScore",
     "a sample that got no answer is no wrong answer: it is counted under `answered` and in nothing else",
     "intervals: whole walks drawn with replacement, as windows of a flight overlap and flights of a walk resemble each other",
+    "floor rule: a tree of depth two on the numbers of the prompt, fitted on train; `teacher` is no floor but the reference itself",
     "verdicts: against what the flight did after the window, as the captions' own were made",
 ]
 
@@ -223,10 +224,12 @@ def score_language(
     """Score the student and the floors on the samples of one language: who -> scores."""
     samples = [sample for sample, _ in pairs]
     references = [coc_of(sample) for sample in samples]
-    who = {STUDENT: [Answer.of(prediction) for _, prediction in pairs], **floors.answers(references)}
+    who = {STUDENT: [Answer.of(prediction) for _, prediction in pairs], **floors.answers(samples, references)}
     texts: dict[str, np.ndarray] = {}
     if scorer is not None:
-        written = {name: [text_of(a.coc) for a in answers] for name, answers in who.items() if name != "majority"}
+        written = {
+            name: [text_of(a.coc) for a in answers] for name, answers in who.items() if name in (STUDENT, *WRITTEN)
+        }
         groups = floors.groups(len(samples))
         texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
     return {name: score_answers(samples, answers, texts.get(name), judged.get(name)) for name, answers in who.items()}

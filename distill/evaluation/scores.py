@@ -95,7 +95,7 @@ def _numbers() -> dict[str, int]:
     return {token: number for number, token in enumerate(action_tokens())}
 
 
-def _number_of(decision: str, sample: Sample) -> int:
+def number_of(decision: str, sample: Sample) -> int:
     """Give the number of a decision.
 
     Raises:
@@ -142,15 +142,12 @@ def score_answers(
         walk=np.array([sample.walk for sample in samples], dtype=object),
         language=np.array([sample.language for sample in samples], dtype=object),
         against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
-        reference=np.array([_number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
+        reference=np.array([number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
         answer=np.array(
-            [
-                _number_of(a.coc.flight_decision, s) if a.coc else UNPARSED
-                for s, a in zip(samples, answers, strict=True)
-            ],
+            [number_of(a.coc.flight_decision, s) if a.coc else UNPARSED for s, a in zip(samples, answers, strict=True)],
             dtype=np.int8,
         ),
-        label=np.array([_number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
+        label=np.array([number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
         verdict=np.array(verdicts, dtype=np.int8),
