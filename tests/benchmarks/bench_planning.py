@@ -1,4 +1,4 @@
-"""How long planners take for a flight, how good the flights are, and how MuCO's optimiser compares with scipy's L-BFGS-B.
+"""Steps 2 to 4: times of simplification, walks and planners, the flights' quality, each beside a library: scipy's Dijkstra and L-BFGS-B, shapely's tree.
 
 python tests/benchmarks/bench_planning.py [--maps a b c] [--planners muco ...]
 """
@@ -6,23 +6,129 @@ python tests/benchmarks/bench_planning.py [--maps a b c] [--planners muco ...]
 from __future__ import annotations
 
 import argparse
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import scenes
+import shapely
 from scipy.optimize import minimize
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosfly.errors import NoPathError
-from cosfly.geometry import DT_S
+from cosfly.pedestrians.astar import find_route, route_cost
+from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
+from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.kinds import KINDS
+from cosfly.simplify.merge import clusters
+from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space import flight_metrics as metrics
 from cosfly.space.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.work.chance import rng_for
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
+
+
+# --- Step 2 and Step 3 ------------------------------------------------------------------------------------------------
+
+WALKS = PedestriansConfig(num_paths=scenes.NUM_WALKS)
+BIG_M = (3784 * 0.5, 2357 * 0.5)  # the largest map of the paper
+
+
+def peer_clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
+    """The clusters of Step 2 by shapely's STRtree and scipy's connected components."""
+    grown = shapely.box(mins[:, 0] - gap_m, mins[:, 1] - gap_m, maxs[:, 0] + gap_m, maxs[:, 1] + gap_m)
+    one, other = shapely.STRtree(shapely.box(mins[:, 0], mins[:, 1], maxs[:, 0], maxs[:, 1])).query(grown)
+    near = (mins[one, 2] <= maxs[other, 2] + gap_m) & (mins[other, 2] <= maxs[one, 2] + gap_m)
+    graph = coo_array((np.ones(near.sum(), dtype=np.int8), (one[near], other[near])), shape=(len(mins), len(mins)))
+    return connected_components(graph, directed=False)[1]
+
+
+def simplification(maps: dict[str, BoxMap]) -> None:
+    rows = []
+    for name, raw in maps.items():
+        times = [scenes.cpu_ms(lambda raw=raw: simplify(raw, SimplifyConfig())) for _ in range(3)]
+        rows.append([name, len(raw), len(times[-1][1].box_map), min(ms for ms, _ in times) / 1e3])
+    scenes.print_table("simplify", ["map", "boxes", "left", "s"], rows)
+    raw = next(iter(maps.values()))
+    plants = raw.select(raw.kinds == KINDS["Vegetation"])
+    ours_ms, ours = scenes.cpu_ms(lambda: clusters(plants.mins, plants.maxs, 2.0))
+    peer_ms, peer = scenes.cpu_ms(lambda: peer_clusters(plants.mins, plants.maxs, 2.0))
+    assert len(np.unique(np.column_stack([ours, peer]), axis=0)) == len(np.unique(ours)) == len(np.unique(peer))
+    names = ["ours, ms", "STRtree + connected components, ms"]
+    scenes.print_table(f"clusters of {len(plants)} vegetation boxes", names, [[ours_ms, peer_ms]])
+
+
+def octile_graph(walkable: np.ndarray) -> coo_array:
+    """The graph of the walkable cells, (ny, nx) bool, without corner cutting, for scipy."""
+    number = np.arange(walkable.size).reshape(walkable.shape)
+    ones, others, costs = [], [], []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        height, width = walkable.shape[0] - dy, walkable.shape[1] - abs(dx)
+        a = np.s_[:height, max(-dx, 0) : max(-dx, 0) + width]
+        b = np.s_[dy : dy + height, max(dx, 0) : max(dx, 0) + width]
+        free = walkable[a] & walkable[b]
+        if dx and dy:
+            free &= walkable[a[0], b[1]] & walkable[b[0], a[1]]
+        ones.append(number[a][free])
+        others.append(number[b][free])
+        costs.append(np.full(free.sum(), np.hypot(dx, dy)))
+    shape = (walkable.size, walkable.size)
+    return coo_array((np.concatenate(costs), (np.concatenate(ones), np.concatenate(others))), shape=shape).tocsr()
+
+
+def stage_a(box_map: BoxMap) -> tuple:
+    """Grid to A* without files and pictures: the ground and the walks."""
+    ground = walkable_ground(box_map, WALKS)
+    names = [f"path_{k:05d}" for k in range(WALKS.num_paths)]
+    return ground, [make_walk(name, ground, WALKS, rng_for(scenes.SEED, "pedestrians", name)) for name in names]
+
+
+def walking(maps: dict[str, BoxMap]) -> None:
+    rows = []
+    for name, box_map in maps.items():
+        times = [scenes.cpu_ms(lambda box_map=box_map: stage_a(box_map)) for _ in range(3)]
+        ground, walks = times[-1][1]
+        with tempfile.TemporaryDirectory() as folder:
+            write_boxes(Path(folder) / "map.json", box_map)
+            whole_ms, _ = scenes.cpu_ms(lambda f=Path(folder): run(WALKS, f / "map.json", f / "out"))
+        graph, ours_ms, peer_ms, worst = octile_graph(ground.walkable), [], [], 0.0
+        for walk in walks[:5]:
+            ends = ground.grid.cells_at(walk.walk.polyline_m[[0, -1]])
+            ms, cells = scenes.cpu_ms(lambda ends=ends, ground=ground: find_route(ground.walkable, ends[0], ends[1]))
+            ours_ms.append(ms)
+            source, goal = (int(y * ground.walkable.shape[1] + x) for x, y in ends)
+            ms, lengths = scenes.cpu_ms(lambda s=source, g=graph: dijkstra(g, directed=False, indices=s, limit=700.0))
+            peer_ms.append(ms)
+            worst = max(worst, abs(lengths[goal] - route_cost(cells)))
+        size, means = " x ".join(map(str, ground.grid.size)), [float(np.mean(ours_ms)), float(np.mean(peer_ms))]
+        best_s = min(ms for ms, _ in times) / 1e3
+        rows.append([name, len(box_map), size, best_s, whole_ms / 1e3, *means, f"{worst:.1e}"])
+    names = ["map", "boxes", "grid", "without files and report, s", "whole stage, s", "one route by A*, ms"]
+    scenes.print_table("stage A, 20 paths", [*names, "by Dijkstra, ms", "greatest difference of costs, cells"], rows)
+
+
+def ground_stages() -> None:
+    town, city = scenes.town(), scenes.city()
+    raw, simple = {"(a) town": town}, {"(a) town": scenes.simplified(town)}
+    if city is not None:
+        low, high = city.bounds()
+        columns, lines = (int(np.ceil(BIG_M[k] / (high[k] - low[k]))) for k in (0, 1))
+        raw |= {"(b) city": city, "(c) city 12 x 12": scenes.tiled(city, 12, 12)}
+        tiled = scenes.cut_to(scenes.tiled(city, columns, lines), BIG_M)
+        simple[f"(b) tiled {columns} x {lines}, cut"] = scenes.simplified(tiled)
+    stage_a(simple["(a) town"])  # compiles
+    simplification(raw)
+    walking(simple)
+
+
+# --- Step 4 -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -87,47 +193,6 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
     ]  # fmt: skip
 
 
-def muco_ring(cfg: PlanConfig) -> np.ndarray:
-    """Places where MuCO's loss wants the drone, relative to the ground below the walker: 72 directions, (72, 3) m."""
-    turns, height = np.arange(72) * (2.0 * np.pi / 72), cfg.altitude_preferred_m
-    radius = np.sqrt(cfg.muco.track_distance_m**2 - (height - 1.0) ** 2)
-    return np.column_stack([radius * np.cos(turns), radius * np.sin(turns), np.full(72, height)])
-
-
-def wide_lattice(cfg: PlanConfig) -> np.ndarray:
-    """24 directions, seven distances up to 55 m, seven altitudes up to the greatest: (1,015, 3) m."""
-    radii, turns = np.array([0.0, 6.0, 12.0, 20.0, 28.0, 40.0, 55.0]), np.arange(24) * (2.0 * np.pi / 24)
-    heights = np.geomspace(cfg.altitude_min_m, cfg.altitude_max_m, 7)
-    radius, turn, height = (a.ravel() for a in np.meshgrid(radii, turns, heights, indexing="ij"))
-    return np.unique(np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height]).round(9), axis=0)
-
-
-def most_visible(scene: Scene, places: np.ndarray, every: int, cfg: PlanConfig) -> tuple[float, float]:
-    """Exhaustive search for the flights that see most, from places given relative to the walker; means over the scenarios.
-
-    Every `every`-th frame. First: the best free place of each frame, whatever the way between them. Second: the best sequence that
-    keeps the speed limit (dynamic programming), through buildings if need be. No flight over these places can see more.
-    """
-    jumping, moving, reach_m = [], [], cfg.speed_max_mps * DT_S * every
-    for scenario in scene.scenarios:
-        targets, best, greatest = scenario.targets_m[::every], np.zeros(len(places)), []
-        grounds_m = scenario.ground_m[::every]
-        for k, target in enumerate(targets):
-            there = places + np.array([target[0], target[1], grounds_m[k]])
-            is_free = signed_distances(scene.obstacles, there, cfg.safety_distance_m)[0] >= cfg.relaxed_safety_m
-            seen = visibility(scene.obstacles, there, np.repeat(target[None], len(there), axis=0))
-            seen = np.where(is_free, seen, -np.inf)
-            greatest.append(seen.max())
-            if k > 0:
-                step = np.append((target - targets[k - 1])[:2], 0.0)
-                far = ((places[:, None] + step - places[None]) ** 2).sum(axis=-1) > reach_m**2
-                best = np.where(far, -np.inf, best[None]).max(axis=1)
-            best = best + seen
-        jumping.append(np.mean(greatest))
-        moving.append(best.max() / len(targets))
-    return float(np.mean(jumping)), float(np.mean(moving))
-
-
 def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     """The same loss, start and bounds for both; times of the optimisation alone.
 
@@ -180,6 +245,7 @@ def main() -> None:
     parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS))
     options = parser.parse_args()
     scenes.one_thread_and_machine()
+    ground_stages()
     cfg, found, rows = PlanConfig(), make_scenes(options.maps), []
     for planner in options.planners:
         first = Scene("warm-up", found[0].obstacles, found[0].scenarios[:2])
@@ -187,14 +253,6 @@ def main() -> None:
         print(f"{planner}: first two flights with compilation or its cache {warm_up_ms / 1e3:.2f} s")
         rows += [measure(scene, planner, cfg) for scene in found]
     print()
-    lattices = {"MuCO's ring, every frame": (muco_ring(cfg), 1), "wide lattice, every 4th": (wide_lattice(cfg), 4)}
-    bounds = [
-        [scene.name, name] + [f"{share:.3f}" for share in most_visible(scene, places, every, cfg)]
-        for scene in found
-        if scene.name in ("(a) town", "(b) city 1 x 1")
-        for name, (places, every) in lattices.items()
-    ]
-    scenes.print_table("mean visibility that no flight can exceed", ["map", "places", "jumping", "moving"], bounds)
     names = [
         "map", "planner", "obstacles", "flights + failed", "points", "mean ms", "p95 ms", "max ms", "visibility", "worst",
         "clearance, m", "collisions", "smooth", "length, m", "acceleration / jerk, RMS",

@@ -38,15 +38,6 @@ def city() -> BoxMap | None:
     return load_map(build(MapsConfig, {"source": "simworld", "simworld": {"world": str(world)}}, "benchmark"))
 
 
-def quarter() -> BoxMap | None:
-    """Delft's CityJSON quarter, raw; None where the shared data are absent."""
-    path = SHARED_DATA / "delft-bgt-lod1" / "delft.json.gz"
-    if not path.is_file():
-        print(f"(Delft is left out: {path} is not here)")
-        return None
-    return load_map(build(MapsConfig, {"source": "cityjson", "cityjson": {"path": str(path)}}, "benchmark"))
-
-
 def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
     """Copies of a map side by side; the first copy stays where the map is."""
     low, high = box_map.bounds()
