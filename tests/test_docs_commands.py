@@ -51,13 +51,14 @@ def commands(page: Path) -> list[str]:
     return found
 
 
+COMMAND_LINE = typer.main.get_command(app)
 ALL = [(page.name, text) for page in PAGES for text in commands(page)]
 
 
 def parsed(text: str) -> tuple[Any, list[str]]:
     """The command that a line names, and its words after that."""
     words = options_first(shlex.split(text, comments=True))
-    command: Any = typer.main.get_command(app)
+    command: Any = COMMAND_LINE
     while words and words[0] in getattr(command, "commands", {}):
         command, words = command.commands[words[0]], words[1:]
     return command, words
