@@ -27,7 +27,7 @@ MUTUAL = {
     ("release", "release/get"),
     ("release", "release/verify"),
 }
-ASSEMBLY = ("app", "bench", "studies")  # what may know all stages and siblings
+ASSEMBLY = ("app", "studies")  # what may know all stages and siblings
 HEAVY = {
     "torch",
     "transformers",

@@ -71,7 +71,6 @@ SMALL = {
     "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
-    "bench": ["--kills", "1", "--stalls", "0"],
     "distill train": _set(
         "distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2", "distill.train.batch_size=1",
         "distill.train.validation_samples=2", "distill.train.validation_answers=false", "distill.train.data_workers=0",

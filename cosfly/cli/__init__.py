@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import typer
 
 from cosfly import __version__
-from cosfly.cli.bench import app as bench_app
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
 from cosfly.cli.export import app as export_app
@@ -58,7 +57,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, render_app, bench_app):
+for group in (run_app, stages_app, render_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (
     ("caption", caption_app),

@@ -230,6 +230,36 @@ def list_runs(root: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where 
         answer_console.print(f"not readable: {error}", soft_wrap=True)
 
 
+@app.command()
+def bench(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that is finished up to the stage.")],
+    out: Annotated[Path, typer.Option(help="New folder for bench.json and bench.md.")],
+    stage: Annotated[str, typer.Option(help="Stage to measure.")] = "render",
+    workers: Annotated[str, typer.Option(help="Counts of worker processes, as in 1,2,4.")] = "1,2,4",
+    overrides: options.Overrides = None,
+) -> None:
+    """Measure a stage with one worker process and more: the paper's tables of scaling and of reliability."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from cosfly.app import bench as benchmark
+    from cosfly.work.console import console
+
+    counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
+    if min(counts) < 1:
+        raise typer.BadParameter("whole numbers from 1 up, with commas between them", param_hint="'--workers'")
+    measured = benchmark.run(options.resolve(run / "run.yaml", overrides), run, out, stage, counts)
+    for title, head, rows in benchmark.tables(measured):
+        # Eighty columns hold the widest.
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False)
+        for number, name in enumerate(head):
+            table.add_column(name, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    typer.echo(out)
+
+
 def _size(size_bytes: float) -> str:
     return f"{size_bytes / 1e9:.2f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.1f} MB"
 

@@ -17,8 +17,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import scenes
+from faults import Faults, planted
 
-from cosfly.bench.faults import Faults, planted
 from cosfly.errors import EnvironmentMissing
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
