@@ -210,7 +210,6 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
     "release export tree": [["release", "export", DATASET, "--format", "tree", "--out", "{out}", "--workers", "1"]],
     "release export webdataset": [["release", "export", DATASET, "--format", "webdataset", "--out", "{out}", "--workers", "1"]],
     "release export lerobot": [["release", "export", DATASET, "--format", "lerobot", "--out", "{out}", "--workers", "1"]],
-    "release export lerobot-v2.1": [["release", "export", DATASET, "--format", "lerobot-v2.1", "--out", "{out}", "--workers", "1"]],
     "release get": [["release", "get", "{served}", "--out", "{out}", "--workers", "1"]],
     "release get, a part": [["release", "get", "{served}", "--out", "{out}", "--workers", "1", "--modality", "rgb"]],
     "release stats": [["release", "stats", DATASET, "--out", "{out}"]],

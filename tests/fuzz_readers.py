@@ -106,9 +106,9 @@ from distill.windows import Windows
 from release.export import stage as export
 from release.export.captions import export as export_captions
 from release.export.contract import ExportConfig
-from release.export.manifest import read_export
+from release.export.stage import read_export
 from release.get import stage as get
-from release.get.choice import Choice
+from release.get.stage import Choice
 from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
@@ -585,12 +585,6 @@ EXPORTED = {
         "meta/tasks.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "data/chunk-000/file-000.parquet",
-    ),
-    "lerobot-v2.1": (
-        "meta/info.json",
-        "meta/tasks.jsonl",
-        "meta/episodes.jsonl",
-        "data/chunk-000/episode_000000.parquet",
     ),
 }
 

@@ -40,13 +40,7 @@ _OF_LEROBOT = (
     "huggingface_hub==0.35.3",
 )
 # LeRobot's own pins ask for another torch; what reads data sets works with ours, so the packages are named one by one.
-LEROBOT = {
-    "lerobot": ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_OF_LEROBOT),
-    "lerobot-v2.1": (
-        "lerobot==0.3.3", "datasets==3.6.0", "av==15.1.0", "fsspec==2025.3.0", "dill==0.3.8", "multiprocess==0.70.16", *_OF_LEROBOT,
-        "aiohttp==3.12.15", "aiohappyeyeballs==2.6.1", "aiosignal==1.4.0", "frozenlist==1.7.0", "multidict==6.6.4", "yarl==1.20.1", "propcache==0.3.2",
-    ),
-}  # fmt: skip
+LEROBOT = ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_OF_LEROBOT)
 
 # An S3 server, and what fsspec opens s3:// with; of the server only what its S3 part asks for.
 S3 = (

@@ -17,7 +17,7 @@ from caption.truth.released import read_released
 from cosfly.reading.files import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers
-from release.package.folder import write_records
+from release.package.records import write_records
 from release.package.rows import open_writer
 from release.record import (
     ReleasedFlight,

@@ -35,12 +35,11 @@ from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import Flight, read_flight, write_flight
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
+from release.depth import encoded
 from release.package.config import ReleaseConfig
-from release.package.depth import encoded
-from release.package.publishable import published, published_name
 from release.package.sources import Source
 from release.package.stage import run
-from release.record import ReleaseRecord, read_record
+from release.record import ReleaseRecord, published, published_name, read_record
 from specimens import make_playback_tree
 
 POINTS = 14

@@ -24,10 +24,9 @@ from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
 from release.card.numbers import COLUMNS, Counted, Sum, count_shard, spread_of
-from release.card.render import render_card
-from release.card.snippets import first_split
+from release.card.render import first_split, render_card
 from release.columns import POINT, schema
-from release.package.folder import write_records
+from release.package.records import write_records
 from release.record import MadeBy, read_record
 from release.verify.verify import verify
 

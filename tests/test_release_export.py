@@ -38,11 +38,9 @@ from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
-from release.export.lerobot.features import moves, tiff_of_depth
-from release.export.lerobot.format import runs_of
-from release.export.lerobot.summary import merged, summarize
-from release.export.manifest import read_export
+from release.export.lerobot import merged, moves, runs_of, summarize, tiff_of_depth
 from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
+from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
 from release.package.sources import Source
@@ -356,9 +354,8 @@ def test_splits_reach_every_format(tmp_path):
         names = [name for shard in shards.glob(f"{split}-*.tar") for name in names_in(shard)]
         assert sum(name.endswith(".json") for name in names) == told.frames
     episodes = numbers["train"].flights
-    for format in ("lerobot", "lerobot-v2.1"):
-        info = json.loads((export(config(format), dataset, tmp_path / format) / "meta/info.json").read_text())
-        assert info["splits"] == {"train": f"0:{episodes}", "validation": f"{episodes}:6"}
+    info = json.loads((export(config("lerobot"), dataset, tmp_path / "lerobot") / "meta/info.json").read_text())
+    assert info["splits"] == {"train": f"0:{episodes}", "validation": f"{episodes}:6"}
 
 
 # --- whatever the format ----------------------------------------------------------------------------------------------

@@ -38,9 +38,8 @@ from release.export.contract import ExportConfig
 from release.export.stage import run as export
 from release.get import remote as remotes
 from release.get import stage
-from release.get.choice import Choice
 from release.get.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
-from release.get.stage import NOT_ASKED_FOR
+from release.get.stage import NOT_ASKED_FOR, Choice
 from release.get.stage import run as get
 from release.record import content_digest, read_record
 from release.verify.verify import verify

@@ -22,7 +22,7 @@ from test_release_export import TWO_SPLITS, make_release
 from test_release_package import all_bytes
 
 from cosfly.work.config import build
-from release.get.choice import Choice
+from release.get.stage import Choice
 from release.get.stage import run as get
 from release.record import read_record
 

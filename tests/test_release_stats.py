@@ -27,12 +27,12 @@ from cosfly.reading.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import BOX, POINT, POSE
 from release.record import read_record
+from release.stats.cells import Absent, Stats, Table
 from release.stats.counting import Counts, overlap
-from release.stats.frame_tables import weather
 from release.stats.page import markdown, page_html
 from release.stats.pixels import BIN_M, Pixels
-from release.stats.schema import Absent, Stats, Table
 from release.stats.stats import run
+from release.stats.tables import weather
 from specimens import make_flight
 
 BIG = dict(zip(BOX, (10.0, 10.0, 20.0, 30.0), strict=True))

@@ -34,7 +34,7 @@ from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.record import read_record
-from release.splits import split_groups
+from release.rules import split_groups
 from release.verify.by_rule import check_inspected
 from release.verify.findings import EXAMPLES, Findings
 from release.verify.rows import FlightRows

@@ -66,9 +66,9 @@ def exported(honest_exports, tmp_path) -> Path:
     return shutil.copytree(honest_exports["webdataset"], tmp_path / "webdataset")
 
 
-@pytest.fixture(params=["lerobot", "lerobot-v2.1"])
-def episodes(request, honest_exports, tmp_path) -> Path:
-    return shutil.copytree(honest_exports[request.param], tmp_path / request.param)
+@pytest.fixture
+def episodes(honest_exports, tmp_path) -> Path:
+    return shutil.copytree(honest_exports["lerobot"], tmp_path / "lerobot")
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -195,8 +195,8 @@ def release_export(
     folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
     out: Annotated[Path, typer.Option(help="Folder for the export and its records.")],
     format: Annotated[
-        Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"],
-        typer.Option(help="Playback tree (CosFly-Track v7), WebDataset, LeRobot v3.0 or v2.1."),
+        Literal["tree", "webdataset", "lerobot"],
+        typer.Option(help="Playback tree (CosFly-Track v7), WebDataset or LeRobot v3.0."),
     ],
     shard_mb: Annotated[int | None, typer.Option(help="Size of a file of many frames, about, in MB.")] = None,
     config: options.ConfigFile = None,
@@ -252,7 +252,7 @@ def release_get(
     """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and all that can be checked is."""
     from cosfly.work.config import build
     from release.get import stage as get
-    from release.get.choice import Choice
+    from release.get.stage import Choice
 
     cfg = options.resolve(config, overrides, {"workers": workers})
     asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}

@@ -22,8 +22,7 @@ from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, re
 from cosfly.reading.arrays import parse_array, parse_array_header
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes, write_model
-from release.depth import depth_of
-from release.package.depth import MOST_PNG_M, depth_record, encoded
+from release.depth import MOST_PNG_M, depth_of, depth_record, encoded
 from release.record import DepthCodingName
 
 SCHEMA, VERSION = "cosfly.depth_study", "1.0"

@@ -23,19 +23,18 @@ from cosfly.work.config import Config
 from cosfly.work.store import atomic_file
 from release.export.source import Release, ReleasedRows, Span
 
-FormatName = Literal["tree", "webdataset", "lerobot", "lerobot-v2.1"]
+FormatName = Literal["tree", "webdataset", "lerobot"]
 FORMATS: dict[FormatName, str] = {
     "tree": "release.export.tree",
     "webdataset": "release.export.webdataset",
-    "lerobot": "release.export.lerobot.format",
-    "lerobot-v2.1": "release.export.lerobot.format",
+    "lerobot": "release.export.lerobot",
 }
 
 
 class ExportConfig(Config):
     """What is made of a release."""
 
-    format: FormatName = Field(description="tree, webdataset, lerobot (v3.0) or lerobot-v2.1")
+    format: FormatName = Field(description="tree, webdataset, or lerobot (v3.0)")
     shard_mb: int = Field(
         500,
         ge=1,

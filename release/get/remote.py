@@ -22,8 +22,7 @@ from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.reading.files import open_file
 from cosfly.work.runner import advance
 from cosfly.work.store import inside
-from release.package.publishable import published_name
-from release.record import release_folder
+from release.record import published_name, release_folder
 
 Answer = TypeVar("Answer")
 MB = 1024 * 1024

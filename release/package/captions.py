@@ -24,7 +24,7 @@ from release.columns import (
     WINDOW,
     ReleasedCaption,
 )
-from release.package.publishable import published_name
+from release.record import published_name
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other

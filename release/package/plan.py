@@ -8,20 +8,50 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosfly.errors import InputError, NothingKept
+from cosfly.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
-from cosfly.work.stage_folder import StageFolder, Tally
+from cosfly.work.stage_folder import Failed, StageFolder, Tally, write_failures
 from release.columns import SPLIT_NAMES, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig
 from release.package.shards import FlightPart
 from release.package.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
 from release.package.survey import Placing, Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
-from release.package.wrong import Findings
 from release.record import ReleasedMap
-from release.subsample import select_frames
+from release.rules import select_frames
+
+NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
+
+
+class Findings:
+    """Takes what is wrong, and refuses to go on."""
+
+    def __init__(self, stage: StageFolder) -> None:
+        self._stage, self.failures = stage, list[Failed]()
+
+    def tell(self, item_id: str, error: CosflyError) -> None:
+        self.failures.append(Failed(id=item_id, code=error.code, message=str(error)))
+
+    def check(self) -> None:
+        """Refuse to go on if anything is wrong.
+
+        Raises:
+            InputError, VerifyError: names the first findings; `failures.jsonl` has all.
+        """
+        if not self.failures:
+            return
+        path = self._stage.path / "failures.jsonl"
+        write_failures(path, self.failures)
+        listed = [failure.message for failure in self.failures[:NUM_NAMED]]
+        more = f" | and {len(self.failures) - NUM_NAMED} more, see {path}" if len(self.failures) > NUM_NAMED else ""
+        kind = VerifyError if all(failure.code == VerifyError.code for failure in self.failures) else InputError
+        wrong = "1 thing is" if len(self.failures) == 1 else f"{len(self.failures)} things are"
+        raise kind(
+            f"nothing is released: {wrong} wrong with the material", where=self._stage.path,
+            got=" | ".join(listed) + more, fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

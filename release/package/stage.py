@@ -17,15 +17,21 @@ from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_of
 from cosfly.work.store import CHECKSUMS, atomic_folder
 from release.card.numbers import compute_numbers
-from release.package.account import make_record
 from release.package.config import ReleaseConfig
-from release.package.folder import DATASET, PARTS, Finished, check_parts, name_shards, write_records
-from release.package.origin import provenance_of
-from release.package.plan import Plan, make_plan
+from release.package.plan import Findings, Plan, make_plan
+from release.package.records import (
+    DATASET,
+    PARTS,
+    Finished,
+    check_parts,
+    make_record,
+    name_shards,
+    provenance_of,
+    write_records,
+)
 from release.package.rows import ShardPlan
 from release.package.shards import Written, write_shard
 from release.package.sources import Source, input_names, told_apart
-from release.package.wrong import Findings
 from release.verify.verify import verify
 
 

@@ -17,7 +17,7 @@ from cosfly.work.console import progress_bar
 from release.columns import SplitName
 from release.package.sources import Candidate
 from release.record import Pairs, SplitBy
-from release.splits import split_groups
+from release.rules import split_groups
 
 MOST_NAMED = 3  # flights of each kind in a message
 

@@ -6,9 +6,8 @@ from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.products.captions import FIELDS
 from release.record import ReleaseRecord
-from release.stats.cells import SPREAD, pairs, percent, spread_row
+from release.stats.cells import SPREAD, Cell, Table, pairs, percent, spread_row
 from release.stats.counting import LANGUAGES, STATES, TEXT_BIN, Counts
-from release.stats.schema import Cell, Table
 
 LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
 

@@ -6,7 +6,7 @@ from cosfly.escaping import for_markdown
 from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import page
 from cosfly.products.coverage import Coverage
-from release.stats.schema import Absent, Cell, Stats, Table
+from release.stats.cells import Absent, Cell, Stats, Table
 
 STYLE = """
 .tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; } .tables .wide { column-span: all; margin-top: 12px; }

@@ -16,7 +16,7 @@ from cosfly.space.flight_metrics import accel_rms, jerk_rms
 from cosfly.work.provenance import CONVERSION, CONVERTED
 from release.columns import PLACE
 from release.record import ReleasedFlight, ReleaseRecord, SourceRecord
-from release.splits import NAME_OF, SPLIT_RULE, split_groups
+from release.rules import NAME_OF, SPLIT_RULE, split_groups
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 

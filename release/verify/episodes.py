@@ -1,4 +1,4 @@
-"""The rows and pictures of an exported LeRobot data set, v3.0 or v2.1, read again from its episodes: of a release what LeRobot has features for.
+"""The rows and pictures of an exported LeRobot data set, read again from its episodes: of a release what LeRobot has features for.
 
 Episodes are joined to flights by the export's own table of them, and what LeRobot adds (numbers, times, tasks, actions, statistics) is made
 again from what stands beside it. Poses and points are float32 here.
@@ -21,12 +21,22 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile, depth_bytes
 from cosfly.products.playback import ORIGINAL
 from cosfly.reading.arrays import check_pixels
-from cosfly.reading.documents import parse_document, read_object
-from cosfly.reading.files import read_bytes
+from cosfly.reading.documents import read_object
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_batches, rows_of
 from release.columns import INTRINSICS, PLACE, POSE
-from release.export.lerobot.features import ACTION, CAMERAS, FLAGS, STATE, TEXTS, VECTORS, features_of, moves, schema_of
-from release.export.lerobot.format import VERSIONS, task_of
+from release.export.lerobot import (
+    ACTION,
+    CAMERAS,
+    FLAGS,
+    STATE,
+    TEXTS,
+    VECTORS,
+    VERSION,
+    features_of,
+    moves,
+    schema_of,
+    task_of,
+)
 from release.verify.findings import Findings
 from release.verify.rows import Row
 from release.verify.sources import BATCH_ROWS, Entry, Pictures, pictures_of, rows_of_table, with_ids
@@ -113,8 +123,8 @@ def found_episodes(folder: Path, names: list[str], findings: Findings) -> tuple[
         InputError: a file cannot be read, or holds something else.
     """
     files, size_px, info = _info(folder, findings)
-    told = {row["episode_index"]: row for row in _lines(folder, names, info["version"])}
-    tasks = _tasks(folder, info["version"])
+    told = {row["episode_index"]: row for row in _lines(folder, names)}
+    tasks = _tasks(folder)
     parts, splits = defaultdict[str, list[tuple[str, int, int, int, int]]](list), dict[str, str]()
     num_rows = num_episodes = 0
     schema = schema_of(features_of(files, size_px))
@@ -167,7 +177,7 @@ def _info(folder: Path, findings: Findings) -> tuple[tuple[FrameFile, ...], tupl
         info["version"] = told["codebase_version"]
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise InputError("not the info of an export", where=INFO, got=f"{type(error).__name__}: {error}") from None
-    if info["version"] not in VERSIONS.values() or min(info["fps"], width, height) < 1:
+    if info["version"] != VERSION or min(info["fps"], width, height) < 1:
         raise InputError("not the info of an export", where=INFO, got=f"{info['version']}, {info['fps']} a second, {width} x {height} px")  # fmt: skip
     expected = {name: feature.declared() for name, feature in features_of(files, (width, height)).items()}
     if declared != expected:
@@ -175,33 +185,24 @@ def _info(folder: Path, findings: Findings) -> tuple[tuple[FrameFile, ...], tupl
     return files, (width, height), info
 
 
-def _lines(folder: Path, names: list[str], version: str) -> Iterator[dict[str, Any]]:
+def _lines(folder: Path, names: list[str]) -> Iterator[dict[str, Any]]:
     """Yield what is told of each episode.
 
     Raises:
         InputError: it is not what an export tells.
     """
-    if version == VERSIONS["lerobot"]:
-        tables = sorted(name for name in names if name.startswith("meta/episodes/"))
-        rows = (row for name in tables for row in rows_of(folder / name, list(EPISODE), tree=folder))
-    else:
-        name = "meta/episodes.jsonl"
-        lines = read_bytes(folder / name, what="table of episodes", tree=folder).splitlines()
-        rows = (parse_document(line, name, what="table of episodes") for line in lines)
+    tables = sorted(name for name in names if name.startswith("meta/episodes/"))
+    rows = (row for name in tables for row in rows_of(folder / name, list(EPISODE), tree=folder))
     for row in rows:
         if not isinstance(row, dict) or any(not isinstance(row.get(key), kind) for key, kind in EPISODE.items()):
             raise InputError("not an episode", where="meta/episodes", got=str(row)[:200], expected=", ".join(EPISODE))
         yield row
 
 
-def _tasks(folder: Path, version: str) -> list[str]:
+def _tasks(folder: Path) -> list[str]:
     """Give the tasks by their numbers."""
-    name = "meta/tasks.parquet" if version == VERSIONS["lerobot"] else "meta/tasks.jsonl"
-    if version == VERSIONS["lerobot"]:
-        rows = list(rows_of(folder / name, ["task_index", "task"], tree=folder))
-    else:
-        lines = read_bytes(folder / name, what="table of tasks", tree=folder).splitlines()
-        rows = [parse_document(line, name, what="table of tasks") for line in lines]
+    name = "meta/tasks.parquet"
+    rows = list(rows_of(folder / name, ["task_index", "task"], tree=folder))
     try:
         tasks = {row["task_index"]: str(row["task"]) for row in rows}
         return [tasks[number] for number in range(len(rows))]

@@ -13,8 +13,8 @@ from cosfly.reading.tables import open_table
 from cosfly.work.runner import Watch
 from cosfly.work.store import CHECKSUMS
 from release.export.contract import ExportConfig
-from release.export.manifest import ExportRecord
 from release.export.source import open_release
+from release.export.stage import ExportRecord
 from release.export.stage import run as export
 from release.verify.findings import Findings
 from release.verify.folder import LICENCES, files_below

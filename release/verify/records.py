@@ -20,7 +20,7 @@ from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.depth import SKY_MM
 from release.record import ReleaseRecord, content_digest, shard_path
-from release.subsample import RULE, select_frames
+from release.rules import RULE, select_frames
 from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
 

@@ -27,7 +27,7 @@ from cosfly.work.stage_folder import Failed, Kept, StageFolder
 from cosfly.work.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
-from release.export.manifest import ExportRecord, read_export, render_readme
+from release.export.stage import ExportRecord, read_export, render_readme
 from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across

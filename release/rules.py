@@ -1,4 +1,4 @@
-"""Which frames of a flight are released: runs of frames, spread evenly, so that captions keep their windows.
+"""The rules that the record of a release tells: which frames of a flight are released, and which walks stand in which split.
 
 The paper strides evenly (sec:dataset_stats), which at its flights of 618 to 770 frames and 400 of them leaves no window of five frames
 whole. Runs of six windows' steps keep five sixths of them.
@@ -6,9 +6,12 @@ whole. Runs of six windows' steps keep five sixths of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
+
+from cosfly.products.splits import Split, assign_splits
+from release.columns import SplitName
 
 WINDOWS_A_RUN = 6  # a run of 6 (w - 1) frames holds 5 (w - 1) + 1 whole windows of w frames
 
@@ -46,3 +49,24 @@ def select_frames(num_points: int, num_frames: int | None, window_frames: int) -
 def is_whole(window: Iterable[int], selected: set[int]) -> bool:
     """Tell whether all frames of a caption's window are released."""
     return selected.issuperset(window)
+
+
+NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}
+SPLIT_RULE = (
+    "whole walks (a walk: flights of one town, in any of its builds, whose person is at the same places at the same seconds), or whole towns; ranked "
+    "by sha256 of the seed and the name, the first to test, the next to validation, the rest to train, one at least for each split that has a share; "
+    "fewer than splits fill train, then validation"
+)
+
+
+def split_groups(
+    groups: Iterable[str], fractions: Mapping[SplitName, float], seed: int, what: str
+) -> dict[str, SplitName]:
+    """Give each group, a walk or a family of towns, its split. Those of which no flight is released are not among them, and have no rank.
+
+    Raises:
+        InputError: there is no group; names `what` is missing.
+    """
+    shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
+    splits = assign_splits(groups, shares, seed, too_few="fill", what=what)
+    return {group: NAME_OF[split] for group, split in splits.items()}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from release.subsample import is_whole, select_frames
+from release.rules import is_whole, select_frames
 
 WINDOW = 5
 

@@ -1,10 +1,10 @@
-"""LeRobot v3.0 and v2.1: a flight is an episode, or several where the release leaves frames of it out.
+"""LeRobot v3.0: a flight is an episode, or several where the release leaves frames of it out.
 
-    v3.0    data/chunk-000/file-000.parquet of several episodes, meta/{info.json, stats.json, tasks.parquet, episodes/chunk-000/file-000.parquet}
-    v2.1    data/chunk-000/episode_000000.parquet, meta/{info.json, tasks.jsonl, episodes.jsonl, episodes_stats.jsonl}
+    data/chunk-000/file-000.parquet of several episodes, meta/{info.json, stats.json, tasks.parquet, episodes/chunk-000/file-000.parquet}
 
 LeRobot counts time by frames, so an episode holds frames that follow each other without a gap. Pictures are the released PNG bytes in the
 parquet files; depth is TIFF of float32, LeRobot's own lossless form. The task of a frame is its caption's decision in words.
+`observation.*` is what a policy sees, `action` what it answers, `timestamp` counts from the start of an episode.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,26 +22,210 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
-from cosfly.geometry import step_s
+from cosfly.geometry import step_s, wrap_deg
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
-from release.columns import PICTURES, SPLIT_NAMES
+from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
 from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
-from release.export.lerobot.features import CAMERAS, COLUMNS, Feature, features_of, schema_of, tiff_of_depth, values_of
-from release.export.lerobot.summary import QUANTILES, Summary, merged, sampled, summarize, thinned
-from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, rows_of_flight
+from release.export.source import (
+    Release,
+    ReleasedRows,
+    depth_in_words,
+    depth_npy,
+    picture,
+    read_span,
+    rows_of_flight,
+    vectors,
+)
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+SAMPLED_FRAMES, PIXEL_STEP = 5, 4
+Summary = dict[str, list]  # name of the statistic -> values, nested as LeRobot has them
+
+
+def sampled(num_frames: int) -> set[int]:
+    """Give the frames of an episode whose pictures count."""
+    return {int(i) for i in np.linspace(0, num_frames - 1, min(num_frames, SAMPLED_FRAMES)).round()}
+
+
+def thinned(picture: np.ndarray) -> np.ndarray:
+    """Give every fourth pixel of a picture, (k, channels) float64: colours from 0 to 1, depth (two dimensions) as it is."""
+    few = picture[::PIXEL_STEP, ::PIXEL_STEP]
+    return few.reshape(-1, 1).astype(np.float64) if picture.ndim == 2 else few.reshape(-1, 3) / 255.0
+
+
+def summarize(values: np.ndarray, count: int, *, is_picture: bool = False) -> Summary:
+    """Summarize (k, d) values, NaN left out; `count` is the number of frames they are of. Without any value all is zero, and so is count."""
+    known = ~np.isnan(values)
+    has_any = known.any(axis=0)
+    filled = np.where(has_any, values, 0.0)
+    found = {
+        "min": np.nanmin(filled, axis=0), "max": np.nanmax(filled, axis=0),
+        "mean": np.nanmean(filled, axis=0), "std": np.nanstd(filled, axis=0),
+        **{name: np.nanquantile(filled, share, axis=0) for name, share in QUANTILES.items()},
+    }  # fmt: skip
+    nested = {name: _nested(value, is_picture) for name, value in found.items()}
+    return nested | {"count": [count if has_any.any() else 0]}
+
+
+def merged(summaries: Sequence[Summary]) -> Summary:
+    """Summarize what was summarized: exact but for the quantiles, which are means of quantiles, as LeRobot's own are."""
+    parts = [part for part in summaries if part["count"][0]] or summaries
+    counts = np.array([part["count"][0] for part in parts], dtype=np.float64)
+    weights = counts / counts.sum() if counts.sum() else np.full(len(parts), 1 / len(parts))
+    stacked = {name: np.array([part[name] for part in parts], dtype=np.float64) for name in parts[0] if name != "count"}
+    mean = np.tensordot(weights, stacked["mean"], axes=1)
+    variance = np.tensordot(weights, stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2, axes=1)
+    found: dict[str, Any] = {name: np.tensordot(weights, stacked[name], axes=1) for name in QUANTILES}
+    found |= {
+        "min": stacked["min"].min(axis=0),
+        "max": stacked["max"].max(axis=0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+    }
+    return {name: value.tolist() for name, value in found.items()} | {"count": [int(counts.sum())]}
+
+
+def _nested(value: np.ndarray, is_picture: bool) -> list:
+    return value.reshape(-1, 1, 1).tolist() if is_picture else value.tolist()
+
+
+STATE, ACTION = "observation.state", "action"
+MOVE = ("forward_m", "left_m", "up_m", "yaw_deg")
+CAMERAS: dict[FrameFile, str] = {
+    "rgb": "observation.images.rgb", "depth": "observation.depth", "instance": "observation.images.instance",
+}  # fmt: skip
+TEXTS = ("sample_id", "decision", "label", "verdict", *CAPTION_FIELDS)
+FLAGS = ("target_in_view", "target_visible", "is_perturbed", "has_caption")
+VECTORS = {  # feature -> the release's column and its members
+    "target": ("target", POINT),
+    "target_uv": ("target_uv", ("u_px", "v_px")),
+    "target_bbox": ("target_bbox", BOX),
+    "intrinsics": ("intrinsics", ("fx", "fy", "cx", "cy")),
+}
+DEFAULTS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+# Columns of the release that the values are made of; pictures apart.
+COLUMNS = ["pose", "visibility", "target_depth_m", *FLAGS, *TEXTS, *(column for column, _ in VECTORS.values())]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature of `info.json`."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None = None
+    info: dict[str, Any] | None = None
+
+    def declared(self) -> dict[str, Any]:
+        found: dict[str, Any] = {
+            "dtype": self.dtype,
+            "shape": list(self.shape),
+            "names": self.names and list(self.names),
+        }
+        return found | ({"info": self.info} if self.info else {})
+
+    @property
+    def arrow(self) -> pa.DataType:
+        if self.dtype == "image":
+            return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        plain = pa.type_for_alias(self.dtype)
+        return plain if self.shape == (1,) else pa.list_(plain, self.shape[0])
+
+    @property
+    def hub(self) -> dict[str, Any]:
+        """As `datasets` writes it into a parquet file."""
+        if self.dtype == "image":
+            return {"_type": "Image"}
+        value = {"dtype": self.dtype, "_type": "Value"}
+        return value if self.shape == (1,) else {"feature": value, "length": self.shape[0], "_type": "Sequence"}
+
+
+def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> dict[str, Feature]:
+    """Give the features of frames whose pictures are (width, height) px."""
+    width, height = size_px
+    found: dict[str, Feature] = {}
+    for file in modalities:
+        if file == "depth":
+            info = {"is_depth_map": True, "depth_unit": "m"}
+            found[CAMERAS[file]] = Feature("image", (height, width, 1), ("height", "width", "channels"), info)
+        else:
+            found[CAMERAS[file]] = Feature("image", (height, width, 3), ("height", "width", "channels"))
+    found[STATE] = Feature("float32", (len(POSE),), POSE)
+    found[ACTION] = Feature("float32", (len(MOVE),), MOVE)
+    found |= {name: Feature("float32", (len(members),), members) for name, (_, members) in VECTORS.items()}
+    found |= {name: Feature("float32", (1,)) for name in ("visibility", "target_depth_m")}
+    found |= {name: Feature("bool", (1,)) for name in (*FLAGS, "next.done")}
+    found |= {name: Feature("string", (1,)) for name in TEXTS}
+    return found | {name: Feature(dtype, (1,)) for name, dtype in DEFAULTS.items()}
+
+
+def schema_of(features: dict[str, Feature]) -> pa.Schema:
+    """Give the parquet schema, with what `datasets` wants to know in its metadata."""
+    about = {"info": {"features": {name: feature.hub for name, feature in features.items()}}}
+    return pa.schema(
+        [(name, feature.arrow) for name, feature in features.items()], {b"huggingface": json.dumps(about).encode()}
+    )
+
+
+def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Give the values of all features of an episode but pictures and LeRobot's own: arrays (n,) or (n, d), and lists of texts.
+
+    What a frame does not have is NaN, or the empty text.
+    """
+    pose = vectors(rows, "pose", POSE)
+    found: dict[str, Any] = {STATE: pose.astype(np.float32), ACTION: moves(pose).astype(np.float32)}
+    found |= {name: vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()}
+    for name in ("visibility", "target_depth_m"):
+        found[name] = np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float32)
+    found |= {name: np.array([bool(row[name]) for row in rows]) for name in FLAGS}
+    found["next.done"] = np.arange(len(rows)) == len(rows) - 1
+    return found | {name: [row[name] or "" for row in rows] for name in TEXTS}
+
+
+def moves(poses: np.ndarray) -> np.ndarray:
+    """Give what takes each pose to the next, (n, 4): the way in the drone's own level axes, m, and the turn, degrees; zero at the last.
+
+    Args:
+        poses: (n, 6) x, y, z in m, pitch, yaw, roll in degrees, right-handed.
+    """
+    found = np.zeros((len(poses), 4))
+    steps = np.diff(poses[:, :3], axis=0)
+    yaw_rad = np.radians(poses[:-1, 4])
+    found[:-1, 0] = steps[:, 0] * np.cos(yaw_rad) + steps[:, 1] * np.sin(yaw_rad)
+    found[:-1, 1] = steps[:, 1] * np.cos(yaw_rad) - steps[:, 0] * np.sin(yaw_rad)
+    found[:-1, 2] = steps[:, 2]
+    found[:-1, 3] = wrap_deg(np.diff(poses[:, 4]))
+    return found
+
+
+def tiff_of_depth(data: bytes, where: str) -> bytes:
+    """Give the bytes of a `depth.npy` as TIFF of float32, in which LeRobot keeps depth: the same numbers, uncompressed.
+
+    Raises:
+        InputError: it is no depth image.
+    """
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(parse_array(data, where, dtype=np.float32, ndim=2, what="depth image")).save(buffer, "TIFF")
+    return buffer.getvalue()
+
 
 MB = 1024 * 1024
-CHUNK = 1000  # files, or in v2.1 episodes, of one folder
+CHUNK = 1000  # files of one folder
 STEP_TOLERANCE_S = 1e-3
 FOLLOW_TASK = "Follow the walking person from the air."
-DATA_PATH = {
-    "lerobot": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-    "lerobot-v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-}
-VERSIONS = {"lerobot": "v3.0", "lerobot-v2.1": "v2.1"}
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VERSION = "v3.0"
 
 
 @dataclass(frozen=True)
@@ -70,7 +254,7 @@ def task_of(decision: str) -> str:
 
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
-    """Number episodes and frames; a unit is a data file of whole flights, in v2.1 one flight.
+    """Number episodes and frames; a unit is a data file of whole flights.
 
     Raises:
         InputError: pictures of several sizes, or times that no whole number of frames a second gives.
@@ -88,7 +272,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
         groups: list[list[ReleasedRows]] = []
         for flight in (flight for flight in flights if flight.split == split):
             is_full = groups and sum(member.num_bytes for member in groups[-1]) >= cfg.shard_mb * MB
-            if not groups or is_full or cfg.format == "lerobot-v2.1":
+            if not groups or is_full:
                 groups.append([])
             groups[-1].append(flight)
         for group in groups:
@@ -159,27 +343,16 @@ def _episodes(unit: Unit) -> Iterator[Episode]:
 
 
 def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
-    """Write the data files of a unit, and of v3.0 its part of the table of episodes."""
+    """Write the data files of a unit, and its part of the table of episodes."""
     layout: Layout = unit.extra
     features = features_of(release.modalities, layout.size_px)
     files, rows_about = Files(folder), list[dict[str, Any]]()
-    if cfg.format == "lerobot":
-        name = DATA_PATH[cfg.format].format(chunk_index=layout.file // CHUNK, file_index=layout.file % CHUNK)
-        tables = (
-            table for episode in _episodes(unit) for table in _tables(release, episode, layout, features, rows_about)
-        )
-        _write_parquet(files, name, schema_of(features), tables)
-        _write_episodes(files, layout, rows_about)
-        whole = _merge_all([row["stats"] for row in rows_about])
-        return files.written(stats=whole, episodes=len(rows_about))
-    for episode in _episodes(unit):
-        name = DATA_PATH[cfg.format].format(episode_chunk=episode.number // CHUNK, episode_index=episode.number)
-        _write_parquet(files, name, schema_of(features), _tables(release, episode, layout, features, rows_about))
-    for row in rows_about:
-        row["stats"] = {
-            name: {k: v for k, v in summary.items() if k not in QUANTILES} for name, summary in row["stats"].items()
-        }
-    return files.written(about=rows_about, episodes=len(rows_about))
+    name = DATA_PATH.format(chunk_index=layout.file // CHUNK, file_index=layout.file % CHUNK)
+    tables = (table for episode in _episodes(unit) for table in _tables(release, episode, layout, features, rows_about))
+    _write_parquet(files, name, schema_of(features), tables)
+    _write_episodes(files, layout, rows_about)
+    whole = _merge_all([row["stats"] for row in rows_about])
+    return files.written(stats=whole, episodes=len(rows_about))
 
 
 def _tables(
@@ -280,7 +453,7 @@ def _write_parquet(files: Files, name: str, schema: pa.Schema, tables: Iterator[
 
 
 def _write_episodes(files: Files, layout: Layout, about: list[dict[str, Any]]) -> None:
-    """Write a unit's part of v3.0's table of episodes."""
+    """Write a unit's part of the table of episodes."""
     place = {"chunk_index": layout.file // CHUNK, "file_index": layout.file % CHUNK}
     rows = []
     for row in about:
@@ -321,21 +494,12 @@ def finish(
     files, tasks = Files(folder), [task_of(decision) for decision in layout.tasks]
     counts = [one.facts["episodes"] for one in written]
     info = _info(release, units, counts, cfg)
-    if cfg.format == "lerobot":
-        files.put("meta/stats.json", dump_json(_merge_all([one.facts["stats"] for one in written]), indent=4).encode())
-        files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
-    else:
-        about = [row for one in written for row in one.facts["about"]]
-        plain = [
-            {k: row[k] for k in ("episode_index", "tasks", "length", "flight", "split", "first_frame")} for row in about
-        ]
-        files.put("meta/tasks.jsonl", _lines({"task_index": k, "task": task} for k, task in enumerate(tasks)))
-        files.put("meta/episodes.jsonl", _lines(plain))
-        files.put("meta/episodes_stats.jsonl", _lines({k: row[k] for k in ("episode_index", "stats")} for row in about))
+    files.put("meta/stats.json", dump_json(_merge_all([one.facts["stats"] for one in written]), indent=4).encode())
+    files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
     files.put("meta/info.json", dump_json(info, indent=4).encode())
     num_flights = sum(len(unit.flights) for unit in units)
     return Facts(
-        version=VERSIONS[cfg.format],
+        version=VERSION,
         codings={
             file: depth_in_words(release.record.depth, "TIFF, the released numbers") if file == "depth" else "PNG, the released bytes"
             for file in release.modalities
@@ -365,14 +529,12 @@ def _info(release: Release, units: Sequence[Unit], counts: list[int], cfg: Expor
         total += here
     features = features_of(release.modalities, layout.size_px)
     info: dict[str, Any] = {
-        "codebase_version": VERSIONS[cfg.format], "robot_type": "cosfly_drone", "total_episodes": total,
+        "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": total,
         "total_frames": sum(unit.frames for unit in units), "total_tasks": len(layout.tasks), "chunks_size": CHUNK, "fps": layout.fps,
-        "splits": splits, "data_path": DATA_PATH[cfg.format], "video_path": None,
+        "splits": splits, "data_path": DATA_PATH, "video_path": None,
         "features": {name: feature.declared() for name, feature in features.items()},
     }  # fmt: skip
-    if cfg.format == "lerobot":
-        return info | {"data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb}
-    return info | {"total_videos": 0, "total_chunks": (total + CHUNK - 1) // CHUNK}
+    return info | {"data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb}
 
 
 def _tasks_table(tasks: list[str]) -> pa.Table:
@@ -381,7 +543,3 @@ def _tasks_table(tasks: list[str]) -> pa.Table:
     about = {"index_columns": ["task"], "column_indexes": [], "columns": [named], "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
     return table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
-
-
-def _lines(rows: Any) -> bytes:
-    return "".join(dump_json(row) + "\n" for row in rows).encode()

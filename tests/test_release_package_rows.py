@@ -9,18 +9,18 @@ import os
 import pytest
 
 from cosfly.work.store import atomic_file
-from release.package import hashed_file
-from release.package.hashed_file import BLOCK, NUM_BLOCKS, HashedFile
+from release.package import rows
+from release.package.rows import BLOCK, NUM_BLOCKS, HashedFile
 
 
-@pytest.mark.parametrize("direct", [hashed_file.DIRECT, 0], ids=["past the page cache", "through it"])
+@pytest.mark.parametrize("direct", [rows.DIRECT, 0], ids=["past the page cache", "through it"])
 @pytest.mark.parametrize(
     "sizes",
     [[], [1], [BLOCK], [BLOCK - 1, 1, 1], [3, 4096, 2 * BLOCK + 5], [BLOCK // 3] * (3 * NUM_BLOCKS + 1)],
     ids=str,
 )
 def test_a_file_holds_what_was_written_and_the_digest_is_of_that(tmp_path, monkeypatch, sizes, direct):
-    monkeypatch.setattr(hashed_file, "DIRECT", direct)
+    monkeypatch.setattr(rows, "DIRECT", direct)
     parts = [os.urandom(size) for size in sizes]
     with atomic_file(tmp_path / "shard") as file, HashedFile(file) as hashed:
         for part in parts:
@@ -33,7 +33,7 @@ def test_a_file_holds_what_was_written_and_the_digest_is_of_that(tmp_path, monke
 
 
 def test_a_file_system_that_asks_for_more_than_whole_pages_gets_the_same_bytes(tmp_path, monkeypatch):
-    write, set_direct, told, refused = os.write, hashed_file._set_direct, [], []
+    write, set_direct, told, refused = os.write, rows._set_direct, [], []
 
     def told_direct(number, wanted):
         told.append(wanted)
@@ -45,12 +45,12 @@ def test_a_file_system_that_asks_for_more_than_whole_pages_gets_the_same_bytes(t
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         return write(number, data)
 
-    monkeypatch.setattr(hashed_file, "_set_direct", told_direct)
+    monkeypatch.setattr(rows, "_set_direct", told_direct)
     data = os.urandom(BLOCK + 7)
     with atomic_file(tmp_path / "shard") as file, HashedFile(file) as hashed:
         if not hashed._is_direct:
             pytest.skip("this file system writes through the page cache alone")
-        monkeypatch.setattr(hashed_file.os, "write", picky)
+        monkeypatch.setattr(rows.os, "write", picky)
         hashed.write(data)
         hashed.finish()
     assert refused == [BLOCK]

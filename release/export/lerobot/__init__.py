@@ -1,1 +1,0 @@
-"""A release as a LeRobot data set, v3.0 and v2.1."""

@@ -1,0 +1,260 @@
+"""The folder that is published: finished shards under their names, and the records beside them, without anything of this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+import cosfly
+from cosfly.errors import VerifyError
+from cosfly.reading.files import sha256_file
+from cosfly.work import in_place
+from cosfly.work.provenance import StageInput, stages_behind
+from cosfly.work.store import write_bytes, write_checksums
+from release import columns
+from release.card.croissant import CROISSANT, render_croissant
+from release.card.render import render_card
+from release.columns import SPLIT_NAMES, SplitName
+from release.depth import depth_record
+from release.package.captions import CaptionAccount, teacher_settings
+from release.package.config import ReleaseConfig
+from release.package.plan import Plan
+from release.package.shards import Written
+from release.package.sources import Source, input_names
+from release.record import (
+    CaptionHistory,
+    FlightHistory,
+    History,
+    MadeBy,
+    Numbers,
+    Provenance,
+    ReleasedFlight,
+    ReleaseRecord,
+    Repairs,
+    Settings,
+    Shard,
+    SourceRecord,
+    SplitNumbers,
+    Splits,
+    Teacher,
+    content_digest,
+    published,
+    shard_path,
+    write_record,
+)
+from release.rules import RULE, SPLIT_RULE
+
+DIGITS = 4  # of shares
+
+
+def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
+    """Give what the record says of the sources and of all their captions.
+
+    Args:
+        inputs: of the stage, by their names (`input_names`).
+    Raises:
+        InputError: a stage's record cannot be read.
+    """
+    repaired = dict(sorted(account.repairs.items()))
+    first = account.accepted - sum(repaired.values())
+    parts = {"first_answers": first, **{f"repaired: {rung}": count for rung, count in repaired.items()}}
+    return Provenance(
+        versions={
+            "cosfly": cosfly.__version__,
+            "python": platform.python_version(),
+            "pyarrow": pa.__version__,
+            "numpy": np.__version__,
+        },
+        sources=[_source(source, names, inputs) for source, names in zip(sources, input_names(sources), strict=True)],
+        teachers=[
+            Teacher(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
+            for (kind, model, settings), count in sorted(account.teachers.items())
+        ],
+        repairs=Repairs(
+            accepted=account.accepted,
+            first_answers=first,
+            repaired_by_rung=repaired,
+            shares={name: round(count / account.accepted, DIGITS) for name, count in parts.items() if account.accepted},
+        ),
+        tokens=dict(sorted(account.tokens.items())),
+        asks=account.asks,
+    )
+
+
+def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
+    sha256 = {role: inputs[name].sha256 for role, name in names.items()}
+    return SourceRecord(
+        run=source.run,
+        tree_sha256=sha256["data"],
+        captions_sha256=sha256["captions"],
+        inspect_sha256=sha256.get("inspect"),
+        review_sha256=sha256.get("review"),
+        stages=[
+            MadeBy(
+                stage=record.stage,
+                code_version=record.code_version,
+                seed=record.seed,
+                config=published(record.config),
+                inputs={name: made_of.sha256 for name, made_of in record.inputs.items()},
+            )
+            for record in stages_behind(source.files.values())
+        ],
+    )
+
+
+def account_for(plan: Plan, written: list[Written]) -> History:
+    """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
+    flights = [flight for result in written for flight in result.flights]
+    account = plan.account
+    captions = CaptionHistory(
+        read=account.accepted + account.dropped.total(),
+        dropped=dict(sorted(account.dropped.items())),
+        accepted=account.accepted,
+        released=sum(flight.captions for flight in flights),
+        frame_not_selected=sum(flight.frame_not_selected for flight in flights),
+        window_not_whole=sum(flight.window_not_whole for flight in flights),
+        flight_left_out=account.of_no_flight,
+    )
+    parts = captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out
+    assert captions.accepted == parts, captions
+    found = FlightHistory(
+        found=len(plan.material.candidates),
+        inspected=plan.material.num_inspected,
+        released=len(flights),
+        left_out=dict(sorted(plan.left_out.items())),
+    )
+    assert found.found == len(flights) + plan.left_out.total(), found
+    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
+
+
+def splits_of(cfg: ReleaseConfig, plan: Plan, written: list[Written]) -> Splits:
+    """Give what the record says of its splits."""
+    surveyed = {flight.name: flight for flight, *_ in plan.flights}
+    numbers: dict[SplitName, SplitNumbers] = {}
+    for split in SPLIT_NAMES:
+        own = [f for result in written for f in result.flights if plan.placings[f.name].split == split]
+        if own:
+            numbers[split] = SplitNumbers(
+                frames=sum(flight.frames for flight in own),
+                captions=sum(flight.captions for flight in own),
+                flights=len(own),
+                trajectories=len({surveyed[flight.name].candidate.trajectory for flight in own}),
+                walks=sorted({plan.placings[flight.name].walk for flight in own}),
+                towns=sorted({surveyed[flight.name].candidate.place.town for flight in own}),
+            )
+    return Splits(by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions, splits=numbers)
+
+
+def make_record(
+    cfg: ReleaseConfig,
+    plan: Plan,
+    written: list[Written],
+    shards: list[Shard],
+    numbers: Numbers,
+    provenance: Provenance,
+    prompts: dict[str, dict[str, str]],
+) -> ReleaseRecord:
+    """Give what release.json says of its shards. prompts: as the record has them."""
+    five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
+    return ReleaseRecord(
+        name=cfg.name,
+        licence=plan.licence,
+        credits=cfg.credits,
+        maps=plan.maps,
+        made_by=f"cosfly {cosfly.__version__}",
+        settings=Settings(
+            num_frames=cfg.num_frames,
+            window_frames=plan.window_frames,
+            tracks=list(cfg.tracks),
+            pairs=cfg.pairs,
+            modalities=list(cfg.modalities),
+        ),
+        frame_selection=RULE,
+        depth=depth_record(cfg.depth, [result.depth for result in written]) if "depth" in cfg.modalities else None,
+        coordinates=columns.CONTRACT,
+        actions=in_place.given("actions"),
+        prompts=prompts,
+        splits=splits_of(cfg, plan, written),
+        numbers=numbers,
+        history=account_for(plan, written),
+        provenance=provenance,
+        flights=[
+            ReleasedFlight(
+                flight=flight.name,
+                frames=flight.frames,
+                frames_available=flight.frames_available,
+                split=plan.placings[flight.name].split,
+                walk=plan.placings[flight.name].walk,
+                pair=plan.placings[flight.name].pair,
+                five_ray_mean=five_ray[flight.name],
+            )
+            for result in written
+            for flight in result.flights
+        ],
+        content_digest=content_digest((shard.split, shard.sha256) for shard in shards),
+        shards=shards,
+    )
+
+
+DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A shard that is written, and where it stands until the release has its name."""
+
+    split: SplitName
+    path: Path
+    rows: int
+    bytes: int
+    sha256: str
+
+
+def check_parts(shards: Sequence[Finished], out: Path) -> None:
+    """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage.
+
+    Raises:
+        VerifyError: it is not.
+    """
+    for shard in shards:
+        if not shard.path.is_file() or shard.path.stat().st_size != shard.bytes:
+            raise VerifyError(
+                "a shard that was finished before is missing or has another size", where=shard.path,
+                expected=f"{shard.bytes} bytes", fix=f"remove {out} and run again",
+            )  # fmt: skip
+
+
+def name_shards(finished: Sequence[Finished], folder: Path) -> list[Shard]:
+    """Put shards under their names in the release: linked, so that no byte moves and a kill costs nothing."""
+    digest = content_digest((shard.split, shard.sha256) for shard in finished)
+    counts, numbers = Counter(shard.split for shard in finished), Counter[str]()
+    (folder / "data").mkdir()
+    shards = []
+    for shard in finished:
+        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
+        numbers[shard.split] += 1
+        try:
+            os.link(shard.path, folder / path)
+        except OSError:  # the file system has no links
+            shutil.copyfile(shard.path, folder / path)
+        shards.append(Shard(path=path, split=shard.split, rows=shard.rows, bytes=shard.bytes, sha256=shard.sha256))
+    return shards
+
+
+def write_records(folder: Path, record: ReleaseRecord) -> None:
+    """Write release.json, the card, croissant.json and the checksums beside the shards."""
+    write_record(folder / "release.json", record)
+    write_bytes(folder / "README.md", render_card(record).encode())
+    write_bytes(folder / CROISSANT, render_croissant(record).encode())
+    digests = {shard.path: shard.sha256 for shard in record.shards}
+    for name in ("release.json", "README.md", CROISSANT):
+        digests[name] = sha256_file(folder / name)
+    write_checksums(folder, digests)
