@@ -216,6 +216,38 @@ class JudgeConfig(Config):
         return super().recorded() | {"url": None if self.url is None else "endpoint"}
 
 
+class ReaderConfig(Config):
+    """Language models that read somebody else's prose into claims, twice (caption/teachers/reader.py)."""
+
+    urls: tuple[str, ...] = Field(
+        (),
+        max_length=2,
+        description="OpenAI-compatible endpoints of one reader, asked in two orders, or of two; empty: none",
+    )
+    models: tuple[str, ...] = Field(
+        (), max_length=2, description="their model names; empty takes each endpoint's only one"
+    )
+    max_tokens: int = Field(4096, ge=64, description="longest reading, tokens")
+    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
+    timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
+    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    max_reply_mb: MayDiffer[float] = Field(
+        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
+    )
+    json_schema: bool = Field(True, description="ask the server to enforce the JSON schema of claims")
+    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
+
+    @model_validator(mode="after")
+    def _are_urls(self) -> Self:
+        for url in self.urls:
+            check_url(url)
+        return self
+
+    def recorded(self) -> dict[str, Any]:
+        """Where a reader is asked does not decide what it says."""
+        return super().recorded() | {"urls": len(self.urls)}
+
+
 class RepairConfig(Config):
     formerly: ClassVar[dict[str, str]] = {"verdicts": "now hard_conflict and soft_conflict: keep | repair | drop"}
 
@@ -291,6 +323,7 @@ class CaptionConfig(Config):
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
+    reader: ReaderConfig = Field(ReaderConfig(), description="an optional reader of prose that came without claims")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     correction_asks: int = Field(
         1,

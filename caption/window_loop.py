@@ -13,6 +13,7 @@ from caption.prepared import Prepared, prepare
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.foreign import Terms
 from caption.teachers.prompts import Correction, Question
+from caption.teachers.reader import Reader, judge_reading
 from caption.teachers.teacher import Teacher
 from caption.truth.actions import Motion, verdict_of
 from caption.truth.facts import Facts
@@ -24,29 +25,46 @@ from caption.writing.contract import Draft, Refused, refuse_decision, way_of
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
 from cosfly.products.answer_text import Parsed, parse_answer
-from cosfly.products.captions import Caption, Checks, Coc, JudgeRecord, Language, RepairRecord, Usage, Verdict
+from cosfly.products.captions import (
+    Caption,
+    Checks,
+    Coc,
+    JudgeRecord,
+    Language,
+    ReaderRecord,
+    RepairRecord,
+    Usage,
+    Verdict,
+)
 from cosfly.reading.objects import CONTEXT_FULL
 
 
-async def caption_window(window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None) -> Caption:
+async def caption_window(
+    window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None, reader: Reader | None = None
+) -> Caption:
     """Caption one window.
 
     Args:
-        judge: asked about conflicts; None: none is.
+        judge: asked about conflicts; None: none is. reader: asked what prose states that came without claims; None: none is.
     Raises:
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
     """
     [prepared] = prepare([window], teacher, cfg)
-    return await caption_prepared(prepared, teacher, cfg, judge)
+    return await caption_prepared(prepared, teacher, cfg, judge, reader)
 
 
 async def caption_prepared(
-    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
+    prepared: Prepared,
+    teacher: Teacher,
+    cfg: CaptionConfig,
+    judge: Judge | None = None,
+    reader: Reader | None = None,
 ) -> Caption:
     """Caption a window that is prepared; as `caption_window`."""
     window, terms, question = prepared.window, prepared.terms, prepared.question
     loop = _Loop(teacher, cfg, terms, prepared.motion, prepared.label, judge)
+    loop.reader = reader
     loop.checks["keyframe"] = window.keyframe
     loop.checks["contradicted"] = prepared.contradicted
     reason = window.problem
@@ -91,6 +109,7 @@ def _record(prepared: Prepared, teacher: Teacher, loop: _Loop, reason: str | Non
         label=loop.label,
         verdict=loop.verdict,
         judge=loop.judgement,
+        reader=loop.reading,
         repair=loop.repair,
         checks=Checks(**loop.checks),
         status="accepted" if reason is None else "dropped",
@@ -155,6 +174,8 @@ class _Loop:
         self.answered: Question | None = None  # the one that `english` answers
         self.verdict: Verdict | None = None
         self.judgement: JudgeRecord | None = None
+        self.reader: Reader | None = None
+        self.reading: ReaderRecord | None = None
         self.repair: RepairRecord | None = None
         self.checks: dict[str, Any] = {}
         self.usage = Usage()
@@ -173,7 +194,7 @@ class _Loop:
         elif reason is None:
             self.checks["bilingual"] = "no_chinese"
         if reason is None or (self.terms.is_given and self.english is not None):
-            found = self._check_evidence(question)  # what was given is judged even where its window is dropped
+            found = await self._check_evidence(question)  # what was given is judged even where its window is dropped
             reason = reason or found
         if self._recovered:
             self.checks["recovered"] = sorted(self._recovered)
@@ -347,7 +368,7 @@ class _Loop:
         found = check_translation(english.coc, chinese.coc)
         return Refused(*found, chinese) if found else chinese
 
-    def _check_evidence(self, question: Question) -> str | None:
+    async def _check_evidence(self, question: Question) -> str | None:
         """Put on record what was found out about every sentence; gives the reason to drop the window."""
         assert self.english is not None
         drafts: dict[Language, Draft] = {"en": self.english}
@@ -357,6 +378,10 @@ class _Loop:
             language: self.way.judge(draft, question.facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
         }
+        if self.reader is not None and self.terms.writing == "prose":
+            texts = {language: draft.coc for language, draft in drafts.items()}
+            self.reading = await self.reader.record(texts, question.facts, question.window.sample_id)
+            judged = {language: self._with_reading(language, judged[language], question.facts) for language in judged}
         self.checks["sentences"] = {
             language: [sentence.state for sentence in sentences] for language, sentences in judged.items()
         }
@@ -368,6 +393,14 @@ class _Loop:
         ]
         self.checks["evidence"] = found or "ok"
         return "evidence" if found and self.cfg.evidence.drop else None
+
+    def _with_reading(self, language: Language, judged: list[Judged], facts: Facts) -> list[Judged]:
+        """Take what the readings of a text prove or contradict, and of sentences that they leave unread what was found without them."""
+        assert self.reading is not None
+        coc = self.chinese.coc if language == "zh" and self.chinese else self.english.coc if self.english else None
+        assert coc is not None
+        read = judge_reading(coc, self.reading.claims[language], facts, self.cfg.evidence, language)
+        return [one if one.state != "unread" else other for one, other in zip(read, judged, strict=True)]
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1

@@ -345,7 +345,7 @@ def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path,
     at, data = ["--out", tmp_path / "out"], ["--data", tmp_path]
     commands = [
         ["caption", "--teacher", url, *data], ["caption", "--judge", url, *data], ["caption", "--plan", "--teacher", url, *data],
-        ["caption", "doctor", url], ["caption", "judge-check", url], ["caption", "compare-strategies", "--teacher", url, *at, *data],
+        ["caption", "doctor", url], ["caption", "judge-check", url], ["caption", "reader-check", url], ["caption", "compare-strategies", "--teacher", url, *at, *data],
         ["run", "quickstart", "--set", f"caption.teacher={json.dumps(url)}", "--set", "caption.writing=prose", *at],
     ]  # fmt: skip
     for command in commands:

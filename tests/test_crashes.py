@@ -94,6 +94,7 @@ def test_every_command_that_writes_is_in_the_sweep():
         "release verify",
         "caption doctor",
         "caption judge-check",
+        "caption reader-check",
     }
     root, names = get_command(app), set[str]()
     for name, found in root.commands.items():

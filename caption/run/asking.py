@@ -18,6 +18,7 @@ from pathlib import Path
 from caption.run.flights import Allotted
 from caption.run.progress import Display
 from caption.schema import CaptionConfig, Window
+from caption.teachers.reader import open_reader
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.judge import open_judge
 from caption.window_loop import caption_window
@@ -32,7 +33,7 @@ from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_failures, 
 
 log = logging.getLogger(__name__)
 
-ANSWERS, JUDGEMENTS = "answers", "judgements"  # folders
+ANSWERS, JUDGEMENTS, READINGS = "answers", "judgements", "readings"  # folders
 QUARANTINE, FAILURES = "quarantine.jsonl", "failures.jsonl"
 # Begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked.
 WAITING_WINDOWS = 16
@@ -75,7 +76,8 @@ class Asking:
         self.failures: list[Failed] = []  # flights that cannot be read
         self.quarantine = read_quarantine(stage.path)
         self.only = frozenset(self.quarantine) if retry_failed else None
-        in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
+        beside = [cfg.judge.concurrency] * bool(cfg.judge.url) + [cfg.reader.concurrency] * bool(cfg.reader.urls)
+        in_flight = max(cfg.most_in_flight, *beside, 0)
         self.most_open = in_flight + WAITING_WINDOWS
         self.was_whole = was_whole
         self.failed_in_row = 0
@@ -87,15 +89,16 @@ class Asking:
             TeacherError: no window would get an answer. What was answered is kept.
         """
         guesses = {flight.name: flight.guess_num_windows(self.cfg.window) for flight in allotted}
-        self.books = AnswerBook(self.stage.path / ANSWERS), AnswerBook(self.stage.path / JUDGEMENTS)
-        answers, judgements = self.books
-        budget, troubles = first_budget(self.cfg, answers.totals, judgements.totals), Troubles()
+        self.books = tuple(AnswerBook(self.stage.path / name) for name in (ANSWERS, JUDGEMENTS, READINGS))
+        answers, judgements, readings = self.books
+        budget, troubles = first_budget(self.cfg, *(book.totals for book in self.books)), Troubles()
         display = Display(sum(guesses.values()), budget, of_judge=judgements.totals, troubles=troubles)
         try:
-            with answers, judgements, display as self.display:
+            with answers, judgements, readings, display as self.display:
                 async with (
                     open_teacher(self.cfg, answers, self.seed, budget, self.only, troubles) as teacher,
                     open_judge(self.cfg.judge, self.seed, judgements, budget, troubles) as self.judge,
+                    open_reader(self.cfg.reader, self.seed, readings, budget, troubles) as self.reader,
                     self._heartbeat(),
                 ):
                     await self._ask_all(allotted, teacher, guesses)
@@ -183,7 +186,7 @@ class Asking:
     async def _caption(self, flight: _OpenFlight, window: Window, teacher: Teacher) -> None:
         sample_id, begun_s = window.observed.sample_id, time.monotonic()
         try:
-            caption = await caption_window(window, teacher, self.cfg, self.judge)
+            caption = await caption_window(window, teacher, self.cfg, self.judge, self.reader)
         except BudgetSpent as error:
             self.asked.stopped = self.asked.stopped or error.what
             self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=error.what))

@@ -89,7 +89,7 @@ def _run(
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)
-    if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
+    if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None and not cfg.reader.urls:
         asked = Asked(_run_embedded(stage, allotted, cfg, seed, workers, watch))
     else:
         if retry_failed:

@@ -31,7 +31,7 @@ MAX_COMPLAINTS = 8  # named at once
 UNITS = ("m", "mps", "deg", "dps", "px", "percent", "times")
 
 _TEXT = {"type": "string", "maxLength": MAX_TEXT}
-_CLAIM = {
+CLAIM_SCHEMA: dict[str, Any] = {
     "type": "object",
     "properties": {
         "sentence": {"type": "string", "pattern": "^[CR][1-9][0-9]?$"},
@@ -66,7 +66,7 @@ class Claims:
 
     system = "system_claims_en"
     mirror_system = "mirror_system"
-    fields: Mapping[str, dict] = {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": _CLAIM}}
+    fields: Mapping[str, dict] = {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": CLAIM_SCHEMA}}
 
     def table(self, facts: Facts) -> str:
         return "Table of facts:\n" + "\n".join(

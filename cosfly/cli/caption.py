@@ -33,6 +33,12 @@ AsStudent = Annotated[
 ]
 Model = Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")]
 JudgeUrl = Annotated[str | None, typer.Option(help="URL of an endpoint that judges conflicts.")]
+Readers = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
+    ),
+]
 Keyframes = Annotated[
     bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
 ]
@@ -54,6 +60,7 @@ def caption(
     as_student: AsStudent = None,
     model: Model = None,
     judge: JudgeUrl = None,
+    reader: Readers = None,
     keyframes: Keyframes = None,
     data: options.Data = None,
     flights: options.Flights = None,
@@ -83,6 +90,7 @@ def caption(
         "caption.endpoint.model": model,
         "caption.student.folder": as_student,
         "caption.judge.url": judge,
+        "caption.reader.urls": reader or None,
         "caption.window.keyframes": keyframes,
         "caption.limit": limit,
         "caption.budget.max_cost": max_cost,
@@ -203,6 +211,29 @@ def caption_judge_check(
     cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
     with own_files(cfg.caption):
         console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, read_gold(), cfg.seed))))
+
+
+@app.command("reader-check")
+def caption_reader_check(
+    urls: Annotated[list[str], typer.Argument(help="OpenAI-compatible endpoint of the reader, or two.")],
+    model: Model = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only so many captions, spread over the set.")] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+) -> None:
+    """Measure a reader of prose on the gold set: true captions flagged, errors caught, claims, requests, tokens."""
+    import asyncio
+
+    from caption.own_files import own_files
+    from caption.teachers.reader import check_reader, reader_check_table
+    from caption.truth.gold import read_gold_prose
+    from cosfly.work.console import console
+
+    given = {"caption.reader.urls": urls, "caption.reader.models": None if model is None else [model]}
+    cfg, gold = options.resolve(config, overrides, given), list(read_gold_prose())
+    gold = gold if limit is None else gold[:: -(-len(gold) // limit)]
+    with own_files(cfg.caption):
+        console.print(reader_check_table(asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))))
 
 
 @app.command("compare-strategies")

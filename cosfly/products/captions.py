@@ -164,6 +164,7 @@ class Claim(BaseModel):
 
     sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its aspect
     (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window. unit: m, mps, deg ...
+    quote: the words of the sentence that it stands for, where a reader made it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -174,6 +175,23 @@ class Claim(BaseModel):
     value: Annotated[float, Field(strict=True)] | str  # true is no 1.0
     unit: str | None = None
     modality: Modality = "observed"
+    quote: _Given[str] = None
+
+
+class ReaderRecord(BaseModel):
+    """What language models read in texts that came without claims.
+
+    models: one or two. prompt: digest of the prompts. claims: language -> what both readings say, which is what was judged.
+    num_claims: language -> claims of each reading; None: it could not be read.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    models: list[str]
+    prompt: str
+    claims: dict[Language, list[Claim]]
+    num_claims: dict[Language, list[int | None]]
+    usage: Usage
 
 
 class Template(BaseModel):
@@ -240,6 +258,7 @@ class Caption(BaseModel):
     label: str | None  # ground-truth decision from the future geometry; None: geometry cannot tell
     verdict: Verdict | None = None
     judge: JudgeRecord | None = None
+    reader: _Given[ReaderRecord] = None
     repair: RepairRecord | None = None
     checks: Checks = Checks()
     status: Literal["accepted", "dropped"]

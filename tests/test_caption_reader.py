@@ -1,0 +1,205 @@
+"""Prose read into claims by a language model: a perfect reader, readers with stated faults, and a run with one. No real model is asked."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import re
+from functools import cache
+
+from teacher_server import TeacherServer
+from typer.testing import CliRunner
+
+from caption.run.stage import run
+from caption.schema import CaptionConfig, ReaderConfig
+from caption.teachers.reader import Reader, measure_reader, prompt_digest, read_reading
+from caption.truth.gold import GoldCaption, read_gold_prose
+from caption.truth.sizes import same_size
+from caption.truth.stated import read_stated
+from cosfly.chat.answers import KeptAnswers
+from cosfly.chat.contract import Reply
+from cosfly.cli import app
+from cosfly.products.captions import Claim, Coc, Usage, read_captions
+from cosfly.products.sentences import sentences_of
+from specimens import make_playback_tree
+
+
+@cache
+def gold() -> tuple[GoldCaption, ...]:
+    """Captions whose claims were written by their writers, who knew no rule of ours: every third."""
+    return tuple(caption for caption in read_gold_prose() if caption.claims)[::3]
+
+
+def quoted(claim: Claim, sentence: str, language: str) -> dict:
+    """Give a claim as a reader writes it: it quotes the clause that holds its number, else its sentence."""
+    quote = sentence
+    if isinstance(claim.value, float):
+        for clause in re.split(r"(?<=[,;，；])", sentence):
+            if any(same_size(numeral, claim) for numeral in read_stated(clause, language).numerals):
+                quote = clause
+                break
+    return claim.model_dump(exclude={"quote"}) | {"at": claim.at or "", "unit": claim.unit or "", "quote": quote}
+
+
+def written(coc: Coc, claims: tuple[Claim, ...], language: str) -> list[dict]:
+    sentences = dict(sentences_of(coc))
+    return [quoted(claim, sentences[claim.sentence], language) for claim in claims if claim.sentence in sentences]
+
+
+@cache
+def readings() -> dict[str, list[dict]]:
+    """Give what a perfect reader answers to each text, by its sentences: the claims of its writer, with the planted error."""
+    found = {}
+    for caption in gold():
+        texts = [(caption.coc, caption.claims)]
+        texts += [(e.in_text(caption.coc), e.in_claims(caption.claims) or caption.claims) for e in caption.errors]
+        for coc, claims in texts:
+            key = key_of(f"{name}: {text}" for name, text in sentences_of(coc))
+            found.setdefault(
+                key, written(coc, claims, caption.language)
+            )  # of a wrong decision the text is the true one
+    return found
+
+
+def key_of(lines) -> str:
+    return "\n".join(sorted(lines))
+
+
+class FakeEngine:
+    """Answers from `readings`, with a fault that is a function of (claims, random) -> claims."""
+
+    kind, where, model = "endpoint", "nowhere", "perfect"  # type: ignore
+
+    def __init__(self, fault=lambda claims, rng: claims, seed: int = 0) -> None:
+        self.fault, self.rng = fault, random.Random(seed)
+
+    async def answer(self, request) -> Reply:
+        sentences = request.messages[1]["content"]
+        claims = readings()[key_of(sentences.split("\n"))]
+        return Reply(json.dumps({"claims": self.fault(claims, self.rng)}), Usage(prompt_tokens=900), "plain", "stop")
+
+
+def measured(*engines):
+    reader = Reader([KeptAnswers(engine, None) for engine in engines], ReaderConfig(urls=("http://x",)), 0)
+    return asyncio.run(measure_reader(reader, gold()))
+
+
+def test_a_perfect_reader_flags_no_true_caption_and_catches_most_errors():
+    check = measured(FakeEngine())
+    assert check.num_true >= 60
+    assert check.num_flagged == 0
+    assert check.num_caught >= 0.75 * check.num_false
+
+
+def lose(claims, rng):
+    return [claim for claim in claims if rng.random() > 0.2]
+
+
+def misread(claims, rng):
+    return [
+        claim | {"value": round(claim["value"] * 1.3 + 1, 2)}
+        if isinstance(claim["value"], float) and rng.random() < 0.1
+        else claim
+        for claim in claims
+    ]
+
+
+def misquote(claims, rng):
+    return [claim | {"quote": claim["quote"][::-1]} if rng.random() < 0.1 else claim for claim in claims]
+
+
+def turn(claims, rng):
+    other = {"left": "right", "right": "left", "increasing": "decreasing", "decreasing": "increasing"}
+    return [
+        claim | {"value": other.get(claim["value"], claim["value"])} if rng.random() < 0.05 else claim
+        for claim in claims
+    ]
+
+
+def test_readers_with_faults_lose_proofs_and_flag_next_to_nothing():
+    perfect = measured(FakeEngine())
+    for fault in (lose, misread, misquote, turn):
+        check = measured(FakeEngine(fault, 1), FakeEngine(fault, 2))
+        assert check.num_flagged <= 0.02 * check.num_true, fault
+        assert check.num_proved <= perfect.num_proved, fault
+        assert check.num_claims < perfect.num_claims, fault
+        assert check.num_caught > 0.4 * check.num_false, fault
+
+
+def test_two_readings_that_err_alike_are_believed():
+    """What the agreement of two readings cannot find: one model with one fault twice. Hence reader-check."""
+    assert measured(FakeEngine(turn, 1), FakeEngine(turn, 1)).num_flagged > 3
+
+
+def test_a_claim_must_quote_words_that_hold_its_number():
+    coc = Coc(
+        critical_components="The walker is 12.5 m away and to the left.",
+        reasoning_trace="The gap has grown by 2 m, so speed up.",
+        flight_decision="speed_up",
+    )
+    plain = {"sentence": "C1", "quantity": "distance", "at": "t4", "value": 12.5, "unit": "m", "modality": "observed"}
+    wrong = [
+        plain | {"quote": "13.5 m"},  # not in the sentence
+        plain | {"quote": "to the left"},  # without the number
+        plain | {"quote": "12.5 m away", "value": 13.5},
+        plain | {"quote": "by 2 m", "sentence": "R1"},
+        plain | {"quote": "12.5 m", "sentence": "C9"},
+        plain,
+        "12.5 m",
+    ]
+    answer = json.dumps({"claims": [plain | {"quote": "12.5 m away"}, *wrong]})
+    assert read_reading(answer, "stop", coc, "en") == [Claim(**plain, quote="12.5 m away")]
+    assert read_reading("I cannot.", "stop", coc, "en") is None
+
+
+def reading_of(body: dict) -> str:
+    """Read a made-up text of one sentence each: the altitude that it gives."""
+    lines = re.findall(r"^(\w\d): (.*)$", body["messages"][1]["content"], re.MULTILINE)
+    claims = [
+        {"sentence": name, "quantity": "altitude", "at": "t4", "value": float(found[1]), "unit": "m", "modality": "observed",
+         "quote": found[0]}
+        for name, text in lines if (found := re.search(r"([\d.]+) m", text))
+    ]  # fmt: skip
+    return json.dumps({"claims": claims})
+
+
+def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+    rules = list(read_captions(run(CaptionConfig(), tree, tmp_path / "rules")))
+    altitudes = [float(re.search(r"Altitude[^\[]*\[(.*?)\]", c.prompt["en"].user)[1].split(",")[-1]) for c in rules]
+    lines = [
+        {
+            "sample_id": caption.sample_id,
+            "en": {
+                "critical_components": f"We fly at {altitude + 5 * (number % 2):.1f} m over the road.",
+                "reasoning_trace": "There is nothing to say against this manoeuvre here.",
+                "flight_decision": caption.label or "hover",
+            },
+        }
+        for number, (caption, altitude) in enumerate(zip(rules, altitudes, strict=True))
+    ]
+    path = tmp_path / "theirs.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    server = TeacherServer()
+    server.text = reading_of
+    with server:
+        cfg = CaptionConfig.model_validate({"teacher": f"file:{path}", "reader": {"urls": [server.url]}})
+        found = list(read_captions(run(cfg, tree, tmp_path / "out")))
+        assert len(server.bodies) == 2 * len(lines)
+        run(cfg, tree, tmp_path / "out")
+        assert len(server.bodies) == 2 * len(lines)  # nothing is asked twice
+    assert [c.checks.sentences["en"][0] for c in found] == [
+        "contradicted" if n % 2 else "proved" for n in range(len(found))
+    ]
+    assert all(c.reader.prompt == prompt_digest() and c.reader.claims["en"][0].quote for c in found)
+
+
+def test_the_command_measures_an_endpoint():
+    server = TeacherServer()
+    server.text = lambda body: "I cannot."
+    with server:
+        result = CliRunner().invoke(app, ["caption", "reader-check", server.url, "--limit", "2"])
+    assert result.exit_code == 0, result.output
+    assert "flagged" in result.output
+    assert "unreadable" in result.output
