@@ -17,6 +17,7 @@ from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.source import SHARD_NAME, open_release
 from release.get.remote import without_secrets
+from release.sign import SIGNATURE, is_signed
 from release.verify.findings import Verified
 from release.verify.verify import Level, verify
 
@@ -67,6 +68,7 @@ def pack(folder: Path) -> Parcel:
     folder = open_release(folder).folder
     digests = read_checksums(folder)
     names = [*sorted(digests, key=lambda name: (SHARD_NAME.fullmatch(name) is None, name)), CHECKSUMS]
+    names += [SIGNATURE] if is_signed(folder) else []
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         raise InputError("not a whole release", where=folder, got=f"missing: {', '.join(missing)[:200]}")

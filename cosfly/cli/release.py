@@ -94,6 +94,9 @@ def release_verify(
         Path | None,
         typer.Option(help="Of an export: the release it was made of; it is made again and every file compared."),
     ] = None,
+    public_key: Annotated[
+        Path | None, typer.Option(help="Public key of who should have signed it; all checksums are then compared.")
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the findings for machines here.")] = None,
     repair_plan: Annotated[
         bool, typer.Option("--repair-plan", help="Say what could be mended, and how; changes nothing.")
@@ -106,13 +109,15 @@ def release_verify(
     from caption.truth.released import read_released
     from cosfly.app.settings import manner_of_work
     from cosfly.work.store import write_json
+    from release.sign import read_public_key
     from release.verify.repair import plan_of
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:
         raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
     cfg = options.resolve(config, overrides, {"workers": workers})
-    report = verify(folder, level=level, reader=read_released, source=source, **manner_of_work(cfg))
+    key = None if public_key is None else read_public_key(public_key)
+    report = verify(folder, level=level, reader=read_released, source=source, public_key=key, **manner_of_work(cfg))
     typer.echo(str(report))
     for line in plan_of(report) if repair_plan else []:
         typer.echo(f"repair plan: {line}")
@@ -120,6 +125,34 @@ def release_verify(
         write_json(json_file, report.as_json())
     if not report.is_ok:
         raise typer.Exit(1)
+
+
+@app.command("sign")
+def release_sign(
+    folder: Annotated[Path, typer.Argument(help="Release folder, or a run with one.")],
+    key: Annotated[Path, typer.Option(help="Private ed25519 key, PEM of openssl or ssh-keygen.")],
+    level: Annotated[
+        Literal["structure", "rows", "pixels"], typer.Option(help="How far the release is verified before.")
+    ] = "pixels",
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    workers: options.Workers = None,
+) -> None:
+    """Verify a release, then sign its list of checksums with your key: `release verify --public-key` tells a forged one."""
+    from caption.truth.released import read_released
+    from cosfly.app.settings import manner_of_work
+    from release import sign
+    from release.record import release_folder
+    from release.verify.verify import verify
+
+    cfg = options.resolve(config, overrides, {"workers": workers})
+    private_key = sign.read_private_key(key)
+    report = verify(folder, level=level, reader=read_released, **manner_of_work(cfg))
+    typer.echo(str(report))
+    if not report.is_ok:
+        typer.echo("nothing was signed", err=True)
+        raise typer.Exit(1)
+    typer.echo(sign.sign(release_folder(folder), private_key))
 
 
 @app.command("stats")

@@ -58,6 +58,7 @@ from release.record import (
     content_digest,
     shard_path,
 )
+from release.sign import MOST_SIGNATURE_BYTES, SIGNATURE
 from release.verify.findings import Verified
 from release.verify.verify import verify
 
@@ -403,6 +404,7 @@ def run(
         named = name_shards(done, folder)
         if is_whole:
             _copy_records(remote, folder, data)
+            _copy_signature(remote, folder)
         else:
             part = _part_of(record, choice, published_address(remote.shown))
             write_records(folder, part_record(record, part, flights, plan.modalities, named, taken, folder))
@@ -449,6 +451,16 @@ def _not_kept(report: Verified, where: str) -> VerifyError:
 def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:
     for name in ONE_FILE_EACH:
         write_bytes(folder / name, record if name == RECORD else remote.read(name, 0, remote.size(name)))
+
+
+def _copy_signature(remote: Remote, folder: Path) -> None:
+    """Take the signature along, where there is one; who signed is asked by `release verify --public-key`."""
+    try:
+        size = remote.size(SIGNATURE)
+    except InputError:
+        return
+    if size <= MOST_SIGNATURE_BYTES:
+        write_bytes(folder / SIGNATURE, remote.read(SIGNATURE, 0, size))
 
 
 def _part_of(record: ReleaseRecord, choice: Choice, source: str) -> PartOf:

@@ -18,6 +18,7 @@ PLANS: dict[str, tuple[bool, str]] = {
         (False, "caption the flight again from its tree, and build again"),
     ),
     "leak": (False, "build again: splits are handed out by walk"),
+    "signature": (False, f"{AGAIN}, or ask its maker to sign it: cosfly release sign"),
     "licence": (True, "name licence and credits of the maps: release.licence and release.credits of the build"),
 }  # fmt: skip
 ELSE = (False, "no file of the folder tells what was true: render or build the flights that are named again")

@@ -29,6 +29,7 @@ from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
 from release.export.stage import ExportRecord, read_export, render_readme
 from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
+from release.sign import SIGNATURE, is_signed, signature_fault
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
 from release.verify.drawn_again import Drawn
@@ -55,6 +56,7 @@ class _How:
     workers: int
     watch: Watch
     source: Path | None
+    public_key: bytes | None
 
 
 def verify(
@@ -65,6 +67,7 @@ def verify(
     reader: CaptionReader | None = None,
     watch: Watch = Watch(),
     source: Path | None = None,
+    public_key: bytes | None = None,
 ) -> Verified:
     """Check a folder (or the release inside a release stage's or a run's, or the format's inside an export's).
 
@@ -74,10 +77,11 @@ def verify(
         reader: tells what the words of captions say; None: they are not read, which the report says.
         watch: when a worker counts as stalled; its flight is then an error.
         source: of an export the release that it was made of, to make it again and compare.
+        public_key: of who should have signed the release; all checksums are then compared at every level.
     Returns:
         the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
     """
-    findings, how = Findings(), _How(level, reader, workers, watch, source)
+    findings, how = Findings(), _How(level, reader, workers, watch, source, public_key)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
         exports = (folder / name / EXPORT for name in FORMATS)  # in the stage's folder
         folder = next((path.parent for path in exports if path.is_file()), release_folder(folder))
@@ -89,6 +93,8 @@ def verify(
         _verify_release(folder, how, findings)
     else:
         _verify_tree(folder, how, findings)
+    if public_key is not None and not (folder / RECORD).is_file():
+        findings.error("signature", folder, "no release", "a signed release: exports and trees carry no signature")
     report = findings.report()
     report.level = level
     return report
@@ -114,6 +120,9 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
 
 def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
     expected: dict[str, int | None] = dict.fromkeys(RECORDS)
+    _check_signature(folder, record, how, findings)
+    if is_signed(folder):
+        expected[SIGNATURE] = None
     good = check_names(folder, expected | {shard.path: shard.bytes for shard in record.shards}, findings)
     digests = read_digests(folder, findings)
     _check_lists(record, digests, findings)
@@ -127,8 +136,22 @@ def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Fin
     findings.facts.append(f"structure: {len(shards):,} shards, {record.numbers.frames:,} frames by their record")
     if how.level != "structure":
         _verify_rows(folder, record, readable == shards, how, findings)
-    if how.level == "pixels":
+    if how.level == "pixels" or how.public_key is not None:  # a signature is over the list of digests
         check_digests(folder, digests, [name for name in good if name not in small], findings)
+
+
+def _check_signature(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
+    if how.public_key is None:
+        state = "signed, the key was not checked: --public-key FILE" if is_signed(folder) else "not signed"
+    elif (fault := signature_fault(folder, how.public_key)) is None:
+        state = "signed with the key that was given"
+    else:
+        got, expected = fault
+        if not is_signed(folder) and record.part_of is not None:
+            expected = "the whole release: a part that was fetched does not carry its maker's signature"
+        findings.error("signature", SIGNATURE, got, expected)
+        return
+    findings.facts.append(f"signature: {state}")
 
 
 def _verify_rows(folder: Path, record: ReleaseRecord, is_readable: bool, how: _How, findings: Findings) -> None:
