@@ -23,7 +23,6 @@ from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
 from test_caption_doctor import patient
 from test_cosfly_maps import node, write_world
-from test_cosfly_trees import make_older
 from test_distill_evaluate import make_encoder
 from test_docs_commands import ALL, PAGES, blocks
 from test_release_get import served
@@ -38,7 +37,6 @@ from cosfly.work import runner
 from cosfly.work.config import shipped
 from cosfly.work.runner import Item, Watch
 from cosfly.work.stage_folder import StageFolder
-from specimens import make_playback_tree
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
 FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
@@ -162,16 +160,11 @@ def _others_captions(root: Path, target: Path) -> None:
     target.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def _older(root: Path, target: Path) -> None:
-    make_older(make_playback_tree(root / "old/newer", 1, 6, width_px=96, height_px=54), target)
-
-
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
     "town.csv": _table,
     "town.geojson": _geojson,
-    "old/render": _older,
     "file:captions.jsonl": _others_captions,
     "../shared/data/simworld-progen/progen_world.json": _world,
     "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
