@@ -25,7 +25,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign, read_student
 from caption.teachers.prompt_files import export_prompts, own_prompts
 from caption.truth.facts import Facts
-from caption.truth.gold import GOLD_PROSE, read_gold_prose
+from caption.truth.gold import GOLD, read_gold
 from caption.truth.prose import judge_prose
 from caption.truth.references import parse_reference
 from caption.writing.slots import Slots
@@ -189,7 +189,7 @@ def make_specimens(root: Path) -> Path:
     made = make_captions(captions, tree)
     given = [{"sample_id": c.sample_id, "en": PLAIN, "therefore": None} for c in made[:4]]
     (root / "foreign.jsonl").write_text("".join(json.dumps(line) + "\n" for line in given))
-    with open(GOLD_PROSE, encoding="utf-8") as gold:
+    with gzip.open(GOLD, "rt", encoding="utf-8") as gold:
         (root / "gold.jsonl").write_text("".join(islice(gold, 4)), encoding="utf-8")
     inspection.run(InspectConfig(), None, None, tree, root / "inspect")
     flights = read_inspection(root / "inspect/inspect.json")
@@ -459,7 +459,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _facts() -> Facts:
-    return next(read_gold_prose()).facts
+    return next(read_gold()).facts
 
 
 def _answer(root: Path, name: str, language: Any = "en") -> None:
@@ -694,7 +694,7 @@ READERS: dict[str, Reader] = {
     "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2, hashes=True),
     "captions": _one("captions.jsonl", lambda path: list(read_captions(path))),
     "foreign captions": _one("foreign.jsonl", read_foreign),
-    "gold captions": _one("gold.jsonl", lambda path: [(gold.coc, gold.facts) for gold in read_gold_prose(path)]),
+    "gold captions": _one("gold.jsonl", lambda path: [(gold.coc, gold.facts) for gold in read_gold(path)]),
     "predictions": _one("predictions.jsonl", read_predictions),
     "student's captions": _one("predictions.jsonl", read_student),
     "quarantine": _one("quarantine.jsonl", lambda path: read_quarantine(path.parent)),

@@ -1,26 +1,39 @@
-"""Measure the judging of texts on captions that somebody else wrote: true ones flagged, one-change errors caught.
+"""Measure the judging of texts on the gold set: true ones flagged, one-change errors caught.
 
-    python tests/measure_prose.py claims|prose [FILE...] [--only PREFIX...] [--show]
+    python tests/measure_prose.py claims|prose|reader [--sets N...] [--show]
 
-Files are gold sets (caption/truth/gold.py), by default the one that ships; --only: the captions whose id begins so. Figures by where
-the error was planted (text, claims, both), language and kind; --show prints the true captions that were flagged and the errors that
-were missed.
+Sets are those of caption/truth/gold.py, by default those whose writers gave claims (1 and 2). Figures by where the error was planted
+(text, claims, both), language and kind; --show prints the true captions that were flagged and the errors that were missed.
+
+`reader` stands for language models, of which none could be had: `cosfly caption reader-check` asks a served endpoint that answers with the
+writers' claims (a perfect reader), or with those after a fault at a stated rate. Their writers had read the captions and no code of ours.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import json
+import random
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
-from caption.schema import EvidenceConfig
+from teacher_server import TeacherServer
+
+from caption.schema import EvidenceConfig, ReaderConfig
+from caption.teachers.reader import check_reader, reader_check_table
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
-from caption.truth.gold import GOLD_PROSE, GoldCaption, PlantedError, read_gold_prose
+from caption.truth.gold import GoldCaption, PlantedError, read_gold
 from caption.truth.prose import check_prose
+from caption.truth.sizes import same_size
+from caption.truth.stated import read_stated
 from cosfly.products.captions import Claim, Coc, Language
+from cosfly.products.sentences import sentences_of
+from cosfly.work.console import console
 
 GROUPS = {"numbers": ("num", "halluc", "unit", "words", "ratio"), "sides": ("side", "clock")}
 WHERE = ("text", "claims", "both")
@@ -111,17 +124,105 @@ def show(score: Score, *, in_full: bool) -> None:
             print("missed ", place, name, error.model_dump(exclude_none=True))
 
 
+# --- readers that are no models ----------------------------------------------------------------------------------------
+
+
+def _quoted(claim: Claim, sentence: str, language: Language) -> dict[str, Any]:
+    """Give a claim as a reader writes it: it quotes the clause that holds its number, else its sentence."""
+    quote = sentence
+    if isinstance(claim.value, float):
+        for clause in re.split(r"(?<=[,;，；])", sentence):
+            if any(same_size(numeral, claim) for numeral in read_stated(clause, language).numerals):
+                quote = clause
+                break
+    return claim.model_dump(exclude={"quote"}) | {"at": claim.at or "", "unit": claim.unit or "", "quote": quote}
+
+
+def perfect_readings(gold: Iterable[GoldCaption]) -> dict[str, list[dict]]:
+    """Give what a perfect reader answers to each text, by its sentences: the claims of its writer, with the planted error in them."""
+    found: dict[str, list[dict]] = {}
+    for caption in gold:
+        texts = [(caption.coc, caption.claims)]
+        texts += [(e.in_text(caption.coc), e.in_claims(caption.claims) or caption.claims) for e in caption.errors]
+        for coc, claims in texts:
+            sentences = dict(sentences_of(coc))
+            key = _key_of(f"{name}: {text}" for name, text in sentences.items())
+            there = [_quoted(c, sentences[c.sentence], caption.language) for c in claims if c.sentence in sentences]
+            found.setdefault(key, there)  # of a wrong decision the text is the true one
+    return found
+
+
+def _key_of(lines: Iterable[str]) -> str:
+    return "\n".join(sorted(lines))
+
+
+Fault = Callable[[dict, random.Random], dict | None]  # a claim -> what a bad reader makes of it
+
+_OTHER = {"left": "right", "right": "left", "increasing": "decreasing", "decreasing": "increasing"}
+
+
+def loses(claim: dict, rng: random.Random) -> dict | None:
+    return claim if rng.random() > 0.2 else None
+
+
+def misreads(claim: dict, rng: random.Random) -> dict:
+    is_wrong = isinstance(claim["value"], float) and rng.random() < 0.1
+    return claim | {"value": round(claim["value"] * 1.3 + 1, 2)} if is_wrong else claim
+
+
+def misquotes(claim: dict, rng: random.Random) -> dict:
+    return claim | {"quote": claim["quote"][::-1]} if rng.random() < 0.1 else claim
+
+
+def turns(claim: dict, rng: random.Random) -> dict:
+    return claim | {"value": _OTHER.get(claim["value"], claim["value"])} if rng.random() < 0.05 else claim
+
+
+FAULTS: dict[str, Fault | None] = {
+    "perfect": None,
+    "loses 20 % of claims": loses,
+    "misreads 10 % of numbers": misreads,
+    "misquotes 10 %": misquotes,
+    "swaps 5 % of sides and trends": turns,
+}
+
+
+def answers_of(readings: dict[str, list[dict]], fault: Fault | None, *, alike: bool = False) -> Callable[[dict], str]:
+    """Give what a reader with a fault answers to a request; alike: it errs in the same way whatever the order of the question."""
+
+    def answer(body: dict) -> str:
+        lines = body["messages"][1]["content"].split("\n")
+        rng = random.Random(_key_of(lines) if alike else json.dumps(body["messages"]))
+        claims = readings[_key_of(lines)]
+        found = claims if fault is None else [wrong for claim in claims if (wrong := fault(claim, rng))]
+        return json.dumps({"claims": found})
+
+    return answer
+
+
+def measure_readers(gold: Sequence[GoldCaption]) -> None:
+    readings = perfect_readings(gold)
+    cases = [(name, fault, False) for name, fault in FAULTS.items()] + [("swaps 5 %, alike twice", turns, True)]
+    for name, fault, alike in cases:
+        server = TeacherServer()
+        server.text = answers_of(readings, fault, alike=alike)
+        with server:
+            check = asyncio.run(check_reader(ReaderConfig(urls=(server.url,)), gold))
+        check.models = [name]
+        console.print(reader_check_table(check))
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the judging of texts on a gold set.")
-    parser.add_argument("mode", choices=MODES)
-    parser.add_argument("files", nargs="*", type=Path, default=[GOLD_PROSE])
-    parser.add_argument("--only", nargs="+", default=[""], help="captions whose id begins with one of these")
+    parser = argparse.ArgumentParser(description="Measure the judging of texts on the gold set.")
+    parser.add_argument("mode", choices=[*MODES, "reader"])
+    parser.add_argument("--sets", nargs="+", type=int, default=[1, 2], help="numbers of sets")
     parser.add_argument("--show", action="store_true", help="print what was flagged and what was missed")
     asked = parser.parse_args()
-    lines = [line for file in asked.files for line in read_gold_prose(file) if line.id.startswith(tuple(asked.only))]
-    if not lines:
-        parser.error("no caption to measure")
-    show(measure(lines, *MODES[asked.mode]), in_full=asked.show)
+    gold = [caption for caption in read_gold() if caption.set in asked.sets]
+    if asked.mode == "reader":
+        measure_readers([caption for caption in gold if caption.claims])
+    else:
+        show(measure(gold, *MODES[asked.mode]), in_full=asked.show)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Windows made by hand, and a gold set that somebody else wrote.
+"""Windows made by hand.
 
 FOLLOW: a climbing, accelerating drone turns right after a walker who bends right and is partly covered at the end.
 HOLD: a drone hovers over somebody who stood and is hidden in the last two frames.
@@ -7,7 +7,6 @@ HOLD: a drone hovers over somebody who stood and is hidden in the last two frame
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 from caption.truth.facts import Facts
 
@@ -118,5 +117,4 @@ ORBIT = dataclasses.replace(
     bearing_deg=(0.1, -0.1, 0.0, 0.1, 0.0),
     depression_deg=(31.7, 31.5, 31.9, 31.8, 31.7),
 )
-SECOND_SET = Path(__file__).with_name("prose_second.jsonl")
 WINDOWS = {"follow": FOLLOW, "hold": HOLD, "dive": DIVE, "orbit": ORBIT}

@@ -6,12 +6,11 @@ import dataclasses
 
 import pytest
 from measure_prose import claims_problems, measure, planted
-from specimens_prose import SECOND_SET
 
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
-from caption.truth.gold import GOLD_PROSE, GoldCaption, read_gold_prose
+from caption.truth.gold import GoldCaption, read_gold
 from caption.truth.numerals import chinese_number, english_number, read_numerals
 from caption.truth.stated import read_stated
 from cosfly.products.captions import Claim, Coc, Language
@@ -329,9 +328,9 @@ def test_a_claim_of_the_sentence_beside_counts_and_one_far_outside_is_a_problem(
     assert judged("We fly at two and a half times his speed. He walks on.", [ratio])[0].problems == ()
 
 
-@pytest.mark.parametrize("path", [GOLD_PROSE, SECOND_SET], ids=["gold", "second"])
-def test_the_gold_sets_hold_their_bounds(path):
-    score = measure(read_gold_prose(path), claims_problems)
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_gold_sets_hold_their_bounds(number):
+    score = measure((caption for caption in read_gold() if caption.set == number), claims_problems)
     assert score.flagged_share <= MOST_FLAGGED
     assert score.caught_share() >= LEAST_CAUGHT
     for place, least in LEAST_CAUGHT_IN.items():
@@ -426,14 +425,15 @@ def test_measure_counts_flags_and_catches():
     error = {"kind": "num", "field": "critical_components", "old": "18.0", "new": "20.0", "claim": 0, "claim_value": 20}
     line = GoldCaption(
         id="one",
-        lang="en",
+        set=1,
+        language="en",
         facts=dataclasses.asdict(FACTS),
         label="hover",
         critical_components="The walker is 18.0 m away.",
         reasoning_trace=FILLER,
         flight_decision="hover",
         claims=(DISTANCE,),
-        false=[error],
+        errors=[error],
     )
     found = measure([line], lambda coc, claims, *_: ["x"] if "20" in coc.critical_components else [])
     assert (found.num_true, found.flagged, found.planted.total(), found.caught.total()) == (1, [], 3, 2)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
-from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, judge_messages, parse_judgement, read_gold
+from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
 from cosfly.cli import app
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import read_captions
@@ -151,7 +151,7 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
 
 
 def test_the_gold_set_is_balanced_and_of_conflicts_only():
-    gold = read_gold()
+    gold = gold_conflicts()
     assert Counter(right for _, right in gold) == dict.fromkeys(JUDGEMENTS, 43)
     assert all(case.answer.flight_decision != case.label for case, _ in gold)
     assert len({case.sample_id for case, _ in gold}) == len(gold)
@@ -159,7 +159,7 @@ def test_the_gold_set_is_balanced_and_of_conflicts_only():
 
 def gold_answers():
     """A judge that knows the gold set by heart, from the user's message."""
-    return {judge_messages(case)[1]["content"]: right for case, right in read_gold()}
+    return {judge_messages(case)[1]["content"]: right for case, right in gold_conflicts()}
 
 
 def options(body):
@@ -174,7 +174,7 @@ def say(verdict):
 
 def checked(answer):
     with judging_server(answer) as server:
-        found = asyncio.run(check_judge(JudgeConfig(url=server.url), read_gold()))
+        found = asyncio.run(check_judge(JudgeConfig(url=server.url), gold_conflicts()))
         assert server.most_at_once > 4  # not one after the other
         return found
 
@@ -200,7 +200,7 @@ def test_a_judge_that_cannot_be_read_is_counted_and_agrees_with_nothing():
 
 def test_a_check_needs_a_judge():
     with pytest.raises(InputError, match="no judge to check"):
-        asyncio.run(check_judge(JudgeConfig(), read_gold()))
+        asyncio.run(check_judge(JudgeConfig(), gold_conflicts()))
 
 
 def test_the_command_prints_the_figures():

@@ -4,132 +4,69 @@ from __future__ import annotations
 
 import asyncio
 import json
-import random
 import re
 from functools import cache
 
+import pytest
+from measure_prose import answers_of, loses, misquotes, misreads, perfect_readings, turns
 from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, ReaderConfig
-from caption.teachers.reader import Reader, measure_reader, prompt_digest, read_reading
-from caption.truth.gold import GoldCaption, read_gold_prose
-from caption.truth.sizes import same_size
-from caption.truth.stated import read_stated
+from caption.teachers.reader import Reader, ReaderCheck, measure_reader, prompt_digest, read_reading
+from caption.truth.gold import GoldCaption, read_gold
 from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.contract import Reply
 from cosfly.cli import app
 from cosfly.products.captions import Claim, Coc, Usage, read_captions
-from cosfly.products.sentences import sentences_of
 from specimens import make_playback_tree
 
 
 @cache
 def gold() -> tuple[GoldCaption, ...]:
-    """Captions whose claims were written by their writers, who knew no rule of ours: every third."""
-    return tuple(caption for caption in read_gold_prose() if caption.claims)[::3]
-
-
-def quoted(claim: Claim, sentence: str, language: str) -> dict:
-    """Give a claim as a reader writes it: it quotes the clause that holds its number, else its sentence."""
-    quote = sentence
-    if isinstance(claim.value, float):
-        for clause in re.split(r"(?<=[,;，；])", sentence):
-            if any(same_size(numeral, claim) for numeral in read_stated(clause, language).numerals):
-                quote = clause
-                break
-    return claim.model_dump(exclude={"quote"}) | {"at": claim.at or "", "unit": claim.unit or "", "quote": quote}
-
-
-def written(coc: Coc, claims: tuple[Claim, ...], language: str) -> list[dict]:
-    sentences = dict(sentences_of(coc))
-    return [quoted(claim, sentences[claim.sentence], language) for claim in claims if claim.sentence in sentences]
-
-
-@cache
-def readings() -> dict[str, list[dict]]:
-    """Give what a perfect reader answers to each text, by its sentences: the claims of its writer, with the planted error."""
-    found = {}
-    for caption in gold():
-        texts = [(caption.coc, caption.claims)]
-        texts += [(e.in_text(caption.coc), e.in_claims(caption.claims) or caption.claims) for e in caption.errors]
-        for coc, claims in texts:
-            key = key_of(f"{name}: {text}" for name, text in sentences_of(coc))
-            found.setdefault(
-                key, written(coc, claims, caption.language)
-            )  # of a wrong decision the text is the true one
-    return found
-
-
-def key_of(lines) -> str:
-    return "\n".join(sorted(lines))
+    """Captions with claims by their writers, who knew no rule of ours: every fourth."""
+    return tuple(caption for caption in read_gold() if caption.claims)[::4]
 
 
 class FakeEngine:
-    """Answers from `readings`, with a fault that is a function of (claims, random) -> claims."""
+    """Answers as a reader with a fault does, without a server."""
 
     kind, where, model = "endpoint", "nowhere", "perfect"  # type: ignore
 
-    def __init__(self, fault=lambda claims, rng: claims, seed: int = 0) -> None:
-        self.fault, self.rng = fault, random.Random(seed)
+    def __init__(self, fault=None, *, alike: bool = False) -> None:
+        self.text = answers_of(perfect_readings(gold()), fault, alike=alike)
 
     async def answer(self, request) -> Reply:
-        sentences = request.messages[1]["content"]
-        claims = readings()[key_of(sentences.split("\n"))]
-        return Reply(json.dumps({"claims": self.fault(claims, self.rng)}), Usage(prompt_tokens=900), "plain", "stop")
+        return Reply(self.text({"messages": request.messages}), Usage(prompt_tokens=900), "plain", "stop")
 
 
-def measured(*engines):
-    reader = Reader([KeptAnswers(engine, None) for engine in engines], ReaderConfig(urls=("http://x",)), 0)
+@cache
+def measured(fault=None, *, alike: bool = False) -> ReaderCheck:
+    engine = FakeEngine(fault, alike=alike)
+    reader = Reader([KeptAnswers(engine, None)], ReaderConfig(urls=("http://x",)), 0)
     return asyncio.run(measure_reader(reader, gold()))
 
 
 def test_a_perfect_reader_flags_no_true_caption_and_catches_most_errors():
-    check = measured(FakeEngine())
+    check = measured()
     assert check.num_true >= 60
     assert check.num_flagged == 0
     assert check.num_caught >= 0.75 * check.num_false
 
 
-def lose(claims, rng):
-    return [claim for claim in claims if rng.random() > 0.2]
-
-
-def misread(claims, rng):
-    return [
-        claim | {"value": round(claim["value"] * 1.3 + 1, 2)}
-        if isinstance(claim["value"], float) and rng.random() < 0.1
-        else claim
-        for claim in claims
-    ]
-
-
-def misquote(claims, rng):
-    return [claim | {"quote": claim["quote"][::-1]} if rng.random() < 0.1 else claim for claim in claims]
-
-
-def turn(claims, rng):
-    other = {"left": "right", "right": "left", "increasing": "decreasing", "decreasing": "increasing"}
-    return [
-        claim | {"value": other.get(claim["value"], claim["value"])} if rng.random() < 0.05 else claim
-        for claim in claims
-    ]
-
-
-def test_readers_with_faults_lose_proofs_and_flag_next_to_nothing():
-    perfect = measured(FakeEngine())
-    for fault in (lose, misread, misquote, turn):
-        check = measured(FakeEngine(fault, 1), FakeEngine(fault, 2))
-        assert check.num_flagged <= 0.02 * check.num_true, fault
-        assert check.num_proved <= perfect.num_proved, fault
-        assert check.num_claims < perfect.num_claims, fault
-        assert check.num_caught > 0.4 * check.num_false, fault
+@pytest.mark.parametrize("fault", [loses, misreads, misquotes, turns])
+def test_readers_with_faults_lose_proofs_and_flag_next_to_nothing(fault):
+    perfect, check = measured(), measured(fault)
+    assert check.num_flagged <= 0.02 * check.num_true
+    assert check.num_proved <= perfect.num_proved
+    assert check.num_claims < perfect.num_claims
+    assert check.num_caught > 0.4 * check.num_false
 
 
 def test_two_readings_that_err_alike_are_believed():
     """What the agreement of two readings cannot find: one model with one fault twice. Hence reader-check."""
-    assert measured(FakeEngine(turn, 1), FakeEngine(turn, 1)).num_flagged > 3
+    assert measured(turns, alike=True).num_flagged > 3
 
 
 def test_a_claim_must_quote_words_that_hold_its_number():

@@ -14,7 +14,7 @@ from specimens_captions import write_answers
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
-from caption.truth.gold import read_gold_prose
+from caption.truth.gold import read_gold
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import check_prose, judge_prose
 from caption.windows import cut_windows
@@ -166,11 +166,7 @@ def test_plain_prose_is_unread_but_for_what_is_surely_wrong():
 @pytest.mark.slow
 def test_true_prose_of_others_is_seldom_flagged():
     """Of captions that nobody wrote who works on the rules; 1.2 % of 1,974 was the most they might be."""
-    flagged = Counter(
-        bool(check_prose(line.coc, line.facts, line.language))
-        for path in sorted(Path(__file__).parent.glob("prose_*.jsonl"))
-        for line in read_gold_prose(path)
-    )
+    flagged = Counter(bool(check_prose(line.coc, line.facts, line.language)) for line in read_gold())
     assert flagged[True] <= 0.01 * flagged.total()
 
 

@@ -28,7 +28,7 @@ from caption.truth.stated import read_stated
 from caption.writing.claims import CLAIM_SCHEMA, MAX_CLAIMS, read_claims
 from caption.writing.contract import Refused
 from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.budget import Budget
+from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.errors import InputError
@@ -338,7 +338,7 @@ def interval(count: int, total: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
-def reader_check_table(check: ReaderCheck) -> Table:
+def reader_check_table(check: ReaderCheck, prices: BudgetConfig = BudgetConfig()) -> Table:
     """Give the figures as a table for the terminal."""
     table = Table(title=f"Reader {', '.join(check.models)}", title_justify="left")
     for column in ("figure", "value", "meaning"):
@@ -369,4 +369,8 @@ def reader_check_table(check: ReaderCheck) -> Table:
         "unreadable", str(check.num_unreadable), f"answers that hold no claims, of {check.num_requests} requests"
     )
     table.add_row("tokens", f"{check.usage.total:,}", f"in {check.num_requests} requests")
+    if prices.price_prompt or prices.price_completion:
+        cost = prices.cost(check.usage.prompt_tokens, check.usage.completion_tokens)
+        a_caption = cost * READINGS / max(1, check.num_requests)
+        table.add_row("cost", f"{cost:,.4f}", f"{a_caption:.6f} a caption and language")
     return table

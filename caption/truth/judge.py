@@ -17,7 +17,7 @@ from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
 from caption.teachers.prompt_files import read_prompt
-from caption.truth.gold import GoldCaption, read_gold_prose
+from caption.truth.gold import GoldCaption, read_gold
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
@@ -129,17 +129,17 @@ async def open_judge(
 # --- how good a judge is ----------------------------------------------------------------------------------------------
 
 
-def read_gold() -> list[tuple[Case, Judgement]]:
-    """Give conflicts of the gold set with their right judgements, as many of each.
+def gold_conflicts() -> list[tuple[Case, Judgement]]:
+    """Give conflicts of the first gold set with their right judgements, as many of each.
 
     A true caption for another decision than the label is an acceptable alternative; with one thing in it made false it must be
     written anew; a true caption for the label of which only the decision was changed has the wrong label field.
     """
     found: dict[Judgement, list[Case]] = {judgement: [] for judgement in JUDGEMENTS}
-    for caption in read_gold_prose():
+    for caption in read_gold():
         coc, label = caption.coc, caption.label
         changed = [error.in_text(coc) for error in caption.errors]
-        if label is None:
+        if label is None or caption.set != 1:
             continue
         if coc.flight_decision != label:
             false = next(text for text in changed if text.flight_decision == coc.flight_decision)

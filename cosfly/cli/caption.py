@@ -205,12 +205,12 @@ def caption_judge_check(
     import asyncio
 
     from caption.own_files import own_files
-    from caption.truth.judge import check_judge, judge_check_table, read_gold
+    from caption.truth.judge import check_judge, gold_conflicts, judge_check_table
     from cosfly.work.console import console
 
     cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
     with own_files(cfg.caption):
-        console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, read_gold(), cfg.seed))))
+        console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, gold_conflicts(), cfg.seed))))
 
 
 @app.command("reader-check")
@@ -226,14 +226,15 @@ def caption_reader_check(
 
     from caption.own_files import own_files
     from caption.teachers.reader import check_reader, reader_check_table
-    from caption.truth.gold import read_gold_prose
+    from caption.truth.gold import read_gold
     from cosfly.work.console import console
 
     given = {"caption.reader.urls": urls, "caption.reader.models": None if model is None else [model]}
-    cfg, gold = options.resolve(config, overrides, given), list(read_gold_prose())
+    cfg, gold = options.resolve(config, overrides, given), list(read_gold())
     gold = gold if limit is None else gold[:: -(-len(gold) // limit)]
     with own_files(cfg.caption):
-        console.print(reader_check_table(asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))))
+        check = asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))
+        console.print(reader_check_table(check, cfg.caption.budget))
 
 
 @app.command("compare-strategies")
