@@ -1,7 +1,8 @@
-"""The columns of the released parquet files: schema, one row per frame, and what a reader needs to decode them.
+"""The columns of the released parquet files: one table that says all there is to say of a column.
 
-The HuggingFace key in the schema's metadata makes `datasets.load_dataset` decode `image` and `instance` as pictures. No
-list stands in a row except the caption's window, picture size and states of sentences, so that every reader of parquet shows plain columns.
+A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and where people see it. Schema,
+rows, card, Croissant, viewer and `release verify` follow. No list stands in a row except the caption's window, picture size and states of
+sentences, so that every reader of parquet shows plain columns.
 """
 
 from __future__ import annotations
@@ -9,18 +10,36 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 
+from cosfly.escaping import published_name
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.captions import FIELDS, Language, SentenceState
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, Look
+from cosfly.products.captions import (
+    FIELDS,
+    Caption,
+    LabelFrom,
+    Language,
+    SentenceState,
+    TeacherKind,
+    Verdict,
+    Writing,
+)
+from cosfly.products.frames import (
+    INVALID_DEPTH_M,
+    LEAST_FOV_DEG,
+    MOST_FOV_DEG,
+    SKY_DEPTH_M,
+    FrameFile,
+    Look,
+)
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
-from cosfly.products.weather import WeatherParams
+from cosfly.products.weather import WeatherMode, WeatherParams
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
@@ -29,28 +48,15 @@ LOOK = tuple(Look.model_fields)
 WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 LANGUAGES: tuple[Language, ...] = get_args(Language)
-CAPTION_FIELDS = tuple(f"caption_{language}_{field}" for language in LANGUAGES for field in FIELDS)
-CAPTION_FACTS = (
-    "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing",
-)  # fmt: skip
+LANGUAGE_NAMES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
+STATES: tuple[SentenceState, ...] = get_args(SentenceState)
+CAPTION_FIELDS = tuple(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS)
 CAPTION_SHARES = (
     "proved_en",
     "proved_zh",
 )  # of the sentences, those that the geometry proves; null where none was judged
-
-STATES: tuple[SentenceState, ...] = get_args(SentenceState)
-# How many sentences the geometry proves, contradicts, leaves unread: `proved_sentences_en`; null where none was judged.
-CAPTION_COUNTS = tuple(f"{state}_sentences_{language}" for language in LANGUAGES for state in STATES)
-CAPTION_STATES = tuple(f"sentence_states_{language}" for language in LANGUAGES)  # of each sentence, in order
-CAPTION_PROMPTS = tuple(f"{part}_{language}" for language in LANGUAGES for part in ("system", "prompt"))
-
 WINDOW, PICTURE_PX = "caption_window", "caption_picture_px"
-CAPTION_LISTS = (WINDOW, PICTURE_PX)
-# What a row holds of an accepted caption, and nulls where there is none.
-CAPTION_COLUMNS = (
-    *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_COUNTS, *CAPTION_STATES, *CAPTION_FIELDS, *CAPTION_PROMPTS, *CAPTION_LISTS
-)  # fmt: skip
-ReleasedCaption = dict[str, Any]  # CAPTION_COLUMNS -> value
+ReleasedCaption = dict[str, Any]  # name of a column of CAPTION -> value
 PLACE = ("run", "town", "trajectory", "variant")  # what a flight is told from others by
 Place = tuple[str, str, str, str]
 SplitName = Literal["train", "validation", "test"]
@@ -114,22 +120,38 @@ class Placed:
     look: np.ndarray | None = None
 
 
-Value = Callable[[Flight, int, ReleasedCaption | None], Any]
-
-
 @dataclass(frozen=True)
 class Column:
-    """One column: its type (of TYPES, or the members of a struct) and its value at frame i of a flight; NaN becomes null.
+    """One column.
 
-    value: None for a picture, whose bytes the writer has, and for what Placed says.
+    type: of TYPES, or the members of a struct of numbers.
+    of_frame: its value at frame i of a flight; of_caption: its value of the frame's caption, null where there is none. NaN becomes null. Neither: a
+        picture, whose bytes the writer has, or what Placed says.
+    words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by member ("" where it has none).
+    required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a flight.
+    title: what people call it; annotation: it counts as one, under that title, in the statistics. counted: the card counts the captions by its
+        values. shown: the viewer shows it beside the frame or caption.
     """
 
     name: str
     type: str | tuple[str, ...]
-    value: Value | None = None
+    of_frame: Callable[[Flight, int], Any] | None = None
+    of_caption: Callable[[Caption], Any] | None = None
+    words: tuple[str, ...] | Literal["actions"] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    required: bool = False
+    constant: bool = False
+    title: str = ""
+    annotation: bool = False
+    counted: bool = False
+    shown: bool = False
 
     def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> Any:
-        value = getattr(placed, self.name) if self.value is None else self.value(flight, i, caption)
+        value: Any
+        if self.of_caption is not None:
+            value = None if caption is None else caption[self.name]
+        else:
+            value = getattr(placed, self.name) if self.of_frame is None else self.of_frame(flight, i)
         if isinstance(self.type, tuple):  # of few numbers Python's own are faster than an array
             numbers = [] if value is None else value.tolist()
             is_null = not numbers or any(map(math.isnan, numbers))
@@ -145,8 +167,36 @@ def _knobs(flight: Flight) -> np.ndarray | None:
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
 
 
-def _said(name: str, kind: str = "string") -> Column:
-    return Column(name, kind, lambda _, __, caption: caption and caption[name])
+def _repair(caption: Caption) -> str | None:
+    return caption.repair.strategy if caption.repair else None
+
+
+def _decision(caption: Caption) -> str | None:
+    coc = caption.en or caption.zh
+    return None if coc is None else coc.flight_decision
+
+
+def _share(language: Language, caption: Caption) -> float | None:
+    return caption.coverage(language)
+
+
+def _states(language: Language, caption: Caption) -> list[SentenceState] | None:
+    return (caption.checks.sentences or {}).get(language)
+
+
+def _sentences(language: Language, state: SentenceState, caption: Caption) -> int | None:
+    states = _states(language, caption)
+    return None if states is None else states.count(state)
+
+
+def _text(language: Language, name: str, caption: Caption) -> str | None:
+    coc = caption.en if language == "en" else caption.zh
+    return None if coc is None else getattr(coc, name)
+
+
+def _prompt(language: Language, part: str, caption: Caption) -> str | None:
+    prompt = caption.prompt.get(language)
+    return None if prompt is None else getattr(prompt, part)
 
 
 PICTURES: dict[FrameFile, Column] = {
@@ -156,57 +206,143 @@ PICTURES: dict[FrameFile, Column] = {
 }
 
 
-SCALARS = (  # everything but pictures and depth
-    Column("sample_id", "string", lambda f, i, _: sample_id(f.flight_id, i)),
-    Column("run", "string", lambda f, i, _: f.run),
-    Column("town", "string", lambda f, i, _: f.town),
-    Column("trajectory", "string", lambda f, i, _: f.trajectory),
-    Column("variant", "string", lambda f, i, _: f.variant),
-    Column("track", "string", lambda f, i, _: "clean" if f.is_original else "perturbed"),
-    Column("style", "string", lambda f, i, _: f.styles[i]),
-    Column("pace", "string", lambda f, i, _: f.pace),
-    Column("walk", "string"),
-    Column("split", "string"),
-    Column("pair", "string"),
-    Column("weather", "string", lambda f, i, _: f.weather["weather"]),
-    Column("time_of_day", "string", lambda f, i, _: f.weather["time_of_day"]),
-    Column("weather_mode", "string", lambda f, i, _: f.weather_record and f.weather_record.mode),
-    Column("weather_params", WEATHER_PARAMS, lambda f, i, _: _knobs(f)),
-    Column("look", LOOK),
-    Column("frame_index", "int32", lambda f, i, _: i),
-    Column("time_s", "float64", lambda f, i, _: f.time_s[i]),
-    Column("width_px", "int32", lambda f, i, _: f.camera.width_px),
-    Column("height_px", "int32", lambda f, i, _: f.camera.height_px),
-    Column("fov_deg", "float64", lambda f, i, _: round(f.camera_at(i).fov_deg, 6)),
-    Column("intrinsics", INTRINSICS, lambda f, i, _: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]]),
-    Column("pose", POSE, lambda f, i, _: np.concatenate([f.positions_m[i], f.rotations_deg[i]])),
-    Column("target", POINT, lambda f, i, _: f.targets_m[i]),
-    Column("target_heading_deg", "float64", lambda f, i, _: f.target_headings_deg[i]),
-    Column("target_uv", ("u_px", "v_px"), lambda f, i, _: f.target_uv[i]),
-    Column("target_bbox", BOX, lambda f, i, _: f.target_bbox[i]),
+NONE_TO_ONE = {"": (0.0, 1.0)}
+PIXELS = {"": (1, 100_000)}
+FRAME = (  # everything of a frame but pictures and depth
+    Column("sample_id", "string", lambda f, i: sample_id(f.flight_id, i), required=True),
+    Column("run", "string", lambda f, i: f.run, required=True, constant=True),
+    Column("town", "string", lambda f, i: f.town, required=True, constant=True),
+    Column("trajectory", "string", lambda f, i: f.trajectory, required=True, constant=True),
+    Column("variant", "string", lambda f, i: f.variant, required=True, constant=True),
     Column(
-        "target_mask_bbox",
-        BOX,
-        lambda f, i, _: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
+        "track", "string", lambda f, i: "clean" if f.is_original else "perturbed",
+        words=("clean", "perturbed"), required=True, constant=True,
     ),
-    Column("target_depth_m", "float64", lambda f, i, _: f.target_depth_m[i]),
-    Column("target_in_view", "bool", lambda f, i, _: f.target_in_view[i]),
-    Column("target_visible", "bool", lambda f, i, _: f.target_visible[i]),
-    Column("visibility", "float64", lambda f, i, _: f.visibility[i]),
-    Column("is_perturbed", "bool", lambda f, i, _: f.is_perturbed[i]),
-    Column("perturbation", "events", lambda f, i, _: f.events(i)),
-    Column("drone_offset", POSE, lambda f, i, _: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]])),
-    Column("target_offset", POINT, lambda f, i, _: f.target_offsets_m[i]),
-    Column("has_caption", "bool", lambda f, i, caption: caption is not None),
-    *map(_said, CAPTION_FACTS),
-    *(_said(name, "float64") for name in CAPTION_SHARES),
-    *(_said(name, "int32") for name in CAPTION_COUNTS),
-    *(_said(name, "texts") for name in CAPTION_STATES),
-    *map(_said, CAPTION_FIELDS),
-    *map(_said, CAPTION_PROMPTS),
-    *(_said(name, "indices") for name in CAPTION_LISTS),
-)
+    Column("style", "string", lambda f, i: f.styles[i], required=True, title="style", shown=True),
+    Column("pace", "string", lambda f, i: f.pace, required=True, constant=True, title="pace", shown=True),
+    Column("walk", "string", constant=True),
+    Column("split", "string", constant=True),
+    Column("pair", "string", constant=True),
+    Column("weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather", annotation=True, shown=True),
+    Column("time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day", annotation=True, shown=True),
+    Column("weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode), constant=True),
+    Column(
+        "weather_params", WEATHER_PARAMS, lambda f, i: _knobs(f), constant=True,
+        ranges={
+            **dict.fromkeys(("cloudiness", "precipitation", "fog_density"), (0.0, 100.0)), "fog_distance": (1e-9, 1e6),
+            "sun_altitude_angle": (-90.0, 90.0), "sun_azimuth_angle": (0.0, 360.0),
+        },
+    ),
+    Column(
+        "look", LOOK, constant=True, title="sun and air", annotation=True,
+        ranges={
+            "sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6), "exposure": (0.0, 100.0),
+        },
+    ),
+    Column("frame_index", "int32", lambda f, i: i, required=True),
+    Column("time_s", "float64", lambda f, i: f.time_s[i], ranges={"": (0.0, 1e7)}, required=True),
+    Column("width_px", "int32", lambda f, i: f.camera.width_px, ranges=PIXELS, required=True, constant=True),
+    Column("height_px", "int32", lambda f, i: f.camera.height_px, ranges=PIXELS, required=True, constant=True),
+    Column(
+        "fov_deg", "float64", lambda f, i: round(f.camera_at(i).fov_deg, 6),
+        ranges={"": (LEAST_FOV_DEG, MOST_FOV_DEG)}, required=True, constant=True,  # but of a camera that zooms
+    ),
+    Column("intrinsics", INTRINSICS, lambda f, i: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]], required=True, constant=True),
+    Column(
+        "pose", POSE, lambda f, i: np.concatenate([f.positions_m[i], f.rotations_deg[i]]),
+        ranges={"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
+        required=True, title="drone pose (position, rotation)", annotation=True,
+    ),
+    Column("target", POINT, lambda f, i: f.targets_m[i], title="target position", annotation=True),
+    Column("target_heading_deg", "float64", lambda f, i: f.target_headings_deg[i], ranges={"": (-360.0, 360.0)}),
+    Column("target_uv", ("u_px", "v_px"), lambda f, i: f.target_uv[i]),
+    Column("target_bbox", BOX, lambda f, i: f.target_bbox[i], title="projected box of the target", annotation=True),
+    Column(
+        "target_mask_bbox", BOX, lambda f, i: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
+        title="box of the target's pixels", annotation=True,
+    ),
+    Column("target_depth_m", "float64", lambda f, i: f.target_depth_m[i]),
+    Column("target_in_view", "bool", lambda f, i: f.target_in_view[i], required=True),
+    Column("target_visible", "bool", lambda f, i: f.target_visible[i], required=True),
+    Column(
+        "visibility", "float64", lambda f, i: f.visibility[i], ranges=NONE_TO_ONE,
+        title="rendered visibility of the target", annotation=True,
+    ),
+    Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
+    Column("perturbation", "events", lambda f, i: f.events(i), title="what became of the perturbation", annotation=True),
+    Column(
+        "drone_offset", POSE, lambda f, i: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]]),
+        title="offsets of the perturbation", annotation=True,
+    ),
+    Column("target_offset", POINT, lambda f, i: f.target_offsets_m[i]),
+    Column("has_caption", "bool", of_caption=lambda c: True, required=True),
+)  # fmt: skip
+CAPTION = (  # what a row holds of an accepted caption, and nulls where there is none
+    Column("decision", "string", of_caption=_decision, words="actions", required=True, title="decision", counted=True, shown=True),
+    Column("label", "string", of_caption=lambda c: c.label, words="actions", title="label", counted=True, shown=True),
+    Column(
+        "label_from", "string", of_caption=lambda c: c.label_from, words=get_args(LabelFrom), required=True,
+        title="label from", counted=True, shown=True,
+    ),
+    Column(
+        "verdict", "string", of_caption=lambda c: c.verdict, words=get_args(Verdict), required=True,
+        title="verdict against the geometry", counted=True,
+    ),
+    Column("repair_strategy", "string", of_caption=_repair, title="repair", counted=True, shown=True),
+    Column(
+        "teacher_kind", "string", of_caption=lambda c: c.teacher.kind, words=get_args(TeacherKind), required=True,
+        title="kind of teacher", counted=True, shown=True,
+    ),
+    Column(
+        "teacher_model", "string", of_caption=lambda c: published_name(c.teacher.model), required=True,
+        title="teacher model", counted=True, shown=True,
+    ),
+    Column(
+        "writing", "string", of_caption=lambda c: c.writing, words=get_args(Writing), required=True,
+        title="written as", counted=True, shown=True,
+    ),
+    *(
+        Column(name, "float64", of_caption=partial(_share, language), ranges=NONE_TO_ONE)
+        for language, name in zip(LANGUAGES, CAPTION_SHARES, strict=True)
+    ),
+    *(  # of its sentences, those that the geometry proves, contradicts, leaves unread; null where none was judged
+        Column(
+            f"{state}_sentences_{language}", "int32",
+            of_caption=partial(_sentences, language, state),
+        )
+        for language in LANGUAGES for state in STATES
+    ),
+    *(
+        Column(f"sentence_states_{language}", "texts", of_caption=partial(_states, language))
+        for language in LANGUAGES
+    ),
+    *(
+        Column(
+            f"caption_{language}_{name}", "string", required=True, words="actions" if name == "flight_decision" else (),
+            of_caption=partial(_text, language, name),
+            title=f"caption in {LANGUAGE_NAMES[language]}", annotation=name == "reasoning_trace",
+        )
+        for language in LANGUAGES for name in FIELDS
+    ),
+    *(
+        Column(f"{name}_{language}", "string", of_caption=partial(_prompt, language, part))
+        for language in LANGUAGES for name, part in (("system", "system"), ("prompt", "user"))
+    ),
+    Column(WINDOW, "indices", of_caption=lambda c: c.window, required=True, title="window", shown=True),
+    Column(PICTURE_PX, "indices", of_caption=lambda c: list(c.picture_px), required=True),
+)  # fmt: skip
+SCALARS = (*FRAME, *CAPTION)
 SCALAR_NAMES = [column.name for column in SCALARS]
+CAPTION_NAMES = [column.name for column in CAPTION]
+COUNTED = [column.name for column in CAPTION if column.counted]
+# All but the prompts, which are long, and the same for many captions.
+SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_"))]
+REQUIRED = frozenset(column.name for column in FRAME if column.required)
+
+
+def caption_values(caption: Caption) -> ReleasedCaption:
+    """Give what a row holds of a caption."""
+    return {column.name: column.of_caption(caption) for column in SCALARS if column.of_caption is not None}
 
 
 def matrices_of(intrinsics: np.ndarray) -> np.ndarray:

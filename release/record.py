@@ -1,13 +1,12 @@
-"""`release.json`: what a release says about itself, and what of foreign texts it may publish. Written by package, checked by verify, rendered by card."""
+"""`release.json`: what a release says about itself. Written by package, checked by verify, rendered by card."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet, shipped_actions
@@ -17,7 +16,7 @@ from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.reading.documents import read_model
 from cosfly.work.store import sha256_bytes, write_model
-from release.columns import SplitName
+from release.columns import COUNTED, SplitName
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"
 RECORD = "release.json"
@@ -172,24 +171,24 @@ class Spread(Strict):
 
 
 class CaptionNumbers(Strict):
-    """Frames by what their captions say; mean_proved: of their sentences the share that the geometry proves, where any was judged;
+    """frames_by: column -> frames by what their captions say there; mean_proved: of their sentences the share that the geometry proves, where any was judged;
     `example` is the first one's sample_id and texts, empty without any."""
 
     frames_with: int
     frames_without: int
     with_label: int
     decision_equals_label: int
-    decision: Counts
-    label: Counts
-    label_from: Counts
-    verdict: Counts
-    repair_strategy: Counts
-    teacher_kind: Counts
-    teacher_model: Counts
-    writing: Counts
+    frames_by: dict[str, Counts]
     mean_proved: dict[str, float | None]
     mean_characters: dict[str, float | None]
     example: dict[str, str]
+
+    @field_validator("frames_by")
+    @classmethod
+    def _each_column(cls, value: dict[str, Counts]) -> dict[str, Counts]:
+        if set(value) != set(COUNTED):
+            raise ValueError(f"it counts by {', '.join(COUNTED)}")
+        return value
 
 
 class FileNumbers(Strict):
@@ -345,32 +344,3 @@ def read_record(path: Path) -> ReleaseRecord:
     return read_model(
         path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record", tree=path.parent
     )
-
-
-ADDRESS = re.compile(r"[A-Za-z][\w+.-]*://[^\s,;'\"]*")
-# From the root, a home or a drive; behind letters (`and/or`) it is no path.
-ABSOLUTE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[\\/][^\s,;'\"]*")
-IS_ABSOLUTE = re.compile(r"~|[\\/]|[A-Za-z]:[\\/]")
-# One slash: a name on the hub.
-RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+")
-
-
-def published_name(text: str) -> str:
-    """Give a text with the last name in the place of each path, and `an address` in that of each URL."""
-    if IS_ABSOLUTE.match(text) or RELATIVE.fullmatch(text):
-        return _last_name(text)
-    text = ADDRESS.sub("an address", text)
-    return ABSOLUTE.sub(lambda match: _last_name(match.group()), text)
-
-
-def published(value: Any) -> Any:
-    """Give settings with published names."""
-    if isinstance(value, str):
-        return published_name(value)
-    if isinstance(value, dict):
-        return {published_name(str(key)): published(member) for key, member in value.items()}
-    return [published(member) for member in value] if isinstance(value, list | tuple) else value
-
-
-def _last_name(path: str) -> str:
-    return next((part for part in reversed(re.split(r"[\\/]", path)) if part.strip("~.")), "a path")

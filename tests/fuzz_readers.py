@@ -115,7 +115,7 @@ from release.record import read_record
 from release.stats import stats
 from release.verify.verify import verify
 from release.viewer import page as viewer
-from release.viewer.schema import ViewerConfig
+from release.viewer.content import ViewerConfig
 from specimens import make_playback_tree
 
 ANSWER = {

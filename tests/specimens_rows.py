@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, POINT, POSE, SCALAR_NAMES
+from release.columns import CAPTION_FIELDS, COUNTED, POINT, POSE, SCALAR_NAMES
 
 WORDS = {
     "decision": "hover",
@@ -25,5 +25,5 @@ def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **c
         "visibility": 0.75, "is_perturbed": variant != "ORI", "target_in_view": True, "target_visible": True, "has_caption": i % 2 == 0,
     }  # fmt: skip
     if row["has_caption"]:
-        row |= dict.fromkeys((*CAPTION_FACTS, *CAPTION_FIELDS), "word") | WORDS | {"proved_en": 0.5}
+        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"proved_en": 0.5}
     return row | change

@@ -287,7 +287,7 @@ def test_the_release_says_so_and_verify_goes_by_that(whole, tmp_path):
     dataset = whole / "release/dataset"
     record = read_record(dataset / "release.json")
     assert record.closed_set[-1] == OWN
-    assert record.numbers.captions.decision[OWN] > 0
+    assert record.numbers.captions.frames_by["decision"][OWN] > 0
     report = verify(dataset, level="pixels", reader=read_released)
     assert report.is_ok, str(report)
     assert OWN in (dataset / "README.md").read_text(encoding="utf-8")

@@ -26,8 +26,9 @@ from distill.inference import stage as infer
 from distill.inference.outcome import Answered, make_prediction, prediction_of
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
+from release.columns import caption_values
 from release.package import stage as package
-from release.package.captions import index_captions, released
+from release.package.captions import index_captions
 from release.package.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
@@ -232,7 +233,7 @@ def test_a_students_answers_are_judged_marked_and_released(tree, rules, tmp_path
         tmp_path / "out/captions.jsonl", {flight: 100}, set(), lambda *told: problems.append(told)
     )
     assert problems == []
-    rows = [released(caption) for caption in by_flight[flight].read()]
+    rows = [caption_values(caption) for caption in by_flight[flight].read()]
     assert {row["teacher_kind"] for row in rows} == {"student"}
     assert (len(rows), account.accepted, account.dropped) == (6, 6, {"not_in_file": 5})
 
@@ -312,5 +313,5 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
     folder = package.run(package.ReleaseConfig(licence="mit"), [source], tmp_path / "release")
     assert verify(folder).is_ok
     captions = read_record(folder / "release.json").numbers.captions
-    assert captions.teacher_kind == {"student": len(rules)}
-    assert captions.teacher_model == {MODEL: len(rules)}
+    assert captions.frames_by["teacher_kind"] == {"student": len(rules)}
+    assert captions.frames_by["teacher_model"] == {MODEL: len(rules)}

@@ -27,6 +27,7 @@ from test_release_package import FREE, all_bytes, make_caption, make_inspection,
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, VerifyError
+from cosfly.escaping import published, published_name
 from cosfly.products import review
 from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.flights import find_flights
@@ -39,7 +40,7 @@ from release.depth import encoded
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run
-from release.record import ReleaseRecord, published, published_name, read_record
+from release.record import ReleaseRecord, read_record
 from specimens import make_playback_tree
 
 POINTS = 14

@@ -199,12 +199,12 @@ def test_the_card_says_whom_it_is_not_for_and_whom_to_cite(record):
 
 def test_limits_are_those_of_the_numbers(record):
     card = render_card(record)
-    missing = [name for name in action_tokens() if name not in record.numbers.captions.decision]
+    missing = [name for name in action_tokens() if name not in record.numbers.captions.frames_by["decision"]]
     line = next(line for line in card.splitlines() if line.startswith("- Decisions that no caption has"))
     assert all(f"`{name}`" in line for name in missing)
     assert "rule teacher" in card
     none = record.numbers.captions.model_copy(
-        update={"frames_with": 0, "decision": {}, "teacher_kind": {}, "repair_strategy": {}, "label_from": {}}
+        update={"frames_with": 0, "frames_by": {name: {} for name in record.numbers.captions.frames_by}}
     )
     bare = card_of(record, numbers=record.numbers.model_copy(update={"captions": none}))
     assert "There are no captions" in bare

@@ -546,8 +546,8 @@ def test_a_unit_that_failed_is_done_again_alone(broken, dataset, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda rows: rows[3].update(pose=None), "1 sizes, 1 of"),
-        (lambda rows: rows[3].update(width_px=97), "2 sizes, 0 of"),
+        (lambda rows: rows[3].update(pose=None), "pose: a row without a value"),
+        (lambda rows: rows[3].update(width_px=97), "pictures of one size; got 2 sizes"),
     ],
 )
 def test_a_flight_of_two_sizes_or_without_a_pose_is_no_tree(broken, tmp_path, change, words):
@@ -555,7 +555,7 @@ def test_a_flight_of_two_sizes_or_without_a_pose_is_no_tree(broken, tmp_path, ch
     with pytest.raises(InputError, match="could not be exported"):
         export(config("tree"), broken, tmp_path / "out")
     told = (tmp_path / "out/failures.jsonl").read_text()
-    assert f"pictures of one size, and every frame a pose and intrinsics; got {words}" in told
+    assert words in told
 
 
 def test_a_shard_of_another_version_is_refused(broken, tmp_path):

@@ -264,9 +264,9 @@ def test_numbers_against_a_slow_oracle(loaded, built):
     assert numbers["trajectories"] == len({(r["town"], r["trajectory"]) for r in rows})
     assert numbers["captions"]["frames_with"] == len(with_caption)
     assert numbers["captions"]["frames_without"] == len(rows) - len(with_caption)
-    for decision, count in numbers["captions"]["decision"].items():
+    for decision, count in numbers["captions"]["frames_by"]["decision"].items():
         assert count == sum(row["decision"] == decision for row in with_caption)
-    assert sum(numbers["captions"]["decision"].values()) == len(with_caption)
+    assert sum(numbers["captions"]["frames_by"]["decision"].values()) == len(with_caption)
     heights = np.array([row["pose"]["z_m"] - row["target"]["z_m"] for row in rows])
     assert numbers["height_over_target_m"]["mean"] == pytest.approx(heights.mean(), abs=1e-4)
     assert numbers["height_over_target_m"]["std"] == pytest.approx(heights.std(), abs=1e-4)

@@ -230,8 +230,12 @@ def test_a_release_is_counted_again(dataset, tmp_path):
     assert tables["release"]["frames"] == [numbers["frames"]]
     assert tables["release"]["trajectories"] == [numbers["trajectories"]]
     assert tables["release"]["captions"] == [numbers["captions"]["frames_with"]]
-    assert {name: row[0] for name, row in tables["decisions"].items() if row[0]} == numbers["captions"]["decision"]
-    assert {name: row[0] for name, row in tables["verdicts"].items() if row[0]} == numbers["captions"]["verdict"]
+    assert {name: row[0] for name, row in tables["decisions"].items() if row[0]} == numbers["captions"]["frames_by"][
+        "decision"
+    ]
+    assert {name: row[0] for name, row in tables["verdicts"].items() if row[0]} == numbers["captions"]["frames_by"][
+        "verdict"
+    ]
     assert {name: row[0] for name, row in tables["splits"].items()} == {
         name: own.frames for name, own in record.splits.splits.items()
     }

@@ -32,10 +32,18 @@ from cosfly.reading.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record
 from release.stats import stats
-from release.viewer.choosing import PATH_POINTS, boxes_of, choose_flights, choose_frames, path_of, spread
+from release.viewer.content import (
+    PATH_POINTS,
+    Shown,
+    ViewerConfig,
+    boxes_of,
+    choose_flights,
+    choose_frames,
+    path_of,
+    spread,
+)
 from release.viewer.of_release import VIEW_OF, picture
 from release.viewer.page import page_html, run
-from release.viewer.schema import Shown, ViewerConfig
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -397,7 +405,7 @@ def test_filters_and_the_address_agree(tab, page):
     tab.run("document.querySelector('#filters button').click()")
     assert tab.run(COUNT) == "48 of 48 frames"
     tab.open(page, "#repair=yes")
-    assert "repaired: anchored, first hover" in tab.run("document.querySelector('.tags').textContent")
+    assert "repair: anchored, first hover" in tab.run("document.querySelector('.tags').textContent")
 
 
 @pytest.mark.slow

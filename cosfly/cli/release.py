@@ -215,7 +215,7 @@ def release_viewer(
     """Make one page that works offline: flights, frames (colour, depth, mask), tracks from above, captions with verdict and evidence, filters."""
     from cosfly.work.config import build
     from release.viewer import page
-    from release.viewer.schema import ViewerConfig
+    from release.viewer.content import ViewerConfig
 
     options.resolve(config, overrides)
     chosen = {"flights": flights, "frames": frames, "picture_px": picture_px, "max_mb": max_mb}

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from cosfly.errors import InputError
 from cosfly.products.coverage import AXES, Coverage, axis_values
 from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups
-from release.columns import CAPTION_FACTS, CAPTION_FIELDS, CAPTION_SHARES, PICTURES, PLACE, POINT, schema
+from release.columns import CAPTION_FIELDS, CAPTION_SHARES, COUNTED, PICTURES, PLACE, POINT, REQUIRED, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
@@ -31,11 +31,8 @@ FLAGS = ("is_perturbed", "target_in_view", "target_visible", "has_caption")
 COVERED = ("style", "pace", "label")
 COLUMNS = [
     "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "drone_offset", "target",
-    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *CAPTION_FACTS, *CAPTION_SHARES, *CAPTION_FIELDS,
+    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *CAPTION_SHARES, *CAPTION_FIELDS,
 ]  # fmt: skip
-NEVER_NULL = frozenset(
-    {"sample_id", *PLACE, "track", "time_s", "width_px", "height_px", "fov_deg", "pose", "has_caption"}
-)
 SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
 
@@ -68,13 +65,13 @@ def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]
     """Yield the rows of a shard, a row group at a time, in which every value that must be there is there.
 
     Raises:
-        InputError: it cannot be read, has other columns than a release, or a column of NEVER_NULL, or a part of a pose, place or box, is null.
+        InputError: it cannot be read, has other columns than a release, or a required column, or a part of a pose, place or box, is null.
     """
     for group in row_groups(shard, columns, tree=shard.parents[1]):
         check_columns(group, columns, shard)
         for member in group.schema:
             column = group.column(member.name)
-            wanted = 0 if member.name in NEVER_NULL else column.null_count
+            wanted = 0 if member.name in REQUIRED else column.null_count
             is_struct = pa.types.is_struct(member.type)
             parts = [pc.struct_field(column, i) for i in range(member.type.num_fields)] if is_struct else []
             is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
@@ -203,7 +200,7 @@ class Counted:
 
     rows: int = 0
     counts: dict[str, Counter[str]] = field(
-        default_factory=lambda: {name: Counter() for name in (*FramesBy.model_fields, *CAPTION_FACTS)}
+        default_factory=lambda: {name: Counter() for name in (*FramesBy.model_fields, *COUNTED)}
     )
     totals: Counter[str] = field(default_factory=Counter)
     characters: Counter[str] = field(default_factory=Counter)
@@ -281,7 +278,7 @@ class Counted:
             self.flights[key] = later
 
     def _add_caption(self, row: dict[str, Any]) -> None:
-        for name in CAPTION_FACTS:
+        for name in COUNTED:
             self.counts[name]["none" if row[name] is None else row[name]] += 1
         self.totals["with_label"] += row["label"] is not None
         self.totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
@@ -324,13 +321,12 @@ class Counted:
 
     def _captions(self) -> CaptionNumbers:
         num_captions, characters = self.totals["has_caption"], self.characters
-        facts: dict[str, Any] = {name: _sorted(self.counts[name]) for name in CAPTION_FACTS}
         return CaptionNumbers(
             frames_with=num_captions,
             frames_without=self.rows - num_captions,
             with_label=self.totals["with_label"],
             decision_equals_label=self.totals["decision_equals_label"],
-            **facts,
+            frames_by={name: _sorted(self.counts[name]) for name in COUNTED},
             mean_proved={name: self.sums[name].spread().mean for name in CAPTION_SHARES},
             mean_characters={
                 name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS

@@ -20,7 +20,7 @@ from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED, Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
-from release.columns import PICTURES, SPLIT_NAMES, schema
+from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
 from release.record import (
     CaptionNumbers,
     DepthCodingName,
@@ -137,25 +137,25 @@ def limits(record: ReleaseRecord) -> str:
             "The renderer draws boxes as a town, plainly lit: no sensor noise, motion blur, lens distortion or rolling shutter. A model trained on it needs checking on real images."
         )
         lines.append("People walk planned ways; real ones do what no plan has.")
-    missing = [name for name in record.closed_set if name not in captions.decision]
+    missing = [name for name in record.closed_set if name not in captions.frames_by["decision"]]
     if captions.frames_with and missing:
         lines.append(f"Decisions that no caption has: {', '.join(markdown_code(name) for name in missing)}.")
     if captions.frames_with:
-        top, count = max(captions.decision.items(), key=lambda pair: pair[1])
+        top, count = max(captions.frames_by["decision"].items(), key=lambda pair: pair[1])
         lines.append(
             f"The most frequent decision, {markdown_code(top)}, has {count / captions.frames_with:.1%} of the captions: always saying it scores as much."
         )
-    if "rules" in captions.teacher_kind:
-        share = captions.teacher_kind["rules"] / captions.frames_with
+    if "rules" in captions.frames_by["teacher_kind"]:
+        share = captions.frames_by["teacher_kind"]["rules"] / captions.frames_with
         lines.append(
             f"{share:.1%} of the captions are by the rule teacher: sentences of fixed forms, filled with measurements, by a program that sees no picture."
         )
-    repaired = sum(count for name, count in captions.repair_strategy.items() if name != "none")
+    repaired = sum(count for name, count in captions.frames_by["repair_strategy"].items() if name != "none")
     if repaired:
         lines.append(
             f"{repaired:,} captions ({repaired / captions.frames_with:.1%}) are not their teacher's first answer, which was rejected; `repair_strategy` says how they were mended."
         )
-    noisy = captions.label_from.get("perturbed", 0)
+    noisy = captions.frames_by["label_from"].get("perturbed", 0)
     if noisy:
         lines.append(
             f"{noisy:,} labels come from a perturbed motion that nobody can take the noise out of (`label_from` is `perturbed`)."
@@ -323,7 +323,10 @@ def _values(record: ReleaseRecord) -> dict[str, str]:
         "example": _example(captions.example),
         "decisions_table": _table(
             ("decision", "frames", "share"),
-            [(_Code(name), f"{n:,}", _share(n, captions.frames_with)) for name, n in captions.decision.items()],
+            [
+                (_Code(name), f"{n:,}", _share(n, captions.frames_with))
+                for name, n in captions.frames_by["decision"].items()
+            ],
         ),
         "coverage_table": _covered(numbers.coverage),
         "provenance_table": _provenance(captions),
@@ -364,16 +367,11 @@ def _file_text(record: ReleaseRecord, file: FrameFile) -> str:
 
 
 def _provenance(captions: CaptionNumbers) -> str:
-    groups = (
-        ("verdict against the geometry", captions.verdict),
-        ("label from", captions.label_from),
-        ("written as", captions.writing),
-        ("repair", captions.repair_strategy),
-        ("kind of teacher", captions.teacher_kind),
-        ("teacher model", captions.teacher_model),
-    )
     rows: list[tuple[str, ...]] = [
-        (title, _Code(value), f"{n:,}") for title, counts in groups for value, n in counts.items()
+        (column.title, _Code(value), f"{n:,}")
+        for column in CAPTION
+        if column.counted and column.words != "actions"  # which have a table of their own
+        for value, n in captions.frames_by[column.name].items()
     ]
     for name, share in captions.mean_proved.items():
         rows.append(("sentences proved, mean", _Code(name), "-" if share is None else f"{100.0 * share:.1f} %"))
@@ -491,7 +489,7 @@ def _funnel(history: History) -> str:
 
 
 def _columns(files: list[FrameFile]) -> str:
-    rows = []
+    rows, words = [], {column.name: column.words for column in SCALARS}
     for member in schema(files):
         kind = "float64" if str(member.type) == "double" else str(member.type)
         if member.name in (PICTURES["rgb"].name, PICTURES["instance"].name):
@@ -501,8 +499,9 @@ def _columns(files: list[FrameFile]) -> str:
             kind += ", ".join(child.name for child in member.type)
         elif kind.startswith("list"):
             kind = f"list of {member.type.value_type}"
-        rows.append((_Code(member.name), kind))
-    return _table(("column", "type"), rows)
+        allowed = words.get(member.name, ())
+        rows.append((_Code(member.name), kind, "a decision" if allowed == "actions" else ", ".join(allowed)))
+    return _table(("column", "type", "values"), rows)
 
 
 def _share(count: int, total: int) -> str:

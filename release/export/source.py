@@ -18,13 +18,12 @@ from cosfly.reading.arrays import png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
 from cosfly.work.store import inside
-from release.columns import PICTURES, PLACE, SPLIT_NAMES, SplitName, flight_spans, schema
+from release.columns import PICTURES, PLACE, REQUIRED, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.depth import depth_of
 from release.record import DepthCoding, ReleaseRecord, read_record, release_folder
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
 SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
-NEVER_NULL = ("sample_id", "track", "style", "pace", "width_px", "height_px", "frame_index", "time_s")
 LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision"]
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
 PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
@@ -198,7 +197,7 @@ def _check_values(group: pa.Table, where: str) -> None:
     """
     for member in group.schema:
         column = group.column(member.name)
-        if member.name in NEVER_NULL and column.null_count:
+        if member.name in REQUIRED and column.null_count:
             raise InputError("a row without a value that all have", where=f"{where}: {member.name}", got="null")
         parts = column.combine_chunks().flatten() if pa.types.is_struct(member.type) else [column]
         for part in parts:

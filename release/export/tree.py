@@ -146,15 +146,11 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
     """Give the flight that released rows are of; `number` is its trajectory's among those of the release.
 
     Raises:
-        InputError: a row has no pose or intrinsics, or the pictures' size changes on the way.
+        InputError: the pictures' size changes on the way.
     """
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
-    without = sum(row["pose"] is None or row["intrinsics"] is None for row in rows)
-    if len(sizes) != 1 or without:
-        raise InputError(
-            "a flight has pictures of one size, and every frame a pose and intrinsics", where=placed.name,
-            got=f"{len(sizes)} sizes, {without} of {len(rows)} frames without a pose or intrinsics",
-        )  # fmt: skip
+    if len(sizes) != 1:
+        raise InputError("a flight has pictures of one size", where=placed.name, got=f"{len(sizes)} sizes")
     intrinsics = matrices_of(vectors(rows, "intrinsics", INTRINSICS))
     poses = vectors(rows, "pose", POSE)
     offsets = vectors(rows, "drone_offset", POSE)

@@ -19,10 +19,11 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit, urlunsplit
 
 from cosfly.errors import EnvironmentMissing, InputError
+from cosfly.escaping import published_name
 from cosfly.reading.files import open_file
 from cosfly.work.runner import advance
 from cosfly.work.store import inside
-from release.record import published_name, release_folder
+from release.record import release_folder
 
 Answer = TypeVar("Answer")
 MB = 1024 * 1024

@@ -8,23 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cosfly.errors import InputError
+from cosfly.escaping import published_name
 from cosfly.products.actions import action_tokens, not_in_set
-from cosfly.products.captions import FIELDS, Caption, caption_lines
+from cosfly.products.captions import Caption, caption_lines
 from cosfly.products.places import sample_id, town_folder
 from cosfly.reading.documents import parse_document, parse_json, validation_errors
 from cosfly.reading.files import read_span
 from cosfly.work.store import dump_json
-from release.columns import (
-    CAPTION_COUNTS,
-    CAPTION_PROMPTS,
-    CAPTION_STATES,
-    LANGUAGES,
-    PICTURE_PX,
-    STATES,
-    WINDOW,
-    ReleasedCaption,
-)
-from release.record import published_name
+from release.columns import LANGUAGES
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other
@@ -178,36 +169,6 @@ def _no_caption(caption: Caption, where: str) -> InputError | None:
     if any(language not in caption.prompt for language in LANGUAGES):
         return InputError("an accepted caption lacks a prompt", where=where, got=", ".join(caption.prompt))
     return None
-
-
-def released(caption: Caption) -> ReleasedCaption:
-    """Give what a row holds of an accepted caption."""
-    assert caption.en is not None
-    assert caption.zh is not None
-    states = caption.checks.sentences or {}
-    counts = [
-        states[language].count(state) if language in states else None for language in LANGUAGES for state in STATES
-    ]
-    prompts = [text for name in LANGUAGES for text in (caption.prompt[name].system, caption.prompt[name].user)]
-    return {
-        WINDOW: caption.window,
-        PICTURE_PX: list(caption.picture_px),
-        "decision": caption.en.flight_decision,
-        "label": caption.label,
-        "label_from": caption.label_from,
-        "verdict": caption.verdict,
-        "repair_strategy": caption.repair.strategy if caption.repair else None,
-        "teacher_kind": caption.teacher.kind,
-        "teacher_model": published_name(caption.teacher.model),
-        "writing": caption.writing,
-        "proved_en": caption.coverage("en"),
-        "proved_zh": caption.coverage("zh"),
-        **dict(zip(CAPTION_COUNTS, counts, strict=True)),
-        **{name: states.get(language) for name, language in zip(CAPTION_STATES, LANGUAGES, strict=True)},
-        **{f"caption_en_{name}": getattr(caption.en, name) for name in FIELDS},
-        **{f"caption_zh_{name}": getattr(caption.zh, name) for name in FIELDS},
-        **dict(zip(CAPTION_PROMPTS, prompts, strict=True)),
-    }
 
 
 def teacher_settings(text: str) -> dict:

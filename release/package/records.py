@@ -15,6 +15,7 @@ import pyarrow as pa
 
 import cosfly
 from cosfly.errors import VerifyError
+from cosfly.escaping import published
 from cosfly.reading.files import sha256_file
 from cosfly.work import in_place
 from cosfly.work.provenance import StageInput, stages_behind
@@ -46,7 +47,6 @@ from release.record import (
     Splits,
     Teacher,
     content_digest,
-    published,
     shard_path,
     write_record,
 )

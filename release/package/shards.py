@@ -26,9 +26,9 @@ from cosfly.work.items import advance
 from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
 from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
-from release.columns import Placed, ReleasedCaption
+from release.columns import Placed, ReleasedCaption, caption_values
 from release.depth import DepthErrors
-from release.package.captions import FlightCaptions, released
+from release.package.captions import FlightCaptions
 from release.package.rows import HashedFile, Rows, ShardPlan, open_writer
 from release.package.sources import Candidate
 from release.package.survey import Placing, look_of, open_flight
@@ -202,7 +202,7 @@ def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int
         elif not is_whole(caption.window, selected):
             not_whole += 1
         else:
-            found[caption.frame_index] = released(caption)
+            found[caption.frame_index] = caption_values(caption)
     return found, not_selected, not_whole
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.products.captions import FIELDS
+from release.columns import LANGUAGE_NAMES, LANGUAGES, STATES
 from release.record import ReleaseRecord
 from release.stats.cells import SPREAD, Cell, Table, pairs, percent, spread_row
-from release.stats.counting import LANGUAGES, STATES, TEXT_BIN, Counts
-
-LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
+from release.stats.counting import TEXT_BIN, Counts
 
 
 def of_captions(record: ReleaseRecord, counts: Counts) -> list[Table]:

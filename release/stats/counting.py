@@ -11,30 +11,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosfly.products.captions import FIELDS, Language
+from cosfly.products.captions import FIELDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from release.card.numbers import Place3, Sum, bounded, clean_place
-from release.columns import BOX, PLACE, POINT
+from release.columns import BOX, LANGUAGES, PLACE, POINT, SCALARS, STATES
 
-LANGUAGES: tuple[Language, ...] = ("en", "zh")
 SAME_FOV_DEG = 0.05
 LEAST_STEP_S = 1e-3  # between two frames
 TEXT_BIN = {"en": 25, "zh": 10}  # characters
-STATES = ("proved", "contradicted", "unread")
-COLUMNS = [
-    *PLACE, "sample_id", "track", "split", "walk", "style", "pace", "weather", "time_of_day", "look", "frame_index", "time_s", "width_px", "height_px",
-    "fov_deg", "intrinsics", "pose", "target", "target_uv", "target_bbox", "target_mask_bbox", "target_depth_m", "target_in_view", "target_visible", "visibility",
-    "is_perturbed", "perturbation", "drone_offset", "target_offset", "has_caption", "decision", "label", "label_from", "verdict", "repair_strategy", "writing",
-    *(f"{state}_sentences_{language}" for language in LANGUAGES for state in STATES),
-    *(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS),
-]  # fmt: skip
 # What a frame may be annotated with: a name, and the column that holds it.
-ANNOTATIONS = {
-    "drone pose (position, rotation)": "pose", "target position": "target", "projected box of the target": "target_bbox",
-    "box of the target's pixels": "target_mask_bbox", "rendered visibility of the target": "visibility",
-    "what became of the perturbation": "perturbation", "offsets of the perturbation": "drone_offset", "weather": "weather", "time of day": "time_of_day",
-    "sun and air": "look", "caption in English": "caption_en_reasoning_trace", "caption in Chinese": "caption_zh_reasoning_trace",
-}  # fmt: skip
+ANNOTATIONS = {column.title: column.name for column in SCALARS if column.annotation}
 
 
 @dataclass

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from cosfly.work.console import progress_bar
 from cosfly.work.store import write_bytes, write_json
-from release.card.numbers import COLUMNS as CARD_COLUMNS
 from release.card.numbers import Counted, check_rows, row_lists
+from release.columns import SHORT_NAMES
 from release.record import read_record, release_folder
-from release.stats.counting import COLUMNS, Counts
+from release.stats.counting import Counts
 from release.stats.page import markdown, page_html
 from release.stats.pixels import look_at
 from release.stats.tables import make_stats
@@ -29,7 +29,7 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     with progress_bar("stats: rows", sum(shard.rows for shard in record.shards)) as advance:
         for shard in record.shards:
             check_rows(dataset / shard.path, shard.rows)
-            for rows in row_lists(dataset / shard.path, list(dict.fromkeys([*COLUMNS, *CARD_COLUMNS]))):
+            for rows in row_lists(dataset / shard.path, SHORT_NAMES):
                 card.add(rows)
                 for row in rows:
                     counts.add(row)

@@ -5,59 +5,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from cosfly.products.actions import action_tokens
-from cosfly.products.captions import LabelFrom, TeacherKind, Verdict, Writing
-from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG
 from cosfly.products.playback import EVENTS, ORIGINAL
-from cosfly.products.weather import WeatherMode
-from release.columns import CAPTION_SHARES
+from release.columns import REQUIRED, SCALARS
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
 
-# What cannot change within a flight.
-CONSTANT = (
-    "run", "town", "trajectory", "variant", "track", "pace", "walk", "split", "pair", "weather", "time_of_day", "weather_mode",
-    "weather_params", "look", "width_px", "height_px", "fov_deg", "intrinsics",
-)  # fmt: skip
+CONSTANT = [column.name for column in SCALARS if column.constant]
 ZOOMED = ("fov_deg", "intrinsics")  # but of a camera that zooms; geometry.py looks at each row's
-CLOSED: dict[str, tuple[str, ...]] = {
-    "track": ("clean", "perturbed"),
-    "weather_mode": get_args(WeatherMode),
-    "verdict": get_args(Verdict),
-    "label_from": get_args(LabelFrom),
-    "teacher_kind": get_args(TeacherKind),
-    "writing": get_args(Writing),
-}
-ACTIONS = (
-    "decision",
-    "label",
-    "caption_en_flight_decision",
-    "caption_zh_flight_decision",
-)  # columns that hold one, of the record's set
-# column -> members ("" for a plain number) -> least and greatest value.
-RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "visibility": {"": (0.0, 1.0)},
-    "fov_deg": {"": (LEAST_FOV_DEG, MOST_FOV_DEG)},
-    "time_s": {"": (0.0, 1e7)},
-    "width_px": {"": (1, 100_000)},
-    "height_px": {"": (1, 100_000)},
-    "target_heading_deg": {"": (-360.0, 360.0)},
-    "pose": {"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
-    "look": {"sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6), "exposure": (0.0, 100.0)},
-    "weather_params": {
-        **dict.fromkeys(("cloudiness", "precipitation", "fog_density"), (0.0, 100.0)), "fog_distance": (1e-9, 1e6),
-        "sun_altitude_angle": (-90.0, 90.0), "sun_azimuth_angle": (0.0, 360.0),
-    },
-    **{name: {"": (0.0, 1.0)} for name in CAPTION_SHARES},
-}  # fmt: skip
-NEVER_NULL = (
-    "sample_id", "run", "town", "trajectory", "variant", "track", "frame_index", "time_s", "width_px", "height_px", "fov_deg",
-    "intrinsics", "pose", "target_in_view", "target_visible", "is_perturbed", "has_caption",
-)  # fmt: skip
+CLOSED = {column.name: column.words for column in SCALARS if column.words}
+RANGES = {column.name: column.ranges for column in SCALARS if column.ranges}
 LARGEST = 1e6  # of a coordinate, m: farther than any town reaches
 # What became of a perturbation, in the words of docs/files.md.
 EVENT_WORDS = re.compile(
@@ -70,9 +31,9 @@ def check_identity(flight: FlightRows, findings: Findings) -> None:
     """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
     _check_names(flight, findings)
     _check_constants(flight, findings)
-    closed = CLOSED | dict.fromkeys(ACTIONS, action_tokens())
+    closed = {name: action_tokens() if words == "actions" else words for name, words in CLOSED.items()}
     for i, row in enumerate(flight.rows):
-        for name in NEVER_NULL:
+        for name in REQUIRED:
             if name in row and row[name] is None:
                 findings.error("null", flight.where(i, name), "null", "a value in every row")
         for name, allowed in closed.items():

@@ -137,9 +137,9 @@ def _check_provenance(record: ReleaseRecord, findings: Findings) -> None:
     )
     for column, attribute in (("teacher_kind", "kind"), ("teacher_model", "model")):
         known = {getattr(teacher, attribute) for teacher in told.teachers}
-        for name, count in getattr(captions, column).items():
+        for name, count in captions.frames_by[column].items():
             if name not in known:
-                findings.error("provenance", f"release.json: numbers.captions.{column}", f"{name}: {count}", f"a teacher of the provenance: {', '.join(sorted(known))}")  # fmt: skip
+                findings.error("provenance", f"release.json: numbers.captions.frames_by.{column}", f"{name}: {count}", f"a teacher of the provenance: {', '.join(sorted(known))}")  # fmt: skip
             elif count > sum(t.captions for t in told.teachers if getattr(t, attribute) == name):
                 findings.error("provenance", f"release.json: provenance.teachers: {name}", f"{count} released", "no more than were read")  # fmt: skip
     runs = {source.run for source in told.sources}

@@ -12,41 +12,34 @@ import numpy as np
 import pyarrow as pa
 
 from cosfly.look.frame_views import View, depth_colors, segmentation_colors
-from cosfly.products.captions import Coc, Language
 from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, row_groups
 from cosfly.work.console import progress_bar
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
-from release.columns import BOX, CAPTION_PROMPTS, PLACE, POINT, SCALAR_NAMES
 from release.columns import PICTURES as COLUMNS
+from release.columns import PLACE, POINT, SHORT_NAMES
 from release.depth import depth_of
 from release.record import ReleaseRecord, read_record
-from release.viewer.choosing import choose_flights, choose_frames, path_of, shown_sentences
-from release.viewer.pictures import Pictures, box_of
-from release.viewer.schema import Shown, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
+from release.viewer.content import (
+    Pictures,
+    Shown,
+    ShownFlight,
+    ShownFrame,
+    ViewerConfig,
+    caption_of,
+    choose_flights,
+    choose_frames,
+    frame_of,
+    path_of,
+)
 
 Place = tuple[str, ...]  # PLACE
-SHOWN = [name for name in SCALAR_NAMES if name not in CAPTION_PROMPTS]
 VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
-LANGUAGES: tuple[Language, ...] = ("en", "zh")
 SCAN = [
-    *PLACE,
-    "sample_id",
-    "track",
-    "split",
-    "frame_index",
-    "time_s",
-    "width_px",
-    "height_px",
-    "fov_deg",
-    "pose",
-    "target",
-    "visibility",
-    "has_caption",
-    "verdict",
-    "decision",
-]
+    *PLACE, "sample_id", "track", "split", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "target", "visibility",
+    "has_caption", "verdict", "decision",
+]  # fmt: skip
 
 
 class Scanned:
@@ -119,7 +112,7 @@ def _rows(
     dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, Scanned], frames: Mapping[Place, list[int]]
 ) -> Iterator[dict[str, Any]]:
     """Read the chosen rows with their pictures; of the row groups those alone that hold one."""
-    columns = [*SHOWN, *(COLUMNS[file].name for file in record.settings.modalities)]
+    columns = [*SHORT_NAMES, *(COLUMNS[file].name for file in record.settings.modalities)]
     wanted: dict[Path, set[int]] = {}
     for place, indices in frames.items():
         for index in indices:
@@ -140,22 +133,7 @@ def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) ->
     views: Mapping[View, Callable[[], np.ndarray]] = {
         VIEW_OF[file]: partial(picture, row, file, record) for file in record.settings.modalities
     }
-    pose, target, seen, box = row["pose"], row["target"], row["visibility"], row["target_bbox"]
-    x, y, z, yaw = (round(float(pose[name]), 2) for name in (*POINT, "yaw_deg"))
-    return ShownFrame(
-        index=row["frame_index"],
-        time_s=round(row["time_s"], 3),
-        drone=(x, y, z, yaw),
-        target=None if target is None else (round(target["x_m"], 2), round(target["y_m"], 2), round(target["z_m"], 2)),
-        visibility=None if seen is None else round(seen, 3),
-        is_perturbed=bool(row["is_perturbed"]),
-        events=row["perturbation"],
-        style=row["style"],
-        fov_deg=round(row["fov_deg"], 1),
-        box=None if box is None else box_of([box[name] for name in BOX], row["width_px"], row["height_px"]),
-        pictures=pictures.of_frame(views),
-        caption=_caption(row) if row["has_caption"] else None,
-    )
+    return frame_of(row, pictures.of_frame(views), caption_of(row) if row["has_caption"] else None)
 
 
 def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> np.ndarray:
@@ -173,24 +151,6 @@ def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> n
         return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
     coded = parse_picture(data, where)  # B the high, G the low byte of the id, R the kind
     return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
-
-
-def _caption(row: Mapping[str, Any]) -> ShownCaption:
-    texts = {}
-    for language in LANGUAGES:
-        coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in Coc.model_fields})
-        texts[language] = shown_sentences(coc, row[f"sentence_states_{language}"])
-    return ShownCaption(
-        decision=row["decision"],
-        label=row["label"],
-        label_from=row["label_from"],
-        verdict=row["verdict"],
-        repair=row["repair_strategy"],
-        teacher=f"{row['teacher_kind']}: {row['teacher_model']}",
-        writing=row["writing"],
-        window=row["caption_window"] or [],
-        texts=texts,
-    )
 
 
 def _flight(scanned: Scanned) -> ShownFlight:

@@ -6,21 +6,35 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, View, read_view
 from cosfly.products.boxes import read_boxes
-from cosfly.products.captions import Caption, Coc, Language, read_captions
+from cosfly.products.captions import Caption, read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.review import read_settled
 from cosfly.work.console import progress_bar
-from release.viewer.choosing import boxes_of, choose_flights, choose_frames, path_of, shown_sentences
-from release.viewer.pictures import Pictures, box_of
-from release.viewer.schema import Shown, ShownBox, ShownCaption, ShownFlight, ShownFrame, ViewerConfig
+from release.columns import Placed, caption_values, scalar_row
+from release.viewer.content import (
+    Pictures,
+    Shown,
+    ShownBox,
+    ShownCaption,
+    ShownFlight,
+    ShownFrame,
+    ViewerConfig,
+    boxes_of,
+    caption_of,
+    choose_flights,
+    choose_frames,
+    frame_of,
+    path_of,
+)
 
 Key = tuple[str, str, str]  # a town's folder, trajectory, variant
 VIEWS: tuple[View, ...] = ("rgb", "depth", "segmentation")
@@ -108,13 +122,13 @@ def _kinds(trees: list[Tree], wanted: set[tuple[str, Key]]) -> dict[tuple[str, K
     return kinds
 
 
-def _texts(trees: list[Tree], wanted: dict[tuple[str, Key], set[int]]) -> dict[tuple[str, Key, int], ShownCaption]:
+def _texts(trees: list[Tree], wanted: dict[tuple[str, Key], set[int]]) -> dict[tuple[str, Key, int], Caption]:
     """Read the captions of the chosen frames."""
-    texts: dict[tuple[str, Key, int], ShownCaption] = {}
+    texts: dict[tuple[str, Key, int], Caption] = {}
     for run, caption in _read(trees):
         key = (town_folder(caption.town), caption.trajectory, caption.variant)
         if caption.frame_index in wanted.get((run, key), ()):
-            texts[run, key, caption.frame_index] = _caption(caption)
+            texts[run, key, caption.frame_index] = caption
     return texts
 
 
@@ -154,48 +168,25 @@ def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -
     )
 
 
-def _frame(flight: Flight, index: int, caption: ShownCaption | None, pictures: Pictures) -> ShownFrame:
+def _frame(flight: Flight, index: int, caption: Caption | None, pictures: Pictures) -> ShownFrame:
     folder = flight.frame_folder(index)
     views: Mapping[View, Callable[[], np.ndarray]] = {
         view: partial(read_view, folder, view) for view in VIEWS if (folder / VIEW_FILES[view]).exists()
     }
-    target, seen = flight.targets_m[index], flight.visibility[index]
-    x, y, z, yaw = (round(float(v), 2) for v in (*flight.positions_m[index], flight.rotations_deg[index, 1]))
-    tx, ty, tz = (round(float(v), 2) for v in target)
-    return ShownFrame(
-        index=index,
-        time_s=round(float(flight.time_s[index]), 3),
-        drone=(x, y, z, yaw),
-        target=None if np.isnan(target).any() else (tx, ty, tz),
-        visibility=None if np.isnan(seen) else round(float(seen), 3),
-        is_perturbed=bool(flight.is_perturbed[index]),
-        events=dict(flight.events(index) or {}) or None,
-        style=flight.styles[index],
-        fov_deg=round(flight.camera_at(index).fov_deg, 1),
-        box=box_of(flight.target_bbox[index].tolist(), flight.camera.width_px, flight.camera.height_px),
-        pictures=pictures.of_frame(views),
-        caption=caption,
-    )
+    values = None if caption is None else caption_values(caption)
+    row = scalar_row(flight, index, values, Placed(walk="", split="train"))
+    return frame_of(row, pictures.of_frame(views), None if caption is None else _caption(caption, row))
 
 
-def _caption(caption: Caption) -> ShownCaption:
-    states = caption.checks.sentences or {}
-    answers: dict[Language, Coc | None] = {"en": caption.en, "zh": caption.zh}
-    repair = caption.repair
-    rung = repair and f"{repair.rung or repair.outcome}, first {repair.first_decision} ({repair.first_verdict})"
-    return ShownCaption(
-        decision=caption.en.flight_decision if caption.en else None,
-        label=caption.label,
-        label_from=caption.label_from,
-        verdict=caption.verdict,
-        repair=rung,
-        teacher=f"{caption.teacher.kind}: {caption.teacher.model}",
-        writing=caption.writing,
-        window=caption.window,
-        texts={language: shown_sentences(coc, states.get(language)) for language, coc in answers.items() if coc},
-        problems=caption.checks.evidence if isinstance(caption.checks.evidence, list) else [],
-        dropped=caption.drop_reason if caption.status == "dropped" else None,
-    )
+def _caption(caption: Caption, row: Mapping[str, Any]) -> ShownCaption:
+    """Give a caption of a run, of which more is known than a release tells."""
+    shown, repair = caption_of(row), caption.repair
+    if repair is not None:
+        told = f"{repair.rung or repair.outcome}, first {repair.first_decision} ({repair.first_verdict})"
+        shown.repair = shown.facts["repair"] = told
+    shown.problems = caption.checks.evidence if isinstance(caption.checks.evidence, list) else []
+    shown.dropped = caption.drop_reason if caption.status == "dropped" else None
+    return shown
 
 
 def _maps(trees: list[Tree], flights: list[ShownFlight]) -> dict[str, list[ShownBox]]:

@@ -13,9 +13,9 @@ from cosfly.escaping import for_terminal
 from cosfly.look.page import page
 from cosfly.reading.files import read_text
 from cosfly.work.store import write_bytes
+from release.viewer.content import Shown, ViewerConfig
 from release.viewer.of_release import show_release
 from release.viewer.of_run import show_run
-from release.viewer.schema import Shown, ViewerConfig
 
 PICTURES = "pictures"
 

@@ -49,7 +49,7 @@ function evidenceOf(caption) {
 const textOf = (sample) => {
   const flight = flightOf(sample), frame = flight.frames[sample.frame], caption = frame.caption;
   const texts = caption ? Object.values(caption.texts).flat().map((sentence) => sentence.text) : [];
-  return [flight.name, `frame ${frame.index}`, frame.style, ...texts, caption && caption.label, caption && caption.teacher].join(" ").toLowerCase();
+  return [flight.name, `frame ${frame.index}`, ...Object.values(frame.facts), ...texts, ...(caption ? Object.values(caption.facts) : [])].join(" ").toLowerCase();
 };
 
 const state = { flight: 0, index: null, q: "" };
@@ -157,7 +157,7 @@ function drawStage(sample) {
   const [x, y, z, yaw] = frame.drone;
   const away = frame.target ? Math.hypot(x - frame.target[0], y - frame.target[1], z - frame.target[2]) : null;
   const facts = [
-    `frame ${frame.index}`, `${frame.time_s.toFixed(1)} s`, frame.style && `style ${words(frame.style)}`,
+    `frame ${frame.index}`, `${frame.time_s.toFixed(1)} s`, ...Object.entries(frame.facts).map(([name, what]) => `${name}: ${words(what)}`),
     away === null ? "no target" : `${away.toFixed(1)} m to the person, ${(z - frame.target[2]).toFixed(1)} m above the hip`,
     frame.visibility === null ? null : `${Math.round(100 * frame.visibility)} % visible`, `yaw ${yaw.toFixed(0)}\u00b0`,
     frame.is_perturbed ? `perturbed${frame.events ? ": " + Object.entries(frame.events).map(([name, what]) => `${name} ${what}`).join("; ") : ""}` : null,
@@ -201,12 +201,8 @@ function drawCaption(sample) {
   if (!caption) { show("caption", make("p", { class: "nothing" }, sample ? "This frame has no caption." : "")); return; }
   const tags = [
     caption.verdict && make("span", { class: `tag ${caption.verdict}` }, words(caption.verdict)),
-    make("span", { class: "tag plain" }, `decision: ${words(caption.decision || NONE)}`),
-    make("span", { class: "tag plain" }, `label: ${words(caption.label || NONE)}${caption.label_from ? ` (from the ${caption.label_from})` : ""}`),
-    caption.repair && make("span", { class: "tag plain" }, `repaired: ${words(caption.repair)}`),
+    ...Object.entries(caption.facts).map(([name, what]) => make("span", { class: "tag plain" }, `${name}: ${words(what)}`)),
     caption.dropped && make("span", { class: "tag bad" }, `dropped: ${words(caption.dropped)}`),
-    make("span", { class: "tag plain" }, `${caption.teacher}${caption.writing ? `, ${caption.writing}` : ""}`),
-    make("span", { class: "tag plain" }, `window: ${caption.window.join(", ")}`),
   ].filter(Boolean);
   const columns = Object.entries(LANGUAGES).map(([language, title], number) => {
     const sentences = caption.texts[language] || [];
