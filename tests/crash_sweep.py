@@ -120,7 +120,7 @@ def _teacher(place: Place) -> str:
 
 def _judge(place: Place) -> str:
     """A judge with all three verdicts, always the same one of a case."""
-    from caption.truth.judge import JUDGEMENTS
+    from caption.teachers.judge import JUDGEMENTS
 
     server = _chat_server(place)
     server.text = lambda body: json.dumps(

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from caption.truth.released import read_released
+from caption.run.released import read_released
 from cosfly.reading.files import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers

@@ -19,10 +19,6 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 ROOMS = ("root", "reading", "work", "png", "products", "space", "look", "chat", "stages", "siblings", "app", "cli")
 # Pairs of folders that still import each other.
 MUTUAL = {
-    ("caption", "caption/teachers"),
-    ("caption", "caption/truth"),
-    ("caption", "caption/writing"),
-    ("caption/teachers", "caption/truth"),
     ("release", "release/export"),
     ("release", "release/get"),
     ("release", "release/verify"),

@@ -16,12 +16,12 @@ from test_caption_actions import future
 from test_pipeline_tiny import TINY
 from typer.testing import CliRunner
 
-from caption.own_files import own_files
+from caption.run.own_files import own_files
+from caption.run.released import read_released
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig, LabelConfig
 from caption.truth.actions import Motion, is_contradicted, label_of, measure, table_of
 from caption.truth.reach import never_labels
-from caption.truth.released import read_released
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app

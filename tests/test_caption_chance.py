@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from caption.run.chance import ChanceCounts
+from caption.run.window_loop import caption_window
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
 from caption.truth.actions import measure, verdict_of
-from caption.window_loop import caption_window
-from caption.windows import cut_windows
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption
 from specimens import make_flight

@@ -9,8 +9,8 @@ from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
 from caption.run.compare import STRATEGIES, compare, run, text_distance
+from caption.run.window_loop import Trial
 from caption.schema import CaptionConfig
-from caption.window_loop import Trial
 from cosfly.cli import app
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import Coc

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
-from caption.truth.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
+from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
 from cosfly.cli import app
 from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import read_captions

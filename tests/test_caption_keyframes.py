@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caption.run.stage import run
+from caption.run.windows import choose_keyframes, cut_windows, missed_changes
 from caption.schema import CaptionConfig
 from caption.truth.actions import label_of, measure
-from caption.windows import choose_keyframes, cut_windows, missed_changes
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight

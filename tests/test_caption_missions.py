@@ -6,10 +6,10 @@ import shutil
 import pytest
 
 from caption.run.stage import run
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, ImageConfig, LabelConfig, WindowConfig
 from caption.teachers.prompts import make_question
 from caption.truth.actions import label_of, measure
-from caption.windows import cut_windows
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight, write_flight

@@ -17,12 +17,12 @@ from specimens_prose import FOLLOW
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.run.stage import run
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, WindowConfig
 from caption.teachers.statements import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, check_translation
 from caption.truth.references import Fact, look_up, parse_reference
-from caption.windows import cut_windows
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import Slots, fact_table

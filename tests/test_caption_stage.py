@@ -12,10 +12,10 @@ import pytest
 from caption.run import stage
 from caption.run.flights import allot, named_flights
 from caption.run.stage import run
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
 from caption.teachers.teacher import RuleTeacher
 from caption.truth.actions import label_of, measure
-from caption.windows import cut_windows
 from cosfly.errors import InputError, NothingKept, ResumeError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from specimens_captions import write_answers
 
+from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.truth.gold import read_gold
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import check_prose, judge_prose
-from caption.windows import cut_windows
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Coc
 from specimens import make_flight

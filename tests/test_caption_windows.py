@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from teacher_server import TeacherServer
 
-from caption.label_motion import as_flown
 from caption.run.stage import run
+from caption.run.windows import as_flown, current_frames, cut_future, cut_windows
 from caption.schema import (
     CaptionConfig,
     FutureMotion,
@@ -28,7 +28,6 @@ from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages, system_prompt
 from caption.truth.actions import label_of, measure
 from caption.truth.facts import measure_facts
-from caption.windows import current_frames, cut_future, cut_windows
 from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.boxes import MapHeader, make_box_map

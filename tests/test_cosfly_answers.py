@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caption.truth.judge import parse_judgement
+from caption.teachers.judge import parse_judgement
 from cosfly.chat.contract import Reply, Request
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response

@@ -10,9 +10,9 @@ import pytest
 from specimens_foreign import write_foreign_tree
 from typer.testing import CliRunner
 
+from caption.run.released import read_released
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig
-from caption.truth.released import read_released
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError

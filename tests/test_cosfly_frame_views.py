@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from caption.run.window_loop import caption_window
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.teachers.images import FrameEncoder, pictures_of
 from caption.teachers.prompts import make_question, prompt_hash, question_messages
 from caption.teachers.teacher import RuleTeacher
-from caption.window_loop import caption_window
-from caption.windows import cut_windows
 from cosfly.errors import InputError
 from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
 from cosfly.products.captions import PICTURES_MARK, Language

@@ -19,7 +19,7 @@ from release_tampering import errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot, write_foreign_tree
 from typer.testing import CliRunner
 
-from caption.truth.released import read_released
+from caption.run.released import read_released
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app

@@ -15,7 +15,7 @@ import pytest
 from release_lies import LIES
 from release_tampering import errors_in, forge, pixels_of, png
 
-from caption.truth.released import read_released
+from caption.run.released import read_released
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.reading.documents import read_json

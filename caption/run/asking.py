@@ -17,11 +17,11 @@ from pathlib import Path
 
 from caption.run.flights import Allotted
 from caption.run.progress import Display
+from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
+from caption.teachers.judge import open_judge
 from caption.teachers.reader import open_reader
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.truth.judge import open_judge
-from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer, Troubles

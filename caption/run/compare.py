@@ -17,12 +17,12 @@ from typing import get_args
 
 from rich.table import Table
 
-from caption.own_files import own_files
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
+from caption.run.own_files import own_files
+from caption.run.window_loop import Trial, try_strategy
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.window_loop import Trial, try_strategy
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
 from cosfly.chat.interrupts import run_until_interrupted

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
+from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
-from caption.windows import current_frames, cut_windows
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import caption_lines, write_caption_lines
 from cosfly.products.flights import find_flights, read_twin

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from caption.own_files import own_files
 from caption.run.asking import ANSWERS
 from caption.run.flights import Allotted, allot, named_flights
+from caption.run.own_files import own_files
 from caption.run.progress import duration
 from caption.run.stage import open_stage
+from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
 from caption.teachers.prompts import make_question
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import AskingTeacher, first_budget
-from caption.window_loop import caption_window
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer

@@ -13,18 +13,17 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 
-from caption.own_files import keep_own_files, own_files, package_files
-from caption.prepared import prepare
 from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
+from caption.run.own_files import keep_own_files, own_files, package_files
 from caption.run.report import write_page
+from caption.run.window_loop import caption_prepared, prepare
 from caption.schema import CaptionConfig, Window
 from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
-from caption.window_loop import caption_prepared
 from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.chat.student_chat import student_files

@@ -136,7 +136,7 @@ def caption_doctor(
 
 def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
-    from caption.own_files import own_files
+    from caption.run.own_files import own_files
     from caption.teachers.doctor import examine_endpoint
     from cosfly.work.console import console
 
@@ -155,7 +155,7 @@ def caption_prompts(
     overrides: options.Overrides = None,
 ) -> None:
     """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
-    from caption.own_files import own_files
+    from caption.run.own_files import own_files
     from caption.teachers.prompt_files import export_prompts, own_prompts
 
     if (export is None) == (check is None):
@@ -204,8 +204,8 @@ def caption_judge_check(
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
-    from caption.own_files import own_files
-    from caption.truth.judge import check_judge, gold_conflicts, judge_check_table
+    from caption.run.own_files import own_files
+    from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
     from cosfly.work.console import console
 
     cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
@@ -224,7 +224,7 @@ def caption_reader_check(
     """Measure a reader of prose on the gold set: true captions flagged, errors caught, claims, requests, tokens."""
     import asyncio
 
-    from caption.own_files import own_files
+    from caption.run.own_files import own_files
     from caption.teachers.reader import check_reader, reader_check_table
     from caption.truth.gold import read_gold
     from cosfly.work.console import console

@@ -106,7 +106,7 @@ def release_verify(
     workers: options.Workers = None,
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
-    from caption.truth.released import read_released
+    from caption.run.released import read_released
     from cosfly.app.settings import manner_of_work
     from cosfly.work.store import write_json
     from release.sign import read_public_key
@@ -139,7 +139,7 @@ def release_sign(
     workers: options.Workers = None,
 ) -> None:
     """Verify a release, then sign its list of checksums with your key: `release verify --public-key` tells a forged one."""
-    from caption.truth.released import read_released
+    from caption.run.released import read_released
     from cosfly.app.settings import manner_of_work
     from release import sign
     from release.record import release_folder
@@ -310,7 +310,7 @@ def release_push(
     workers: options.Workers = None,
 ) -> None:
     """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
-    from caption.truth.released import read_released
+    from caption.run.released import read_released
     from cosfly.work.console import answer_console
     from release import push
 

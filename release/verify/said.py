@@ -1,6 +1,6 @@
 """What can be told of a row's caption without its meaning: is it whole, of its own row, decided as it says, and from the past alone?
 
-What its words say is told by a reader of captions (caption/truth/released.py), which the command line brings along.
+What its words say is told by a reader of captions (caption/run/released.py), which the command line brings along.
 """
 
 from __future__ import annotations

@@ -21,9 +21,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from caption.run.stage import caption_in_order, run
+from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
-from caption.windows import cut_windows
 from specimens import FIRST_SECOND, make_flight, make_playback_tree
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from caption.run.windows import current_frames, order_comes_within
 from caption.schema import FutureMotion, LabelConfig, WindowConfig
 from caption.truth.actions import label_of, measure
-from caption.windows import current_frames, order_comes_within
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.traces import DroneTrace, read_traces
 

@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from caption.label_motion import LabelMotion, label_motion
+from caption.run.windows import LabelMotion, cut_future, frames_of, label_motion
 from caption.schema import FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
 from caption.truth.actions import label_of, measure, verdict_of
 from caption.truth.facts import measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import check_prose
-from caption.windows import cut_future, frames_of
 from cosfly.products.actions import actions_in_use
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
 from cosfly.work import in_place

@@ -6,19 +6,19 @@ the flight contradicts is asked for again, by default anchored to the true one; 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from caption.prepared import Prepared, prepare
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.foreign import Terms
-from caption.teachers.prompts import Correction, Question
+from caption.teachers.judge import Case, Judge
+from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
 from caption.teachers.reader import Reader, judge_reading
-from caption.teachers.teacher import Teacher
-from caption.truth.actions import Motion, verdict_of
+from caption.teachers.teacher import Teacher, terms_of
+from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
-from caption.truth.judge import Case, Judge
 from caption.truth.mirror import check_translation
 from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused, refuse_decision, way_of
@@ -37,6 +37,29 @@ from cosfly.products.captions import (
     Verdict,
 )
 from cosfly.reading.objects import CONTEXT_FULL
+
+
+class Prepared(NamedTuple):
+    """A window, what is asked about it, and what its answer is held against."""
+
+    window: Window
+    terms: Terms
+    question: Question
+    prompt_hash: str
+    motion: Motion
+    label: str | None
+    contradicted: list[str]
+
+
+def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig) -> list[Prepared]:
+    """Measure windows and write their questions: each step for all of them, while the processor's caches hold its code."""
+    terms = [terms_of(teacher, window.observed.sample_id, cfg) for window in windows]
+    questions = [make_question(w.observed, cfg.image, t.writing) for w, t in zip(windows, terms, strict=True)]
+    hashes = [prompt_hash(question) for question in questions]
+    motions = [measure(window.future) for window in windows]
+    labels = [label_of(motion, cfg.label) for motion in motions]
+    contradicted = [contradicted_by(m, cfg.label, label) for m, label in zip(motions, labels, strict=True)]
+    return list(map(Prepared, windows, terms, questions, hashes, motions, labels, contradicted))
 
 
 async def caption_window(
