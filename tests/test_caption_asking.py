@@ -336,15 +336,14 @@ def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
 # --- a folder of an earlier version -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("resume", ["if-same", "force"])
-def test_a_folder_whose_answers_stand_in_one_file_is_refused_and_nothing_is_paid_twice(tree, tmp_path, resume):
+def test_a_folder_whose_answers_stand_in_one_file_is_refused_and_nothing_is_paid_twice(tree, tmp_path):
     out = tmp_path / "out"
     with hovering() as server:
         cfg = settings(server.url, limit=3)
         path = run(cfg, tree, out)
         num_asked = len(server.bodies)
         Journal(out / "answers.jsonl").append({"key": "k"})
-        assert run(cfg, tree, out, resume=resume) == path  # complete: nothing would be asked
+        assert run(cfg, tree, out) == path  # complete: nothing would be asked
         with pytest.raises(ResumeError, match=r"answers.jsonl.*earlier version"):
             run(cfg.model_copy(update={"limit": 5}), tree, out)
         assert (out / "manifest.json").exists()
@@ -354,9 +353,9 @@ def test_a_folder_whose_answers_stand_in_one_file_is_refused_and_nothing_is_paid
         refused = r"answers.jsonl.*earlier version.*the version that began it, or choose another --out"
         for changed in (cfg, other):
             with pytest.raises(ResumeError, match=refused):
-                run(changed, tree, out, resume=resume)
+                run(changed, tree, out)
             with pytest.raises(ResumeError, match=refused):
-                make_forecast(changed, tree, out, resume=resume)
+                make_forecast(changed, tree, out)
         with pytest.raises(ResumeError, match=refused):
             compare_strategies(cfg, tree, out)
         assert before == sorted((path, path.read_bytes()) for path in out.rglob("*") if path.is_file())

@@ -92,28 +92,13 @@ def test_another_seed_changes_the_wording_only(tree, done, tmp_path):
     assert [c.en.critical_components for c in other] != [c.en.critical_components for c in base]
 
 
-def test_a_forced_folder_keeps_every_caption_and_takes_what_is_new(tmp_path):
-    small = make_playback_tree(tmp_path / "tree", 2, 18)
-    out = tmp_path / "caption"
-    run(CaptionConfig(), small, out)
-    before = (out / "captions.jsonl").read_text().splitlines()
-    other = CaptionConfig.model_validate({"label": {"yaw_deg": 9.0}})
-    run(other, small, out, resume="force")
-    assert (out / "captions.jsonl").read_text().splitlines() == before  # finished items are kept as they are
-    make_playback_tree(tmp_path / "tree", 3, 18)
-    run(other, small, out, resume="force")
-    after = (out / "captions.jsonl").read_text().splitlines()
-    assert len(after) > len(before) > 30
-    assert set(before) < set(after)
-
-
 def test_a_product_never_loses_captions(tmp_path):
     tree, out = make_playback_tree(tmp_path / "tree", 3, 18), tmp_path / "caption"
     run(CaptionConfig(), tree, out)
     before = (out / "captions.jsonl").read_bytes()
     shutil.rmtree(find_flights(tree)[0])
-    with pytest.raises(ResumeError, match=r"would lose captions.*45 captions .* 54 in the file; choose another --out"):
-        run(CaptionConfig(), tree, out, resume="force")
+    with pytest.raises(ResumeError, match=r"the input data .* has changed; choose another --out"):
+        run(CaptionConfig(), tree, out)
     assert (out / "captions.jsonl").read_bytes() == before
 
 
@@ -215,5 +200,5 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     with pytest.raises(NothingKept):
         run(CaptionConfig(), tree, out)
     clean.write_bytes(whole)
-    found = list(read_captions(run(CaptionConfig(), tree, out, resume="force")))
+    found = list(read_captions(run(CaptionConfig(), tree, out)))
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}

@@ -89,6 +89,7 @@ def test_what_cannot_be_measured(tmp_path):
     (tmp_path / "out/mine").touch()
     with pytest.raises(ResumeError, match="not empty"):
         run(RunConfig(), tmp_path, tmp_path / "out", "render", [1])
+    (tmp_path / "run.yaml").write_text("{}")
     for counts in ("two", "0,1", ""):
         answer = CliRunner().invoke(app, ["bench", str(tmp_path), "--out", str(tmp_path / "o"), "--workers", counts])
         assert answer.exit_code == 2

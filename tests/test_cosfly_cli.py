@@ -18,7 +18,7 @@ from cosfly.app import doctor
 from cosfly.app.doctor import Check
 from cosfly.app.settings import RunConfig
 from cosfly.chat.wire import Connections, Response
-from cosfly.cli.options import resolve, tell_product
+from cosfly.cli.options import Job, resolve
 from cosfly.errors import InputError
 from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import write_json
@@ -35,7 +35,7 @@ def _own_log():
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("run", "quickstart", "--resume", "maybe"), "'maybe' is not one of 'never', 'if-same', 'force'"),
+        (("run", "quickstart", "--resume", "maybe"), "'maybe' is not one of 'never', 'if-same'"),
         (("run", "quickstart", "--workers", "two"), "valid integer, unable to parse string as an integer, got 'two'"),
         (("caption", "--tracks", "x"), "'x' is not one of 'clean', 'perturbed', 'both'"),
     ],
@@ -211,8 +211,8 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
     stage = StageFolder(tmp_path, "plan", is_complete=False)
     stage.finish([tmp_path / "product"], Tally(input=6, kept=3, dropped={"short": 2}, failed={"no_path": 1}))
     with pytest.raises(InputError, match=r"some items failed.*no_path.: 1.*at most 0"):
-        tell_product(tmp_path / "product", tmp_path, RunConfig())
-    tell_product(tmp_path / "product", tmp_path, RunConfig(max_failed=1))
+        Job(RunConfig()).finish(tmp_path / "product", tmp_path)
+    Job(RunConfig(max_failed=1)).finish(tmp_path / "product", tmp_path)
     assert capfd.readouterr().out.count("product") == 2
 
 

@@ -1,10 +1,10 @@
 """The whole way on a tiny town: every stage, one and two workers, kill -9 in the middle of every stage."""
 
 import contextlib
+import itertools
 import json
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -30,7 +30,6 @@ from cosfly.reading.files import sha256_file
 from cosfly.work import provenance
 from cosfly.work.config import load
 from cosfly.work.folder_lock import hold_folder
-from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import read_failures
 from cosfly.work.store import read_checksums, write_checksums, write_json
 from distill.prepare import stage as prepare
@@ -87,17 +86,17 @@ def test_the_licence_of_the_map_reaches_the_card(base):
     assert "Map of Town_SynthTown: SynthTown, licence apache-2.0." in card
 
 
-def test_a_run_that_may_not_be_released_is_refused_before_it_begins(tmp_path):
-    cfg = load(RunConfig, None, [*TINY, "maps.source=cityjson", "maps.cityjson.path=/nowhere.json"])
-    with pytest.raises(ConfigError, match=r"release\.licence.*cityjson: unknown"):
-        pipeline.run(cfg, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_release_of_pictures_that_are_not_drawn_is_refused_before_it_begins(tmp_path):
-    with pytest.raises(ConfigError, match=r"render\.modalities.*no depth, no instance.*release\.modalities=\[rgb\]"):
-        pipeline.run(tiny(**{"render.modalities": "[rgb]"}), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+def test_what_the_release_would_refuse_is_refused_before_the_run_begins(tmp_path):
+    (tmp_path / "town.csv").write_text("type,x,y,length,width\nBuildings,1,1,4,4\n")
+    town = {"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"}
+    for changes, error, words in (
+        ({"maps.source": "cityjson", "maps.cityjson.path": "/nowhere.json"}, ConfigError, r"release\.licence.*cityjson: unknown"),
+        ({"render.modalities": "[rgb]"}, ConfigError, r"render\.modalities.*no depth, no instance.*release\.modalities=\[rgb\]"),
+        (town, InputError, "neither height nor half_height"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=words):
+            pipeline.run(tiny(**changes), tmp_path / "runs/mine")
+        assert [path.name for path in tmp_path.iterdir()] == ["town.csv"]
 
 
 def test_every_stage_is_complete_and_adds_up(base):
@@ -163,31 +162,19 @@ def test_a_run_that_stopped_is_shown_as_it_stands(base, tmp_path):
     assert "did you mean 'render'" in " ".join(listed.output.split())
 
 
-@pytest.mark.parametrize("config", ["", "run.yaml"])
-def test_a_run_goes_on_by_its_folder_or_its_own_settings(base, tmp_path, monkeypatch, config):
-    run = begin(base, tmp_path / "elsewhere", "simplify")
-    shutil.copy(base / "run.yaml", run)
-    asked = []
-    monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append((cfg.pedestrians.num_paths, out)) or [])
-    assert CliRunner().invoke(app, ["run", str(run / config)]).exit_code == 0
-    assert CliRunner().invoke(app, ["run", str(run / config), "--out", str(tmp_path / "new")]).exit_code == 0
-    assert asked == [(2, run), (2, tmp_path / "new")]
-
-
-@pytest.mark.parametrize(
-    ("config", "begun"),
-    [("", ()), ("", ("one/maps",)), ("run.yaml", ("one/maps",))],
-    ids=["nothing", "town", "settings"],
-)
-def test_a_run_that_was_killed_goes_on_in_its_folder_whatever_is_begun(tmp_path, monkeypatch, config, begun):
+def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path, monkeypatch):
     """Before its first stage, or of towns before their release, no stage stands beside run.yaml."""
-    (tmp_path / "run.yaml").write_text("towns: {one: {}, two: {}}\n")
-    for stage in begun:
-        write_json(tmp_path / stage / "stage.json", {})
     asked = []
     monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append(out) or [])
-    assert CliRunner().invoke(app, ["run", str(tmp_path / config)]).exit_code == 0
-    assert asked == [tmp_path]
+    for number, (config, begun) in enumerate(
+        [("", ""), ("", "one/maps"), ("run.yaml", "one/maps"), ("run.yaml", "maps")]
+    ):
+        run = tmp_path / str(number)
+        write_json(run / begun / "stage.json", {}) if begun else run.mkdir()
+        (run / "run.yaml").write_text("towns: {one: {}, two: {}}\n" if begun != "maps" else "seed: 2\n")
+        assert CliRunner().invoke(app, ["run", str(run / config)]).exit_code == 0
+        assert CliRunner().invoke(app, ["run", str(run / config), "--out", str(tmp_path / "new")]).exit_code == 0
+        assert asked[-2:] == [run, tmp_path / "new"]
 
 
 def test_settings_that_stood_in_a_folder_stay_when_the_run_is_refused_before_anything_is_done(tmp_path):
@@ -216,15 +203,6 @@ def test_a_dry_run_counts_by_the_runs_beside_it_and_writes_nothing(base, tmp_pat
     assert shown.exit_code == 0, shown.output
     assert "in all about" in shown.output
     assert not beside.exists()
-
-
-def test_a_dry_run_tells_of_compiling_where_it_was_not_done(base, tmp_path, monkeypatch):
-    told = {}
-    for name, folder in (("new", tmp_path), ("none", None)):
-        monkeypatch.setattr("cosfly.app.ahead.cache_folder", lambda folder=folder: folder)
-        shown = CliRunner().invoke(app, ["run", str(base), "--out", str(tmp_path / "run"), "--dry-run"])
-        told[name] = "of compiling, once on this machine" in shown.output
-    assert told == {"new": True, "none": False}
 
 
 def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base, tmp_path):
@@ -257,14 +235,6 @@ def test_of_more_walks_a_dry_run_counts_what_is_added(base):
     shown = CliRunner().invoke(app, ["run", str(base), "--set", "pedestrians.num_paths=3", "--dry-run"])
     assert "goes on with 1 more walks" in " ".join(shown.output.split())
     assert "refuse" not in shown.output
-
-
-def test_a_run_that_is_refused_before_anything_is_done_leaves_nothing(tmp_path):
-    (tmp_path / "town.csv").write_text("type,x,y,length,width\nBuildings,1,1,4,4\n")
-    cfg = tiny(**{"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"})
-    with pytest.raises(InputError, match="neither height nor half_height"):
-        pipeline.run(cfg, tmp_path / "runs/mine")
-    assert [path.name for path in tmp_path.iterdir()] == ["town.csv"]
 
 
 def test_what_a_teacher_will_take_is_not_made_up(base, tmp_path):
@@ -396,11 +366,10 @@ def changed(paths: list[Path], change: str) -> Iterator[Path]:
         paths[0].write_bytes(data)
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_every_changed_file_of_a_run_is_named_when_all_is_read(tampered, change):
+def test_every_changed_file_of_a_run_is_named_when_all_is_read(tampered):
     kinds = kinds_of(tampered)
     assert len(kinds) > 30
-    for kind, paths in kinds.items():
+    for (kind, paths), change in zip(kinds.items(), itertools.cycle(CHANGES)):
         with (
             changed(paths, change) as path,
             pytest.raises(VerifyError, match=re.escape(f"{path.name} has other bytes")),
@@ -409,13 +378,12 @@ def test_every_changed_file_of_a_run_is_named_when_all_is_read(tampered, change)
     assert provenance.verify([tampered / stage for stage in STAGES]) > 500
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered, change):
+def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered):
     kinds = kinds_of(tampered)
-    for kind, stages in REFUSED_BY.items():
-        for stage in stages:
-            with changed(kinds[kind], change) as path, pytest.raises(VerifyError, match=re.escape(path.name)):
-                work(tiny(), tampered, stage)
+    cases = [(kind, stage) for kind, stages in REFUSED_BY.items() for stage in stages]
+    for (kind, stage), change in zip(cases, itertools.cycle(CHANGES)):
+        with changed(kinds[kind], change) as path, pytest.raises(VerifyError, match=re.escape(path.name)):
+            work(tiny(), tampered, stage)
 
 
 def test_no_changed_picture_reaches_a_release(base, tmp_path):
@@ -488,77 +456,6 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
     out = begin(base, tmp_path / "run", stage)
     work(tiny(workers=2), out, stage)
     assert products(out / stage) == products(base / stage)
-
-
-# The moments of a kill: as the n-th file or line is made safe after the stage was opened, or as an item is done and not yet in
-# the journal while another is.
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-import test_pipeline_tiny as tiny
-from cosfly.work.journal import Journal
-from cosfly.work.stage_folder import StageFolder
-
-what, left = {what!r}, {count}
-def deadly(function):
-    def wrapped(*args, **kwargs):
-        global left
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*args, **kwargs)
-    return wrapped
-
-append = Journal.append
-def append_second(journal, record, **kwargs):
-    if journal.path.name == "items.jsonl" and journal.path.exists() and journal.path.stat().st_size:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return append(journal, record, **kwargs)
-
-opened = StageFolder.open.__func__
-def open_then_arm(cls, *args, **kwargs):
-    stage = opened(cls, *args, **kwargs)
-    if what == "file":
-        os.replace, os.fsync = deadly(os.replace), deadly(os.fsync)
-    else:
-        Journal.append = append_second
-    return stage
-StageFolder.open = classmethod(open_then_arm)
-tiny.work(tiny.tiny(), Path({out!r}), {stage!r})
-print("SURVIVED")
-"""
-
-
-def kill(out: Path, stage: str, what: str, count: int = 0) -> None:
-    program = KILLED.format(tests=str(Path(__file__).parent), what=what, count=count, out=str(out), stage=stage)
-    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
-    assert not (out / stage / "manifest.json").exists()
-
-
-def finished_items(folder: Path) -> list[str]:
-    return [record["id"] for record in Journal(folder / "items.jsonl").read()]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", STAGES)
-def test_kill_again_and_again_and_resume(base, tmp_path, stage):
-    """The products of a killed and resumed stage are those of an undisturbed one, byte for byte, and nothing is done twice.
-
-    Frames too: the renderer gives the same bytes in every process of one machine.
-    """
-    out = begin(base, tmp_path / "run", stage)
-    kill(out, stage, "file", 1)
-    if stage not in ("maps", "simplify"):  # what is done item by item
-        kill(out, stage, "item")
-        assert 0 < len(finished_items(out / stage)) < len(finished_items(base / stage))
-        assert stage == "render" or not any((out / stage / name).exists() for name in products(base / stage))
-    kill(out, stage, "file", 4)
-    work(tiny(), out, stage)
-    assert products(out / stage) == products(base / stage)
-    assert sorted(finished_items(out / stage)) == sorted(finished_items(base / stage))
-    assert not list(out.rglob("*.partial"))
 
 
 @pytest.mark.slow

@@ -30,7 +30,6 @@ from cosfly.chat.student_chat import student_files
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, line_of, write_caption_lines
 from cosfly.products.places import flight_of
-from cosfly.reading.files import read_lines
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, Tally, read_manifest
 from cosfly.work.store import write_json
@@ -254,13 +253,10 @@ def _merge(stage: StageFolder, allotted: list[Allotted], foreign: set[str] | Non
 
     Args:
         foreign: windows of a file of captions; those that are captioned are taken out.
-        with_gaps: windows are still without an answer; the product may then hold fewer captions than before.
-    Raises:
-        ResumeError: the product would lose captions; it stays as it is.
+        with_gaps: windows are still without an answer.
     """
     ledger = Ledger()
     product = stage.path / PRODUCT
-    num_before = _num_lines(product) if product.exists() and not with_gaps else 0
     parts = parts_of(stage.path, allotted, with_gaps)
 
     def lines() -> Iterator[str]:
@@ -270,17 +266,6 @@ def _merge(stage: StageFolder, allotted: list[Allotted], foreign: set[str] | Non
                 if foreign:
                     foreign.discard(caption.sample_id)
                 yield line
-        if ledger.windows.input < num_before:
-            raise ResumeError(
-                "the product would lose captions, so it stays as it is",
-                where=product,
-                got=f"{ledger.windows.input} captions of these flights and settings, {num_before} in the file",
-                fix="choose another --out, or move the file away first if fewer are wanted",
-            )
 
     write_caption_lines(product, (line.encode() for line in lines()))
     return ledger
-
-
-def _num_lines(path: Path) -> int:
-    return sum(1 for _ in read_lines(path))

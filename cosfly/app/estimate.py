@@ -77,6 +77,11 @@ class StageEstimate:
     is_done: bool
     basis: str
 
+    @property
+    def stage(self) -> str:
+        """Its name without that of a town."""
+        return self.name.rpartition("/")[2]
+
 
 # --- figures of finished runs -----------------------------------------------------------------------------------------
 
@@ -252,3 +257,32 @@ def free_bytes(out: Path) -> int:
     """Free space where a run will stand."""
     place = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     return shutil.disk_usage(place).free
+
+
+def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
+    """Say what the figures rest on, what they come to in all, and what stands in the way of the run."""
+    lines = []
+    for basis in dict.fromkeys(row.basis for row in rows):
+        names = dict.fromkeys(row.stage for row in rows if row.basis == basis)
+        lines.append(f"figures of {', '.join(names)}: {basis}")
+    needed, free = sum(row.bytes for row in rows), free_bytes(out)
+    lines.append(f"in all about {time_left(rows)}; {in_words(needed)} of disk, {in_words(free)} are free")
+    if any(row.tokens is None for row in rows):
+        lines.append(f"tokens are {UNKNOWN_TOKENS}")
+    if more := more_walks(cfg, out):
+        kept = "what stands there is kept and not counted, but for the release, which is built anew"
+        lines.append(f"{out} goes on with {more} more walks; {kept}")
+    elif others := other_settings(cfg, out):
+        listed = f"{', '.join(others[:6])}{' ...' if len(others) > 6 else ''}"
+        lines.append(
+            f"{out} was made with other settings ({listed}): its finished stages refuse them, "
+            "and only a greater pedestrians.num_paths goes on there; choose another --out"
+        )
+    if needed > free:
+        lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")
+    return lines
+
+
+def in_words(num_bytes: float) -> str:
+    """Give a size in words."""
+    return f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"

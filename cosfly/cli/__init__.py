@@ -18,9 +18,8 @@ import typer
 from cosfly import __version__
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
-from cosfly.cli.export import app as export_app
 from cosfly.cli.release import app as release_app
-from cosfly.cli.render import app as render_app
+from cosfly.cli.release import export_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
@@ -57,7 +56,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, render_app):
+for group in (run_app, stages_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (
     ("caption", caption_app),

@@ -4,134 +4,105 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from cosfly.cli import options
+from cosfly.cli.options import STAGE, Job, Sets, takes
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
-    from cosfly.app.settings import RunConfig
     from cosfly.products.captions import Writing
 
-app = typer.Typer(invoke_without_command=True, help="Step 7: Chain-of-Cause captions in English and Chinese.")
+app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
-
-Teacher = Annotated[
-    str | None,
-    typer.Option(
-        help="rules, the URL of an OpenAI-compatible endpoint, vllm:MODEL_DIR, file:PATH or "
-        "student:PATH (what `distill infer` wrote). [default: rules]"
-    ),
+TEACHER = (
+    "rules, the URL of an OpenAI-compatible endpoint, vllm:MODEL_DIR, file:PATH or student:PATH (what `distill infer` wrote)."
+)  # fmt: skip
+READERS = (
+    "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
+)
+STUDENT = "What `distill train` or `distill merge` wrote: the teacher is that student behind a server, asked as it was taught."
+Teacher = Annotated[str | None, Option(show_default="rules", help=TEACHER), Sets("caption.teacher")]
+Model = Annotated[
+    str | None, Option(help="Model name at the endpoint; by default its only one."), Sets("caption.endpoint.model")
 ]
-AsStudent = Annotated[
-    Path | None,
-    typer.Option(
-        help="What `distill train` or `distill merge` wrote: the teacher is that student behind a server, and is asked as it was taught."
-    ),
+MaxCost = Annotated[
+    float | None,
+    Option(help="Stop before this cost is passed; prices: caption.budget.price_*."),
+    Sets("caption.budget.max_cost"),
 ]
-Model = Annotated[str | None, typer.Option(help="Model name at the endpoint; by default its only one.")]
-JudgeUrl = Annotated[str | None, typer.Option(help="URL of an endpoint that judges conflicts.")]
-Readers = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
-    ),
+MaxTokens = Annotated[
+    int | None, Option(help="Stop before this many tokens are passed, all runs."), Sets("caption.budget.max_tokens")
 ]
-Keyframes = Annotated[
-    bool | None, typer.Option("--keyframes", help="Only windows at which the label changes, plus a stride.")
-]
-CaptionOut = Annotated[Path | None, typer.Option(help="Output folder; by default `caption` beside the playback tree.")]
-Limit = Annotated[int | None, typer.Option(help="Caption at most this many windows; a later run goes on.")]
-MaxCost = Annotated[float | None, typer.Option(help="Stop before this cost is passed; prices: caption.budget.price_*.")]
-MaxTokens = Annotated[int | None, typer.Option(help="Stop before this many tokens are passed, all runs.")]
-PlanOnly = Annotated[
-    bool, typer.Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
-]
-RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Ask only about the windows in quarantine.jsonl.")]
-Check = Annotated[bool, typer.Option(help="Before the first request of a folder, try what the endpoint can do.")]
 
 
 @app.callback()
+@takes(*STAGE, flights="caption.flights")
 def caption(
-    context: typer.Context,
+    job: Job,
     teacher: Teacher = None,
-    as_student: AsStudent = None,
+    as_student: Annotated[Path | None, Option(help=STUDENT), Sets("caption.student.folder")] = None,
     model: Model = None,
-    judge: JudgeUrl = None,
-    reader: Readers = None,
-    keyframes: Keyframes = None,
-    data: options.Data = None,
-    flights: options.Flights = None,
-    tracks: options.Tracks = None,
-    out: CaptionOut = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    limit: Limit = None,
+    judge: Annotated[
+        str | None, Option(help="URL of an endpoint that judges conflicts."), Sets("caption.judge.url")
+    ] = None,
+    reader: Annotated[list[str] | None, Option(help=READERS), Sets("caption.reader.urls")] = None,
+    keyframes: Annotated[
+        bool | None,
+        Option("--keyframes", help="Only windows at which the label changes, plus a stride."),
+        Sets("caption.window.keyframes"),
+    ] = None,
+    data: options.Trees = None,
+    out: Annotated[
+        Path | None, Option(show_default="`caption` beside the playback tree", help="Output folder.")
+    ] = None,
+    limit: Annotated[
+        int | None, Option(help="Caption at most this many windows; a later run goes on."), Sets("caption.limit")
+    ] = None,
     max_cost: MaxCost = None,
     max_tokens: MaxTokens = None,
-    plan_only: PlanOnly = False,
-    retry_failed: RetryFailed = False,
-    check: Check = True,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
+    plan_only: Annotated[
+        bool, Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
+    ] = False,
+    retry_failed: Annotated[
+        bool, Option("--retry-failed", help="Ask only about the windows in quarantine.jsonl.")
+    ] = False,
+    check: Annotated[bool, Option(help="Before the first request of a folder, try what the endpoint can do.")] = True,
 ) -> None:
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
-    if context.invoked_subcommand is not None:
-        return
     from caption.run import stage
 
-    chosen: dict[str, Any] = {
-        "caption.teacher": teacher,
-        "caption.endpoint.model": model,
-        "caption.student.folder": as_student,
-        "caption.judge.url": judge,
-        "caption.reader.urls": reader or None,
-        "caption.window.keyframes": keyframes,
-        "caption.limit": limit,
-        "caption.budget.max_cost": max_cost,
-        "caption.budget.max_tokens": max_tokens,
-        "seed": seed,
-        "workers": workers,
-    } | options.chosen_flights("caption.flights", flights, tracks)
-    cfg = options.resolve(config, overrides, chosen)
-    tree = options.data_folder(data)
+    cfg, tree = job.cfg.caption, options.data_folder(data)
     target = out or tree.resolve().parent / "caption"
-    options.set_aside(target, repair)
-    options.verify_first(verify, tree, target)
-    is_student = cfg.caption.student.folder is not None  # it knows one question, and no other is tried
-    if check and cfg.caption.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
-        _examine_endpoint(cfg.caption.teacher, cfg.caption, [cfg.caption.writing])
+    job.begin(target, tree)
+    is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
+    if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
+        _examine_endpoint(cfg.teacher, cfg, [cfg.writing])
     if plan_only:
-        _show_forecast(cfg, tree, target, resume)
-        return
-    given = options.manner(cfg, resume) | {"seed": cfg.seed, "retry_failed": retry_failed}
-    options.tell_product(stage.run(cfg.caption, tree, target, **given), target, cfg)
+        return _tell_forecast(job, tree, target)
+    job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.manner), target)
 
 
-def _show_forecast(cfg: RunConfig, tree: Path, target: Path, resume: options.Resume) -> None:
+def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
     from caption.run.forecast import make_forecast
     from cosfly.work.console import console
 
-    forecast = make_forecast(cfg.caption, tree, target, seed=cfg.seed, resume=resume)
-    console.print(options.plain_table("What this run will take", forecast.rows()))
+    forecast = make_forecast(job.cfg.caption, tree, target, seed=job.cfg.seed, resume=job.resume)
+    options.tell_table(console, (), forecast.rows(), title="What this run will take")
 
 
 @app.command("doctor")
+@takes()
 def caption_doctor(
-    url: Annotated[str, typer.Argument(help="URL of an OpenAI-compatible endpoint.")],
-    model: Model = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
+    job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")], model: Model = None
 ) -> None:
     """Try what an endpoint can do: images, schema, thinking, context length, ways of writing. Exit 1 if captioning cannot work."""
     from caption.writing.contract import WAYS
 
-    _examine_endpoint(url, options.resolve(config, overrides, {"caption.endpoint.model": model}).caption, tuple(WAYS))
+    _examine_endpoint(url, job.cfg.caption, tuple(WAYS))
 
 
 def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> None:
@@ -146,13 +117,11 @@ def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> 
 
 
 @app.command("prompts")
+@takes()
 def caption_prompts(
-    export: Annotated[Path | None, typer.Option(help="Folder to write the prompts in use to, to begin with.")] = None,
-    check: Annotated[
-        Path | None, typer.Option(help="Folder with prompts of yours: say what is missing or unknown, a line each.")
-    ] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
+    job: Job,
+    export: Annotated[Path | None, Option(help="Folder to write the prompts in use to, to begin with.")] = None,
+    check: Annotated[Path | None, Option(help="Folder with prompts of yours: say what is missing or unknown.")] = None,
 ) -> None:
     """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
     from caption.run.own_files import own_files
@@ -160,20 +129,17 @@ def caption_prompts(
 
     if (export is None) == (check is None):
         raise typer.BadParameter("give --export DIR or --check DIR")
-    cfg = options.resolve(config, overrides)
     if check is not None:
         typer.echo(f"{check}: {len(own_prompts(check) or {})} prompts, nothing wrong")
     elif export is not None:
-        with own_files(cfg.caption):
+        with own_files(job.cfg.caption):
             typer.echo(f"{export}: {len(export_prompts(export))} prompts")
 
 
 @app.command("actions")
 def caption_actions(
-    export: Annotated[
-        Path | None, typer.Option(help="File to write the set of actions that ships to, to begin with.")
-    ] = None,
-    check: Annotated[Path | None, typer.Option(help="File with actions of yours: say what is wrong with it.")] = None,
+    export: Annotated[Path | None, Option(help="File to write the actions that ship to, to begin with.")] = None,
+    check: Annotated[Path | None, Option(help="File with actions of yours: say what is wrong with it.")] = None,
 ) -> None:
     """Write the closed set of actions into a file, or check a file of yours; --set caption.actions=FILE captions with it."""
     import numpy as np
@@ -195,11 +161,13 @@ def caption_actions(
 
 
 @app.command("judge-check")
+@takes()
 def caption_judge_check(
-    url: Annotated[str, typer.Argument(help="OpenAI-compatible endpoint of the judge.")],
-    model: Model = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
+    job: Job,
+    url: Annotated[str, Argument(help="OpenAI-compatible endpoint of the judge."), Sets("caption.judge.url")],
+    model: Annotated[
+        str | None, Option(help="Model name at the endpoint; by default its only one."), Sets("caption.judge.model")
+    ] = None,
 ) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
@@ -208,18 +176,20 @@ def caption_judge_check(
     from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
     from cosfly.work.console import console
 
-    cfg = options.resolve(config, overrides, {"caption.judge.url": url, "caption.judge.model": model})
+    cfg = job.cfg
     with own_files(cfg.caption):
         console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, gold_conflicts(), cfg.seed))))
 
 
 @app.command("reader-check")
+@takes()
 def caption_reader_check(
-    urls: Annotated[list[str], typer.Argument(help="OpenAI-compatible endpoint of the reader, or two.")],
-    model: Model = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only so many captions, spread over the set.")] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
+    job: Job,
+    urls: Annotated[list[str], Argument(help="OpenAI-compatible endpoint, or two."), Sets("caption.reader.urls")],
+    model: Annotated[
+        list[str] | None, Option(help="Its model, or those of both."), Sets("caption.reader.models")
+    ] = None,
+    limit: Annotated[int | None, Option(min=1, help="Only so many captions, spread over the set.")] = None,
 ) -> None:
     """Measure a reader of prose on the gold set: true captions flagged, errors caught, claims, requests, tokens."""
     import asyncio
@@ -229,35 +199,28 @@ def caption_reader_check(
     from caption.truth.gold import read_gold
     from cosfly.work.console import console
 
-    given = {"caption.reader.urls": urls, "caption.reader.models": None if model is None else [model]}
-    cfg, gold = options.resolve(config, overrides, given), list(read_gold())
+    cfg, gold = job.cfg, list(read_gold())
     gold = gold if limit is None else gold[:: -(-len(gold) // limit)]
     with own_files(cfg.caption):
-        check = asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))
-        console.print(reader_check_table(check, cfg.caption.budget))
+        found = asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))
+        console.print(reader_check_table(found, cfg.caption.budget))
 
 
 @app.command("compare-strategies")
+@takes("seed", "repair", flights="caption.flights")
 def caption_compare_strategies(
-    out: Annotated[Path, typer.Option(help="Folder for compare_strategies.json and the answers.")],
-    data: options.Data = None,
-    flights: options.Flights = None,
-    tracks: options.Tracks = None,
-    teacher: Annotated[str | None, typer.Option(help="rules, or the URL of an endpoint. [default: rules]")] = None,
+    job: Job,
+    out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],
+    data: options.Trees = None,
+    teacher: Teacher = None,
     model: Model = None,
-    conflicts: Annotated[int, typer.Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    repair: options.Repair = False,
+    conflicts: Annotated[int, Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
     from caption.run import compare
     from cosfly.work.console import console
 
-    chosen = {"caption.teacher": teacher, "caption.endpoint.model": model, "seed": seed}
-    chosen |= options.chosen_flights("caption.flights", flights, tracks)
-    cfg = options.resolve(config, overrides, chosen)
-    options.set_aside(out, repair)
-    comparisons = compare.run(cfg.caption, options.data_folder(data), out, seed=cfg.seed, conflicts=conflicts)
+    job.begin(out)
+    tree = options.data_folder(data)
+    comparisons = compare.run(job.cfg.caption, tree, out, seed=job.cfg.seed, conflicts=conflicts)
     console.print(compare.comparison_table(comparisons))

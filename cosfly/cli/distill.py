@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from cosfly.cli import options
+from cosfly.cli.options import Job, Sets, takes
 
 app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set, LoRA, inference, evaluation.")
 
-
-DatasetOption = Annotated[Path, typer.Option(help="Training set, the output of `distill prepare`.")]
-ModelOption = Annotated[Path, typer.Option(help="Folder of the student's base model.")]
+Dataset = Annotated[Path, Option(help="Training set, the output of `distill prepare`.")]
+Runs = Annotated[list[Path] | None, Argument(help="Run folders, as `cosfly run` makes them; all are taken together.")]
+STUDENTS = "Who learns: a model folder, a repository as Qwen/Qwen3.5-2B, or, of random weights, tiny, tiny:small, tiny:medium, random."
+ENGINES = "transformers, endpoint (a server) or vllm."
+JUDGED = (
+    "captions.jsonl that `caption --teacher student:` made of these predictions, one a tree; of a floor's as shuffled=... or constant=..."
+)  # fmt: skip
 
 
 @app.command("tiny-student")
-def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(help="Seed of the weights.")] = 0) -> None:
+def distill_tiny_student(out: options.Out, seed: Annotated[int, Option(help="Seed of the weights.")] = 0) -> None:
     """Make a tiny, randomly initialised student, to try the way without weights."""
     from distill.student.random_student import make_tiny_student
 
@@ -26,26 +31,19 @@ def distill_tiny_student(out: options.Out, seed: Annotated[int, typer.Option(hel
 
 
 @app.command("prepare")
+@takes("seed", "verify", "resume", flights="distill.prepare.flights")
 def distill_prepare(
+    job: Job,
     out: options.Out,
-    runs: Annotated[
-        list[Path] | None, typer.Argument(help="Run folders, as `cosfly run` makes them; all go into one training set.")
-    ] = None,
+    runs: Runs = None,
     captions: Annotated[
-        list[Path] | None, typer.Option(help="captions.jsonl of a tree; repeat both for several.")
+        list[Path] | None, Option(help="captions.jsonl of a tree; repeat both for several.")
     ] = None,
     data: options.Trees = None,
-    flights: options.Flights = None,
-    tracks: options.Tracks = None,
     limit: Annotated[
-        int | None, typer.Option(help="Windows in all splits together, of each decision and flight its share; 0: all.")
+        int | None, Option(help="Windows in all splits together, of each decision and flight its share; 0: all."), Sets("distill.prepare.limit")
     ] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-) -> None:
+) -> None:  # fmt: skip
     """Captions of one run or several to a training set with splits that share no walk."""
     from distill.prepare import stage as prepare
     from distill.prepare.sources import Source
@@ -56,197 +54,146 @@ def distill_prepare(
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], strict=True)]
-    chosen = {"seed": seed, "distill.prepare.limit": limit}
-    chosen |= options.chosen_flights("distill.prepare.flights", flights, tracks)
-    cfg = options.resolve(config, overrides, chosen)
-    options.verify_first(verify, *(path for source in sources for path in (source.data, source.captions)), out)
-    typer.echo(prepare.run(cfg.distill.prepare, sources, out, seed=cfg.seed, resume=resume))
+    job.begin(out, *(path for source in sources for path in (source.data, source.captions)))
+    typer.echo(prepare.run(job.cfg.distill.prepare, sources, out, seed=job.cfg.seed, resume=job.resume))
 
 
 @app.command("dual-track")
-def distill_dual_track(
-    out: options.Out,
-    runs: Annotated[list[Path] | None, typer.Argument(help="Run folders, as `cosfly run` makes them.")] = None,
-    data: options.Trees = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-) -> None:
+@takes("seed", "verify", "resume")
+def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: options.Trees = None) -> None:
     """Windows over clean and perturbed flights, to learn denoising and prediction from, by split."""
     from distill.prepare import dual_track
 
     trees = [folder / "render" for folder in runs or []]
     if data or not trees:
         trees += options.data_folders(data)
-    cfg = options.resolve(config, overrides, {"seed": seed})
-    options.verify_first(verify, *trees, out)
-    options.tell_product(dual_track.run(cfg.distill.dual_track, trees, out, seed=cfg.seed, resume=resume), out, cfg)
+    job.begin(out, *trees)
+    job.finish(dual_track.run(job.cfg.distill.dual_track, trees, out, seed=job.cfg.seed, resume=job.resume), out)
 
 
 @app.command("train")
+@takes("seed", "verify", "resume")
 def distill_train(
-    dataset: DatasetOption,
-    student: Annotated[
-        str,
-        typer.Option(
-            help="Who learns: a model folder, the name of a repository as Qwen/Qwen3.5-2B, or, of random weights, tiny, tiny:small, "
-            "tiny:medium, random."
-        ),
-    ],
+    job: Job,
+    dataset: Dataset,
+    student: Annotated[str, Option(help=STUDENTS)],
     out: options.Out,
     data: options.Trees = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
 ) -> None:
     """Train a student, LoRA or in full, in one process or many (torchrun); continues from its last checkpoint."""
     from distill.training import stage as train
     from distill.training.ranks import is_first_process
 
-    cfg, trees = options.resolve(config, overrides, {"seed": seed}), options.data_folders(data)
-    options.verify_first(verify, dataset, *trees, out)
-    product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=resume)
+    cfg, trees = job.cfg, options.data_folders(data)
+    job.begin(out, dataset, *trees)
+    product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=job.resume)
     if is_first_process():
         typer.echo(product)
 
 
 @app.command("infer")
+@takes("verify", "resume", "repair")
 def distill_infer(
-    dataset: DatasetOption,
-    model: Annotated[
-        str,
-        typer.Option(
-            help="Folder of the student's base model, or the name of its repository; with --engine endpoint a URL."
-        ),
-    ],
+    job: Job,
+    dataset: Dataset,
+    model: Annotated[str, Option(help="Base model: a folder, or a repository's name; with --engine endpoint a URL.")],
     out: options.Out,
     engine: Annotated[
-        str | None, typer.Option(help="transformers, endpoint (a server) or vllm. [default: transformers]")
+        str | None, Option(show_default="transformers", help=ENGINES), Sets("distill.infer.engine")
     ] = None,
-    adapter: Annotated[Path | None, typer.Option(help="Adapter folder; none: the base model as it is.")] = None,
+    adapter: Annotated[Path | None, Option(help="Adapter folder; none: the base model as it is.")] = None,
     data: options.Trees = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
 ) -> None:
     """Let the student answer a split; continues where it stopped."""
     from distill.inference import stage as infer
 
-    cfg, trees = options.resolve(config, overrides, {"distill.infer.engine": engine}), options.data_folders(data)
-    options.set_aside(out, repair)
-    options.verify_first(verify, dataset, *trees, adapter, out)
-    product = infer.run(cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=resume)
-    options.tell_product(product, out, cfg)
+    trees = options.data_folders(data)
+    job.begin(out, dataset, *trees, adapter)
+    product = infer.run(job.cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=job.resume)
+    job.finish(product, out)
 
 
 @app.command("merge")
+@takes("verify", "resume")
 def distill_merge(
-    model: ModelOption,
-    adapter: Annotated[Path, typer.Option(help="Adapter folder, the output of `distill train`.")],
+    job: Job,
+    model: Annotated[Path, Option(help="Folder of the student's base model.")],
+    adapter: Annotated[Path, Option(help="Adapter folder, the output of `distill train`.")],
     out: options.Out,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
 ) -> None:
     """Put an adapter into the weights of its base: a model folder for transformers, vLLM and servers."""
     from distill.inference import merge
 
-    cfg = options.resolve(config, overrides, {})
-    options.verify_first(verify, adapter, out)
-    typer.echo(merge.run(cfg.distill.merge, model, adapter, out, resume=resume))
+    job.begin(out, adapter)
+    typer.echo(merge.run(job.cfg.distill.merge, model, adapter, out, resume=job.resume))
 
 
 @app.command("floors")
+@takes("seed")
 def distill_floors(
-    dataset: DatasetOption,
+    job: Job,
+    dataset: Dataset,
     out: options.Out,
-    split: Annotated[Literal["train", "val", "test"], typer.Option(help="Samples to answer.")] = "test",
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
+    split: Annotated[Literal["train", "val", "test"], Option(help="Samples to answer.")] = "test",
 ) -> None:
     """Answers without a look at a window, as predictions: `caption --teacher student:` judges their sentences beside a student's."""
     from distill.evaluation.floors import write_floors
 
-    for path in write_floors(dataset, split, out, options.resolve(config, overrides, {"seed": seed}).seed):
+    for path in write_floors(dataset, split, out, job.cfg.seed):
         typer.echo(path)
 
 
 @app.command("evaluate")
+@takes("seed", "verify", "resume")
 def distill_evaluate(
-    dataset: DatasetOption,
-    predictions: Annotated[Path, typer.Option(help="Predictions, the output of `distill infer`.")],
+    job: Job,
+    dataset: Dataset,
+    predictions: Annotated[Path, Option(help="Predictions, the output of `distill infer`.")],
     out: options.Out,
     bertscore_en: Annotated[
-        Path | None,
-        typer.Option(help="Local model folder for BERTScore of English (roberta-large); none: not computed."),
+        Path | None, Option(help="Model folder for BERTScore of English (roberta-large); none: not computed.")
     ] = None,
     bertscore_zh: Annotated[
-        Path | None,
-        typer.Option(help="Local model folder for BERTScore of Chinese (bert-base-chinese); none: not computed."),
+        Path | None, Option(help="Model folder for BERTScore of Chinese (bert-base-chinese); none: not computed.")
     ] = None,
-    judged: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[NAME=]CAPTIONS",
-            help="captions.jsonl that `caption --teacher student:` made of these predictions, one a tree; of a floor's as shuffled=... or constant=...",
-        ),
-    ] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
+    judged: Annotated[list[str] | None, Option(metavar="[NAME=]CAPTIONS", help=JUDGED)] = None,
 ) -> None:
     """Parse rate, decisions, verdicts on the true future, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
 
-    cfg = options.resolve(config, overrides, {"seed": seed})
-    options.verify_first(verify, predictions, dataset, out)
-    models = {"en": bertscore_en, "zh": bertscore_zh}
-    given: Any = {
-        "bertscore_models": {language: folder for language, folder in models.items() if folder is not None},
-        "judged": _by_name(map(_judged, judged or [])), "seed": cfg.seed, "resume": resume,
-    }  # fmt: skip
-    typer.echo(evaluate.run(cfg.distill.evaluate, predictions, dataset, out, **given))
+    job.begin(out, predictions, dataset)
+    given: Any = {"en": bertscore_en, "zh": bertscore_zh}
+    typer.echo(
+        evaluate.run(
+            job.cfg.distill.evaluate, predictions, dataset, out, judged=_judged(judged or []), seed=job.cfg.seed, resume=job.resume,
+            bertscore_models={language: folder for language, folder in given.items() if folder is not None},
+        )
+    )  # fmt: skip
 
 
-def _by_name(given: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
+def _judged(given: list[str]) -> dict[str, list[Path]]:
+    """Give the files of captions by whose answers they judge."""
     found: dict[str, list[Path]] = {}
-    for name, path in given:
-        found.setdefault(name, []).append(path)
+    for text in given:
+        name, mark, path = text.partition("=")
+        if not mark:
+            name, path = "student", text
+        elif name not in ("student", "shuffled", "constant"):
+            raise typer.BadParameter(f"{name}: not student, shuffled or constant", param_hint="--judged")
+        found.setdefault(name, []).append(Path(path))
     return found
 
 
-def _judged(text: str) -> tuple[str, Path]:
-    name, mark, path = text.partition("=")
-    if not mark:
-        return "student", Path(text)
-    if name not in ("student", "shuffled", "constant"):
-        raise typer.BadParameter(f"{name}: not student, shuffled or constant", param_hint="--judged")
-    return name, Path(path)
-
-
 @app.command("report")
+@takes("seed", "resume")
 def distill_report(
+    job: Job,
     evaluations: Annotated[
-        list[Path], typer.Argument(help="Folders of `distill evaluate`, one a student; their names name the rows.")
+        list[Path], Argument(help="Folders of `distill evaluate`, one a student; their names name the rows.")
     ],
     out: options.Out,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    resume: options.Resume = "if-same",
 ) -> None:
     """Students side by side: the trade-off table, and differences by paired bootstrap over walks."""
     from distill.evaluation import compare
 
-    cfg = options.resolve(config, overrides, {"seed": seed})
-    typer.echo(compare.run(cfg.distill.report, evaluations, out, seed=cfg.seed, resume=resume))
+    typer.echo(compare.run(job.cfg.distill.report, evaluations, out, seed=job.cfg.seed, resume=job.resume))

@@ -1,216 +1,261 @@
-"""What the commands share: their options, the settings they resolve, and how they tell what they made."""
+"""What the commands share: `takes`, which gives them their common options; types of options; how they tell what they made."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Option
 
 from cosfly.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+    from rich.console import Console, RenderableType
 
     from cosfly.app.settings import RunConfig
-    from cosfly.work.stage_folder import Tally
+    from cosfly.work.stage_folder import Resume, Tally
 
-
-ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with the settings of a run.")]
-Overrides = Annotated[
-    list[str] | None, typer.Option("--set", "-s", metavar="A.B=C", help="Override one setting; may be repeated.")
-]
-Seed = Annotated[int | None, typer.Option(help="Seed; every random choice derives from it.")]
-Workers = Annotated[int | None, typer.Option(help="Worker processes; 0 takes one per core.")]
-Resume = Annotated[
-    Literal["never", "if-same", "force"],
-    typer.Option(
-        help="What to do with a folder that holds work: refuse, continue if the settings are the same, or continue."
-    ),
-]
-Verify = Annotated[
-    bool,
-    typer.Option("--verify", help="First read every file of the finished stages that are used and compare its sha256."),
-]
-Out = Annotated[Path, typer.Option(help="Output folder.")]
-Map = Annotated[Path, typer.Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
-WeatherPool = Annotated[
-    Path | None, typer.Option(help="YAML file with weather presets of yours in the place of those that ship.")
-]
-TimePool = Annotated[
-    Path | None, typer.Option(help="YAML file with times of day of yours in the place of those that ship.")
-]
-Data = Annotated[
-    list[Path] | None,
-    typer.Option("--data", help="Playback tree, one; by default that of the run folder one stands in."),
-]
-Flights = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--flights", metavar="GLOB",
-        help="Only flights whose folder in the tree, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; may be repeated.",
-    ),
-]  # fmt: skip
-Tracks = Annotated[
-    Literal["clean", "perturbed", "both"] | None,
-    typer.Option("--tracks", help="Only flights of this track. [default: both]"),
-]
-
-
+Out = Annotated[Path, Option(help="Output folder.")]
+Map = Annotated[Path, Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
 Trees = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--data", help="Playback tree, once for each of several; by default that of the run folder one stands in."
-    ),
-]
+    Option("--data", show_default="that of the run folder one stands in", help="Playback tree; of commands that take several, repeat it."),
+]  # fmt: skip
 
 
-Repair = Annotated[
-    bool,
-    typer.Option(
-        "--repair",
-        help="First set aside what cannot be used in the folder's journals (FILE.aside); it is done again.",
+# --- the decorator ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sets:
+    """Stands beside an option that is short for a setting. words: what a word of the option is as a value of the setting."""
+
+    path: str
+    words: Mapping[str, Any] = field(default_factory=dict)
+
+
+Track = Literal["clean", "perturbed", "both"]
+TRACKS = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
+GLOB_HELP = "Only flights whose folder in the tree, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; may be repeated."
+TRACKS_HELP = "Only flights of this track."
+RESUME_HELP = "A folder that holds work: refuse it, or continue if settings and inputs are the same."
+SHARED: dict[str, tuple[Any, Any]] = {  # name -> type and default, in the order of the help
+    "flights": (Annotated[list[str] | None, Option(metavar="GLOB", help=GLOB_HELP), Sets("match")], None),
+    "tracks": (
+        Annotated[Track | None, Option(show_default="both", help=TRACKS_HELP), Sets("tracks", TRACKS)],
+        None,
     ),
-]
+    "config": (Annotated[Path | None, Option("--config", "-c", help="YAML file with the settings of a run.")], None),
+    "overrides": (
+        Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override one setting; may be repeated.")],
+        None,
+    ),
+    "seed": (Annotated[int | None, Option(help="Seed; every random choice derives from it."), Sets("seed")], None),
+    "workers": (Annotated[int | None, Option(help="Worker processes; 0 takes one per core."), Sets("workers")], None),
+    "verify": (Annotated[bool, Option("--verify", help="First compare every file of the stages that are read with its sha256.")], False),
+    "resume": (Annotated[Literal["never", "if-same"], Option(help=RESUME_HELP)], "if-same"),
+    "repair": (Annotated[bool, Option("--repair", help="First set aside, as FILE.aside, what is broken in the folder's journals.")], False),
+}  # fmt: skip
+STAGE = ("seed", "workers", "verify", "resume", "repair")  # of a stage that does items by workers
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the common options of a command say: the settings as they are resolved, and how to work."""
+
+    cfg: RunConfig
+    resume: Resume = "if-same"
+    verify: bool = False
+    repair: bool = False
+
+    @property
+    def manner(self) -> dict[str, Any]:
+        """How a stage works, whatever it makes: arguments that all stages with workers take."""
+        from cosfly.app.settings import manner_of_work
+
+        return manner_of_work(self.cfg) | {"resume": self.resume}
+
+    def begin(self, out: Path, *inputs: Path | None) -> None:
+        """Do what --repair and --verify ask for, before the folder is opened; both where nobody does are nothing."""
+        from cosfly.app.repair import repair
+        from cosfly.work import provenance
+
+        if self.repair:
+            typer.echo(f"{out}: {repair(out)} lines set aside")
+        if self.verify:
+            provenance.verify(path for path in (*inputs, out) if path is not None and path.exists())
+
+    def finish(self, product: Path, out: Path) -> None:
+        """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
+        from cosfly.work.stage_folder import read_manifest
+
+        typer.echo(product)
+        self.check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl")
+
+    def check_failures(self, counts_by_stage: Mapping[str, Tally], where: Path) -> None:
+        """Raise InputError, after everything was done, where more items failed than the settings accept."""
+        failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
+        if sum(sum(reasons.values()) for reasons in failed.values()) > self.cfg.max_failed:
+            raise InputError(
+                "some items failed; the others are done", where=where, got=str(failed),
+                expected=f"at most {self.cfg.max_failed} (max_failed)",
+                fix="mend what the records name and run the same command again: only the failed ones are done again",
+            )  # fmt: skip
+
+
+def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a configuration, and those of SHARED that are named; its function takes a Job first.
+
+    An option of its own with `Sets` beside its type is a setting; one that is called as a shared one stands for it. Of a command
+    with further commands below it, nothing is done where one of those is called.
+
+    Args:
+        flights: section of the settings that --flights and --tracks choose in; None: the command has neither.
+    """
+    names = ("config", "overrides", *names, *(("flights", "tracks") if flights else ()))
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        _, *own = (
+            one.replace(kind=Parameter.KEYWORD_ONLY) for one in signature(function, eval_str=True).parameters.values()
+        )
+        taken = {one.name for one in own}
+        shared = [
+            Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for name, (kind, default) in SHARED.items()
+            if name in names and name not in taken
+        ]
+        settings = {
+            one.name: sets
+            for one in (*own, *shared)
+            for sets in getattr(one.annotation, "__metadata__", ())
+            if isinstance(sets, Sets)
+        }
+
+        @functools.wraps(function)
+        def command(context: typer.Context, **given: Any) -> None:
+            if context.invoked_subcommand is not None:
+                return
+            extra = {
+                f"{flights}.{sets.path}" if name in ("flights", "tracks") and name not in taken else sets.path:
+                sets.words.get(given[name], given[name]) if isinstance(given[name], str) else given[name]
+                for name, sets in settings.items() if given[name] not in (None, [])
+            }  # fmt: skip
+            cfg = resolve(given["config"], given.get("overrides"), extra)
+            manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
+            function(Job(cfg, **manner), **{name: given[name] for name in taken})
+
+        context = Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+        command.__signature__ = Signature([context, *own, *shared])  # type: ignore[attr-defined]
+        command.__annotations__ = {}
+        return command
+
+    return decorate
+
+
+class StageGroup(typer.core.TyperGroup):
+    """A stage's command that has further commands below it: what the stage needs is not needed by those."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] in self.commands:
+            for parameter in self.params:
+                parameter.required = False
+        return super().parse_args(ctx, args)
+
+
+def stage_group(text: str) -> typer.Typer:
+    """Make the group of a stage, whose callback is the stage itself."""
+    return typer.Typer(cls=StageGroup, invoke_without_command=True, help=text)
+
+
+# --- settings and inputs ----------------------------------------------------------------------------------------------
 
 
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
-    """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings; None is not given."""
+    """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
     from cosfly.app.settings import RunConfig
     from cosfly.reading.limits import use_limits
     from cosfly.work.config import load
     from cosfly.work.store import dump_json
 
-    texts = {
-        name: value if isinstance(value, int | float | list) else str(value)
-        for name, value in given.items()
-        if value is not None
-    }
     # As YAML, which JSON is: a colon in a text is only a colon.
-    extra = [f"{name}={dump_json(value)}" for name, value in texts.items()]
+    extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
     cfg = load(RunConfig, _config_path(config), [*(overrides or []), *extra])
     use_limits(cfg.reading)
     return cfg
 
 
-def set_aside(out: Path, asked: bool) -> None:
-    """Do what --repair asks for, before the folder is opened."""
-    if asked:
-        from cosfly.app.repair import repair
-
-        typer.echo(f"{out}: {repair(out)} lines set aside")
-
-
 def _config_path(config: Path | None) -> Path | None:
-    """A path, or the bare name of a configuration that ships with cosfly."""
+    """A path, a run folder, or the bare name of a configuration that ships with cosfly."""
     from cosfly.work.config import shipped
 
     if config is None or config.is_file():
         return config
+    if (config / "run.yaml").is_file():
+        return config / "run.yaml"
     is_bare = config.suffix == "" and len(config.parts) == 1
     if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
         return packaged  # whatever folder of this name stands here
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
+    expected = f"a YAML file, a run folder, or one that ships: {', '.join(names)}"
     if config.is_dir():
+        fix = f"cosfly list {config} names the runs in it"
         raise ConfigError(
-            "a folder, and not that of a run", where=config, got="no run.yaml",
-            expected=f"a YAML file, a run folder, or one that ships: {', '.join(names)}",
-            fix=f"cosfly list {config} names the runs in it",
-        )  # fmt: skip
-    if is_bare:
-        raise ConfigError(
-            f"no such configuration{nearest(str(config), names)}", where=config,
-            expected=f"a YAML file, or one that ships: {', '.join(names)}",
-        )  # fmt: skip
-    return config
-
-
-def needed(name: str, value: Path | None) -> Path:
-    """An option that a stage needs but its subcommands do not: a usage error, exit 2, where it is missing."""
-    if value is None:
-        raise typer.BadParameter("it must be given", param_hint=f"'{name}'")
-    return value
-
-
-def manner(cfg: RunConfig, resume: Resume) -> dict[str, Any]:
-    """How a stage works, whatever it makes: arguments that all stages with workers take."""
-    from cosfly.app.settings import manner_of_work
-
-    return manner_of_work(cfg) | {"resume": resume}
-
-
-def tell_product(product: Path, out: Path, cfg: RunConfig) -> None:
-    """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
-    from cosfly.work.stage_folder import read_manifest
-
-    typer.echo(product)
-    check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl", cfg)
-
-
-def check_failures(counts_by_stage: dict[str, Tally], where: Path, cfg: RunConfig) -> None:
-    """Raise InputError, after everything was done, where more items failed than the settings accept."""
-    failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
-    if sum(sum(reasons.values()) for reasons in failed.values()) > cfg.max_failed:
-        raise InputError(
-            "some items failed; the others are done",
-            where=where,
-            got=str(failed),
-            expected=f"at most {cfg.max_failed} (max_failed)",
-            fix="mend what the records name and run the same command again: only the failed ones are done again",
+            "a folder, and not that of a run", where=config, got="no run.yaml", expected=expected, fix=fix
         )
-
-
-def chosen_flights(section: str, flights: list[str] | None, tracks: str | None) -> dict[str, Any]:
-    """Give what --flights and --tracks say, as settings of a section."""
-    return {
-        f"{section}.match": flights or None,
-        f"{section}.tracks": {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}.get(
-            tracks or ""
-        ),
-    }
+    if is_bare:
+        raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
+    return config
 
 
 def data_folder(data: list[Path] | None) -> Path:
     """The playback tree: given, or that of the run folder one stands in; raises InputError where there is none, or several are given."""
-    if data is not None and len(data) > 1:
+    trees = data_folders(data)
+    if len(trees) > 1:
         raise InputError(
-            "this command takes one playback tree", where="--data", got=f"{len(data)}: {', '.join(map(str, data))}",
+            "this command takes one playback tree", where="--data", got=f"{len(trees)}: {', '.join(map(str, trees))}",
             fix="run it once for each tree; distill and release take the results of several together",
         )  # fmt: skip
-    if data:
-        return data[0]
-    for candidate in (Path("render"), Path()):
-        if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
-            return candidate
-    raise InputError(
-        "no playback tree", where=Path.cwd(), got="no --data, and this is not a run folder", fix="give --data DIR"
-    )
+    return trees[0]
 
 
 def data_folders(data: list[Path] | None) -> list[Path]:
     """The playback trees: given, or that of the run folder one stands in."""
-    return data or [data_folder(None)]
+    if data:
+        return data
+    for candidate in (Path("render"), Path()):
+        if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
+            return [candidate]
+    got = "no --data, and this is not a run folder"
+    raise InputError("no playback tree", where=Path.cwd(), got=got, fix="give --data DIR")
 
 
-def verify_first(is_wanted: bool, *paths: Path | None) -> None:
-    """Hold inputs, and an output folder that holds something already, against their records before anything is done."""
-    from cosfly.work import provenance
-
-    if is_wanted:
-        provenance.verify(path for path in paths if path is not None and path.exists())
+# --- on the terminal --------------------------------------------------------------------------------------------------
 
 
-def plain_table(title: str | None, rows: Iterable[Sequence[str | Text]]) -> Table:
-    """A table without lines and without a header."""
+def tell_table(
+    console: Console,
+    head: Sequence[str],
+    rows: Iterable[Sequence[RenderableType]],
+    *,
+    title: str | None = None,
+    left: Sequence[str] = (),
+    **style: Any,
+) -> None:
+    """Print a table. head: names of the columns, none of a table without; numbers stand right, the first column and `left` do not."""
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
+    style = style if head else {"box": None}
+    table = Table(title=title, title_justify="left", show_header=bool(head), **style)
+    for number, name in enumerate(head):
+        table.add_column(name, justify="right" if number and name not in left else "left", overflow="fold")
     for row in rows:
         table.add_row(*row)
-    return table
+    console.print(table)
 
 
 def tell_checks(checks: Sequence[Any], console: Console, title: str | None = None) -> None:
@@ -219,6 +264,6 @@ def tell_checks(checks: Sequence[Any], console: Console, title: str | None = Non
 
     colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}
     rows = [(check.name, Text(check.state, colors[check.state]), check.detail) for check in checks]
-    console.print(plain_table(title, rows))
+    tell_table(console, (), rows, title=title)
     if any(colors[check.state] == "red" for check in checks):
         raise typer.Exit(1)

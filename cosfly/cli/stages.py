@@ -1,4 +1,4 @@
-"""The commands of steps 1 to 4 and 6: `cosfly maps`, `simplify`, `pedestrians`, `plan`, `inspect`."""
+"""The commands of steps 1 to 6 and of pictures that are there: `cosfly maps`, `simplify`, `pedestrians`, `plan`, `render`, `gallery`, `inspect`."""
 
 from __future__ import annotations
 
@@ -6,200 +6,209 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from cosfly.cli import options
+from cosfly.cli.options import STAGE, Job, Sets, takes
 
 app = typer.Typer()
 
+Simplified = Annotated[Path, Option(help="Simplified map: step2_simplified.json.")]
+Traces = Annotated[Path, Option(help="Flights: drone_trace.json.")]
+
 
 @app.command()
+@takes("seed", "resume")
 def maps(
+    job: Job,
     out: options.Out,
-    source: Annotated[
-        str | None, typer.Option(help="synthetic, simworld, cityjson or boxes; short for --set maps.source=...")
-    ] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    resume: options.Resume = "if-same",
+    source: Annotated[str | None, Option(help="synthetic, simworld, cityjson or boxes."), Sets("maps.source")] = None,
 ) -> None:
     """Step 1: make boxes_3d.json from a map source."""
     from cosfly.maps import stage
 
-    cfg = options.resolve(config, overrides, {"maps.source": source, "seed": seed})
-    typer.echo(stage.run(cfg.maps, out, seed=cfg.seed, resume=resume))
+    job.finish(stage.run(job.cfg.maps, out, seed=job.cfg.seed, resume=job.resume), out)
 
 
 @app.command()
-def simplify(
-    map_: options.Map,
-    out: options.Out,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-) -> None:
+@takes("verify", "resume")
+def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
     from cosfly.simplify import stage
 
-    cfg = options.resolve(config, overrides)
-    options.verify_first(verify, map_, out)
-    typer.echo(stage.run(cfg.simplify, map_, out, resume=resume))
+    job.begin(out, map_)
+    job.finish(stage.run(job.cfg.simplify, map_, out, resume=job.resume), out)
 
 
 @app.command()
+@takes(*STAGE)
 def pedestrians(
+    job: Job,
     map_: options.Map,
     out: options.Out,
-    roi: Annotated[Path | None, typer.Option(help="Region of interest: roi_polygon.json.")] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
+    roi: Annotated[Path | None, Option(help="Region of interest: roi_polygon.json."), Sets("roi")] = None,
 ) -> None:
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
     from cosfly.pedestrians import stage
 
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(out, repair)
-    options.verify_first(verify, map_, roi, out)
-    given = options.manner(cfg, resume) | {"seed": cfg.seed, "roi": roi or cfg.roi}
-    options.tell_product(stage.run(cfg.pedestrians, map_, out, **given), out, cfg)
+    job.begin(out, map_, roi)
+    product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.manner)
+    job.finish(product, out)
 
 
-plan_app = typer.Typer(invoke_without_command=True, help="Step 4: drone flights.")
+plan_app = options.stage_group("Step 4: drone flights.")
 app.add_typer(plan_app, name="plan")
 
 
 @plan_app.callback()
+@takes(*STAGE)
 def plan(
-    context: typer.Context,
-    map_: Annotated[Path | None, typer.Option("--map", help="Boxes: step2_simplified.json. [required]")] = None,
-    paths: Annotated[Path | None, typer.Option(help="Walks: path.json. [required]")] = None,
-    out: Annotated[Path | None, typer.Option(help="Output folder. [required]")] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
+    job: Job, map_: options.Map, paths: Annotated[Path, Option(help="Walks: path.json.")], out: options.Out
 ) -> None:
     """Step 4: a drone flight for every walk, drone_trace.json."""
-    if context.invoked_subcommand is not None:
-        return
     from cosfly.planners import stage
 
-    box_map, walks, folder = (
-        options.needed("--map", map_),
-        options.needed("--paths", paths),
-        options.needed("--out", out),
-    )
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(folder, repair)
-    options.verify_first(verify, box_map, walks, folder)
-    product = stage.run(cfg.plan, box_map, walks, folder, seed=cfg.seed, **options.manner(cfg, resume))
-    options.tell_product(product, folder, cfg)
+    job.begin(out, map_, paths)
+    job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.manner), out)
 
 
 @plan_app.command("compare")
+@takes(*STAGE)
 def plan_compare(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
-    paths: Annotated[Path, typer.Argument(metavar="PATHS", help="Walks: path.json.")],
+    job: Job,
+    map_: Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
+    paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
     out: options.Out,
     planner: Annotated[
         list[str] | None,
-        typer.Option(help="A planner to compare; repeat it. The others are held against the first. [default: all]"),
+        Option(show_default="all", help="A planner; repeat it. The others are held against the first."),
     ] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
 ) -> None:
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
-    from rich.table import Table
-
     from cosfly.planners import compare
     from cosfly.planners.compare_tables import text_tables
     from cosfly.work.config import build
     from cosfly.work.console import console
 
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(out, repair)
-    settings = cfg.plan.model_dump() | ({"planners": planner} if planner else {})
+    settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
-    options.verify_first(verify, map_, paths, out)
-    product = compare.run(compared, map_, paths, out, seed=cfg.seed, **options.manner(cfg, resume))
-    for text in text_tables(product):
-        table = Table(title=text.title, title_justify="left")
-        for k, column in enumerate(text.columns):
-            table.add_column(column, justify="right" if k else "left")
-        for row in text.rows:
-            table.add_row(*row)
-        console.print(table)
+    job.begin(out, map_, paths)
+    product = compare.run(compared, map_, paths, out, seed=job.cfg.seed, **job.manner)
+    for table in text_tables(product):
+        options.tell_table(console, table.columns, table.rows, title=table.title)
     typer.echo(product)
 
 
-inspect_app = typer.Typer(invoke_without_command=True, help="Step 6: accept, route to review or reject every flight.")
+render_app = options.stage_group("Step 5: frames of flights.")
+app.add_typer(render_app, name="render")
+
+
+@render_app.callback()
+@takes(*STAGE)
+def render(
+    job: Job,
+    map_: options.Map,
+    simplified: Simplified,
+    traces: Traces,
+    out: options.Out,
+    others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
+    weather_mode: Annotated[
+        str | None, Option(help="off, fixed or random-per-path."), Sets("render.weather_mode")
+    ] = None,
+    weather_name: Annotated[
+        str | None, Option(help="Weather of mode fixed, as heavy_rain."), Sets("render.weather_name")
+    ] = None,
+    tod_name: Annotated[
+        str | None, Option(help="Time of day of mode fixed, as night."), Sets("render.tod_name")
+    ] = None,
+    weather_pool: Annotated[
+        Path | None, Option(help="YAML file with weather presets of yours."), Sets("render.weather_pool")
+    ] = None,
+    tod_pool: Annotated[
+        Path | None, Option(help="YAML file with times of day of yours."), Sets("render.tod_pool")
+    ] = None,
+    weather_seed: Annotated[
+        int | None, Option(help="Seed of random-per-path; a negative one draws another."), Sets("render.weather_seed")
+    ] = None,
+) -> None:
+    """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
+    from cosfly.render import stage
+
+    job.begin(out, map_, simplified, traces, others)
+    manner = job.manner | {"seed": job.cfg.seed, "others": others}
+    job.finish(stage.run(job.cfg.render, map_, simplified, traces, out, **manner), out)
+
+
+@render_app.command("sample")
+@takes()
+def render_sample(
+    job: Job,
+    out: Annotated[Path, Option(help="PNG to write.")],
+    data: options.Trees = None,
+    frame: Annotated[
+        str | None,
+        Option(show_default="one that shows the target whole", help="Folder of a frame, in the tree or a path."),
+    ] = None,
+    map_: Annotated[Path | None, Option("--map", help="Boxes that were drawn; needed without debug.png.")] = None,
+) -> None:
+    """One frame's four pictures: colours, depth, instances, and boxes with ids and distances."""
+    from cosfly.look.gallery import four_panels
+    from cosfly.products.boxes import read_boxes
+
+    box_map = None if map_ is None else read_boxes(map_)
+    typer.echo(four_panels(options.data_folder(data), out, frame=frame, box_map=box_map))
+    typer.echo(out)
+
+
+@app.command()
+@takes(flights="inspect.flights")
+def gallery(
+    job: Job,
+    out: Annotated[Path, Option(help="Folder for contact_sheet.png and preview.gif.")],
+    data: options.Trees = None,
+) -> None:
+    """A contact sheet and a preview GIF of a playback tree."""
+    from cosfly.look.gallery import contact_sheet, preview_gif
+
+    tree, choice = options.data_folder(data), job.cfg.inspect.flights
+    contact_sheet(tree, out / "contact_sheet.png", choice)
+    preview_gif(tree, out / "preview.gif", choice)
+    typer.echo(out)
+
+
+inspect_app = options.stage_group("Step 6: accept, route to review or reject every flight.")
 app.add_typer(inspect_app, name="inspect")
 
 
 @inspect_app.callback()
+@takes("workers", "verify", "resume", "repair", flights="inspect.flights")
 def inspect(
-    context: typer.Context,
-    out: Annotated[Path | None, typer.Option(help="Output folder. [required]")] = None,
-    map_: Annotated[
-        Path | None,
-        typer.Option("--map", help="Simplified map: step2_simplified.json; none for a tree of somebody else."),
-    ] = None,
-    traces: Annotated[
-        Path | None, typer.Option(help="Flights: drone_trace.json; none for a tree of somebody else.")
-    ] = None,
-    data: options.Data = None,
-    flights: options.Flights = None,
-    tracks: options.Tracks = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
+    job: Job,
+    out: options.Out,
+    map_: Annotated[Path | None, Option("--map", help="step2_simplified.json; none for somebody else's tree.")] = None,
+    traces: Annotated[Path | None, Option(help="drone_trace.json; none for somebody else's tree.")] = None,
+    data: options.Trees = None,
 ) -> None:
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
-    if context.invoked_subcommand is not None:
-        return
     from cosfly.inspection import stage
 
-    folder = options.needed("--out", out)
-    chosen = {"workers": workers} | options.chosen_flights("inspect.flights", flights, tracks)
-    cfg, tree = options.resolve(config, overrides, chosen), options.data_folder(data)
-    options.set_aside(folder, repair)
-    options.verify_first(verify, map_, traces, tree, folder)
-    product = stage.run(cfg.inspect, map_, traces, tree, folder, **options.manner(cfg, resume))
-    options.tell_product(product, folder, cfg)
+    tree = options.data_folder(data)
+    job.begin(out, map_, traces, tree)
+    job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.manner), out)
 
 
 @inspect_app.command("review")
 def inspect_review(
-    folder: Annotated[Path, typer.Option("--inspect", help="Folder of the inspection, or its inspect.json.")],
+    folder: Annotated[Path, Option("--inspect", help="Folder of the inspection, or its inspect.json.")],
     accept: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FLIGHT", help="Accept a flight, or the flights in review of a trajectory; repeat it."),
+        list[str] | None, Option(metavar="FLIGHT", help="Accept a flight, or those of a trajectory; repeat it.")
     ] = None,
     reject: Annotated[
-        list[str] | None, typer.Option(metavar="FLIGHT", help="Reject a flight, or those of a trajectory; repeat it.")
+        list[str] | None, Option(metavar="FLIGHT", help="Reject a flight, or those of a trajectory; repeat it.")
     ] = None,
-    by: Annotated[str | None, typer.Option(help="Who decides.")] = None,
-    reason: Annotated[str | None, typer.Option(help="Why.")] = None,
-    decisions: Annotated[
-        Path | None, typer.Option(help="What review.html saved: take its decisions, by whom it says.")
-    ] = None,
+    by: Annotated[str | None, Option(help="Who decides.")] = None,
+    reason: Annotated[str | None, Option(help="Why.")] = None,
+    decisions: Annotated[Path | None, Option(help="What review.html saved: take its decisions.")] = None,
 ) -> None:
     """Decide flights that the inspection left to a person: make review.html, or take what was decided, into review.jsonl."""
     from cosfly.inspection import review

@@ -6,25 +6,24 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from cosfly.cli import options
+from cosfly.cli.options import STAGE, Job, takes
+from cosfly.cli.stages import Simplified, Traces
 
-app = typer.Typer(
-    no_args_is_help=True, help="Compare depth formats, levels of zoom and weathers on the same frames and flights."
-)
+ABOUT = "Compare depth formats, levels of zoom and weathers on the same frames and flights."
+app = typer.Typer(no_args_is_help=True, help=ABOUT)
 
 
 @app.command("depth")
 def study_depth(
-    out: Annotated[Path, typer.Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
-    data: options.Data = None,
+    out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
+    data: options.Trees = None,
     frame: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of a frame, from the tree on or as a path, or a .npy of depth in metres, float32 or float64. [default: a frame of the tree that shows the target whole]"
-        ),
+        Path | None, Option(show_default="one that shows the target whole", help="Folder of a frame, in the tree or a path, or a .npy of depth in metres.")
     ] = None,
-) -> None:
+) -> None:  # fmt: skip
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
     from cosfly.look.gallery import best_frame, frame_in
     from cosfly.studies import depth
@@ -38,73 +37,61 @@ def study_depth(
 
 
 @app.command("weather")
+@takes("seed")
 def study_weather(
+    job: Job,
     map_: options.Map,
-    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
-    out: Annotated[Path, typer.Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
-    trajectory: Annotated[int, typer.Option(help="Which flight of the traces, counted from 0.")] = 0,
+    traces: Traces,
+    out: Annotated[Path, Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
+    trajectory: Annotated[int, Option(help="Which flight of the traces, counted from 0.")] = 0,
     frame: Annotated[
-        int | None, typer.Option(help="Which of its frames. [default: the one that looks down least]")
+        int | None, Option(show_default="the one that looks down least", help="Which of its frames.")
     ] = None,
-    fov: Annotated[float, typer.Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
-    weather_pool: options.WeatherPool = None,
-    tod_pool: options.TimePool = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
+    fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
+    weather_pool: Annotated[Path | None, Option(help="YAML file with weather presets of yours.")] = None,
+    tod_pool: Annotated[Path | None, Option(help="YAML file with times of day of yours.")] = None,
 ) -> None:
     """One view under every weather and time of day: nine pictures, and a sheet of all."""
+    from cosfly.render.settings import RenderConfig
     from cosfly.render.weather import read_pools
     from cosfly.studies import weather
+    from cosfly.work.config import build
     from cosfly.work.console import progress_bar
 
-    pools = {"render.weather_pool": weather_pool, "render.tod_pool": tod_pool}
-    mode = {"render.weather_mode": "random_per_path"} if any(pools.values()) else {}
-    cfg = options.resolve(config, overrides, {"seed": seed, **mode, **pools})
-    presets = read_pools(cfg.render)
+    pools = {"weather_pool": weather_pool, "tod_pool": tod_pool}
+    given = {name: path for name, path in pools.items() if path is not None}
+    mode = {"weather_mode": "random_per_path"} if given else {}
+    cfg = build(RenderConfig, job.cfg.render.model_dump() | mode | given, "--weather-pool, --tod-pool")
+    presets = read_pools(cfg)
     with progress_bar("study weather: pictures", len(presets.weathers) * len(presets.times)) as advance:
         product = weather.run(
-            cfg.render, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=cfg.seed, advance=lambda: advance(1),
+            cfg, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=job.cfg.seed, advance=lambda: advance(1),
         )  # fmt: skip
     for path in product:
         typer.echo(path)
 
 
 @app.command("zoom")
+@takes(*STAGE)
 def study_zoom(
+    job: Job,
     map_: options.Map,
-    simplified: Annotated[Path, typer.Option(help="Simplified map: step2_simplified.json.")],
-    traces: Annotated[Path, typer.Option(help="Flights: drone_trace.json.")],
+    simplified: Simplified,
+    traces: Traces,
     out: options.Out,
-    flights: Annotated[int | None, typer.Option(help="Flights at most. [default: 50]")] = None,
-    every: Annotated[int | None, typer.Option(help="Every how many frames of a flight are drawn. [default: 2]")] = None,
-    config: options.ConfigFile = None,
-    overrides: options.Overrides = None,
-    seed: options.Seed = None,
-    workers: options.Workers = None,
-    verify: options.Verify = False,
-    resume: options.Resume = "if-same",
-    repair: options.Repair = False,
+    flights: Annotated[int | None, Option(show_default="50", help="Flights at most.")] = None,
+    every: Annotated[int | None, Option(show_default="2", help="Every how many frames of a flight are drawn.")] = None,
 ) -> None:
     """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
-    from rich.table import Table
-
     from cosfly.reading.documents import read_object
     from cosfly.studies import zoom
     from cosfly.work.config import build
     from cosfly.work.console import console
 
-    cfg = options.resolve(config, overrides, {"seed": seed, "workers": workers})
-    options.set_aside(out, repair)
-    options.verify_first(verify, map_, simplified, traces, out)
-    given = {"num_flights": flights, "every": every}
-    settings = cfg.render.model_dump() | {name: value for name, value in given.items() if value is not None}
-    studied = build(zoom.ZoomStudyConfig, settings, "--flights, --every")
-    product = zoom.run(studied, map_, simplified, traces, out, seed=cfg.seed, **options.manner(cfg, resume))
-    table = Table(title="Zoom (mean ± standard deviation over flights)", title_justify="left")
-    for column in ("level", "deg", "35 mm", "target px", "visibility %", "IoU"):
-        table.add_column(column)
-    for row in zoom.text_rows(read_object(product, what="zoom study")):
-        table.add_row(*row)
-    console.print(table)
-    options.tell_product(product, out, cfg)
+    given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
+    studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")
+    job.begin(out, map_, simplified, traces)
+    product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.manner)
+    head, rows = zoom.HEAD, zoom.text_rows(read_object(product, what="zoom study"))
+    options.tell_table(console, head, rows, title="Zoom (mean ± standard deviation over flights)", left=head)
+    job.finish(product, out)

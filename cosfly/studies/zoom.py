@@ -35,6 +35,7 @@ from cosfly.work.store import write_bytes, write_json
 SCHEMA, VERSION = "cosfly.zoom_study", "1.0"
 STAGE = "zoom_study"
 NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of flights
+HEAD = ("level", "deg", "35 mm", "target px", "visibility %", "IoU")  # of `text_rows`
 FIGURES = ("width_px", "height_px", "visibility", "track_quality")
 PAPER = {
     110: (12, 24, 89.2, 0.72),

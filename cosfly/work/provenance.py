@@ -46,8 +46,8 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: what the folder was begun with. `resumed_with_other` lists what differed when it was forced on, `grown_from` the sha256 of
-    its products before more items were added, which its product now begins with or holds unchanged.
+    """`stage.json`: what the folder was begun with. `grown_from` lists the sha256 of its products before more items were added,
+    which its product now begins with or holds unchanged.
 
     package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
     """
@@ -58,7 +58,6 @@ class StageRecord(_Record):
     inputs: dict[str, StageInput]
     code_version: str
     package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
-    resumed_with_other: list[str] = Field([], exclude_if=lambda differences: not differences)
     grown_from: list[str] = Field([], exclude_if=lambda digests: not digests)
 
 

@@ -49,7 +49,7 @@ from cosfly.work.store import (
 
 log = logging.getLogger(__name__)
 
-Resume = Literal["never", "if-same", "force"]
+Resume = Literal["never", "if-same"]
 
 # What stands in a folder before anything is finished.
 BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")
@@ -205,8 +205,7 @@ class StageFolder:
         Args:
             config: the stage's settings; those that are MayDiffer are not put on record.
             inputs: name -> file or folder that the stage reads.
-            resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed;
-                `force` continues with the finished items in spite of a difference, which stays on record.
+            resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed.
             package_files: name -> file or flat folder of the package that decides what is made.
             audited: names of inputs that the stage itself holds against their records, item by item.
             grows: names of settings of which more means more items, those of before unchanged.
@@ -248,8 +247,7 @@ class StageFolder:
     ) -> StageFolder | None:
         """Give a folder that is complete as `record` says, which takes no lock; None where there is something to do."""
         manifest = read_manifest(out)
-        differing, grown = _may_continue(out, record, config, resume, grows)
-        if differing or grown or manifest.counts.failed:
+        if _may_continue(out, record, config, resume, grows) or manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
         remove_left_lock(out)
@@ -328,7 +326,7 @@ class StageFolder:
 def _taken_up(
     out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str], begins_anew: bool
 ) -> StageRecord:
-    """Make what stands in a folder ready to be gone on with; gives the record with what was forced, and what has grown, noted."""
+    """Make what stands in a folder ready to be gone on with; gives the record with what has grown noted."""
     if not (out / "stage.json").exists():
         # A kill may have come while the record was being written.
         if any(entry.name != LOCK and not is_partial_of("stage.json", entry) for entry in out.iterdir()):
@@ -344,7 +342,7 @@ def _taken_up(
             if name != "stage.json":
                 (out / name).unlink(missing_ok=True)
         return record
-    differences, grown = _may_continue(out, record, config, resume, grows)
+    grown = _may_continue(out, record, config, resume, grows)
     before = list(found.grown_from)
     if grown:
         log.info("%s: goes on with more: %s", out, "; ".join(grown))
@@ -355,33 +353,27 @@ def _taken_up(
             write_model(out / "stage.json", noted, schema=STAGE_SCHEMA, version=VERSION)
         if begins_anew:
             (out / "items.jsonl").unlink(missing_ok=True)
-    return record.model_copy(
-        update={"resumed_with_other": [*found.resumed_with_other, *differences], "grown_from": before}
-    )
+    return record.model_copy(update={"grown_from": before})
 
 
-def _may_continue(
-    out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str]
-) -> tuple[list[str], list[str]]:
-    """See whether the work that stands in a folder may be continued as `record` says; gives what differs where it is forced, and what
-    has only grown. What is not on record, since a version of before had no such setting, is no difference while it has its default.
-    """
+def _may_continue(out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str]) -> list[str]:
+    """See whether the work that stands in a folder may be continued as `record` says; gives what has only grown. What is not on record, since a version of before had no such setting, is no difference while it has its default."""
     found = read_stage_record(out)
     found = found.model_copy(update={"config": _filled(found.config, config)})
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
     grown = _grown(found, record, grows)
     differences = [phrase for name, phrase in _differences(found, record) if name not in grown]
-    if differences and resume == "if-same":
+    if differences:
         raise ResumeError(
             "the folder holds work made with other settings or inputs",
             where=out,
             got="; ".join(differences),
-            fix="choose another --out, restore the setting, or --resume force to keep the finished items all the same",
+            fix="choose another --out, or restore what differs",
         )
     if found.code_version != record.code_version:
         log.warning("%s: continued by version %s, begun by %s", out, record.code_version, found.code_version)
-    return differences, list(grown.values())
+    return list(grown.values())
 
 
 def _holds_work(out: Path) -> bool:

@@ -31,7 +31,6 @@ import cv2
 import scenes
 from bench_render import FILES, make_inputs
 
-from cosfly.app.ahead import compile_render
 from cosfly.products import frames
 from cosfly.products.boxes import read_boxes
 from cosfly.products.traces import read_traces
@@ -245,7 +244,6 @@ def main() -> None:
         given.inputs.mkdir(parents=True)
         make_inputs(given.inputs, NUM_FLIGHTS)
         return
-    compile_render()  # or all workers would compile the same
     for name in given.maps:
         run_map(name, given.inputs / name, given)
 
