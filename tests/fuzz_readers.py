@@ -52,7 +52,6 @@ from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
 from cosfly.planners.compare_tables import text_tables
-from cosfly.png.read import parse_png
 from cosfly.products import review
 from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
 from cosfly.products.answer_text import Parsed, parse_answer
@@ -66,6 +65,7 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import write_meshes
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
 from cosfly.products.playback import read_flight
+from cosfly.products.png import parse_png
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
 from cosfly.products.town import read_town_map, write_town_map

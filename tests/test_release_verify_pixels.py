@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from release_tampering import png
 
-from cosfly.png.read import parse_png
 from cosfly.products.frames import grid_rows
+from cosfly.products.png import parse_png
 from release.verify.findings import Findings
 from release.verify.person import check_shown, outline_step
 from release.verify.pixels import (

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.png.read import parse_png
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values
 from cosfly.products.kinds import KINDS
+from cosfly.products.png import parse_png
 from cosfly.work.compiled import njit
 
 NO_DEPTH = np.empty((0, 0), np.float32)

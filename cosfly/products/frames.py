@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
-from cosfly.png.write import areas_png, colours_png
 from cosfly.products.places import tree_of_flight
+from cosfly.products.png import areas_png, colours_png
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import parse_array_header, read_array, read_picture
 from cosfly.reading.documents import read_model

@@ -23,17 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba import boolean, extending, int64, types
+from numba import boolean, int64
 from numba.core import caching, event
 
 from cosfly.reading.files import read_bytes
 
-__all__ = ["boolean", "int64", "njit", "put_word", "word_at"]
+__all__ = ["boolean", "int64", "njit"]
 
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).parents[1]
-intrinsic: Any = extending.intrinsic  # of what it decorates, callers do not give the first argument
 UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
 
 
@@ -84,30 +83,6 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
         return compiled
 
     return decorate
-
-
-@intrinsic
-def word_at(typing: Any, address: Any) -> Any:
-    """In compiled code: the eight bytes from an address (`array.ctypes.data`) on as one uint64, least byte first. Nobody looks whether they are
-    the array's; and an array that is named no more after that may be gone."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = builder.inttoptr(args[0], context.get_value_type(types.CPointer(types.uint64)))
-        return context.data_model_manager[types.uint64].load_from_data_pointer(builder, place, align=1)
-
-    return types.uint64(types.uint64), codegen
-
-
-@intrinsic
-def put_word(typing: Any, address: Any, word: Any) -> Any:
-    """In compiled code: write eight bytes from an address on, as `word_at` reads them."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = builder.inttoptr(args[0], context.get_value_type(types.CPointer(types.uint64)))
-        builder.store(args[1], place, align=1)
-        return context.get_dummy_value()
-
-    return types.void(types.uint64, types.uint64), codegen
 
 
 def sources_digest(package: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.png.read import Png
+from cosfly.products.png import Png
 from release.verify.findings import Findings
 from release.verify.pixels import outline_of
 from release.verify.rows import FlightRows

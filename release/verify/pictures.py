@@ -8,9 +8,9 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.png.read import Png, parse_png
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values, grid_rows
 from cosfly.products.kinds import KINDS
+from cosfly.products.png import Png, parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.space.reprojection import View, median_of
 from release.columns import PICTURES
