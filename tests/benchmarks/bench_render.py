@@ -59,7 +59,7 @@ boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])
 cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
 trace = read_traces(traces)[number]
 renderer = open_renderer("gl", read_boxes(boxes), cfg.width_px, cfg.height_px)
-settings = [cfg.visible_threshold] if not hasattr(cfg, "png_compression") else [cfg.png_compression, cfg.visible_threshold]
+settings = [cfg.visible_threshold]
 writing = Writing(tuple(cfg.modalities), *settings)
 script = script_flight(trace, number, "clean", "Town", None, cfg, 0)
 with tempfile.TemporaryDirectory() as scratch:
