@@ -27,12 +27,11 @@ from cosfly.reading.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import BOX, POINT, POSE
 from release.record import read_record
-from release.stats.cells import Absent, Stats, Table
 from release.stats.counting import Counts, overlap
 from release.stats.page import markdown, page_html
 from release.stats.pixels import BIN_M, Pixels
 from release.stats.stats import run
-from release.stats.tables import weather
+from release.stats.tables import Absent, Stats, Table, weather
 from specimens import make_flight
 
 BIG = dict(zip(BOX, (10.0, 10.0, 20.0, 30.0), strict=True))
@@ -177,7 +176,9 @@ def test_pages_show_foreign_text_as_text():
         Table(key=evil, title=evil, paper=evil, note=evil, head=["a", evil, "c"], rows=rows, plot=plot)
         for plot in (None, "bars", "stacked", "heat")
     ]
-    stats = Stats(name=evil, content_digest="0" * 64, tables=tables, absent=[Absent(what=evil, paper=evil, why=evil)])
+    stats = Stats(
+        name=evil, runs=[evil], content_digest="0" * 64, tables=tables, absent=[Absent(what=evil, paper=evil, why=evil)]
+    )
     page, text = page_html(stats, default_coverage()), markdown(stats)
     assert "<script" not in page
     assert "<script" not in text
@@ -190,7 +191,7 @@ def test_an_empty_table_is_drawn():
     empty = [
         Table(key="x", title="x", head=["a", "b"], rows=[], plot=plot) for plot in (None, "bars", "stacked", "heat")
     ]
-    assert "<table>" in page_html(Stats(name="x", content_digest="", tables=empty, absent=[]), Coverage())
+    assert "<table>" in page_html(Stats(name="x", runs=[], content_digest="", tables=empty, absent=[]), Coverage())
 
 
 def test_nothing_is_kept_a_frame():
@@ -252,8 +253,13 @@ def test_a_release_is_counted_again(dataset, tmp_path):
     for table in written.tables:
         assert f'id="{table.key}"' in page
         assert table.title.split("|")[0][:20] in text.replace("\\", "")
-    for outside in ("<script", "src=", "://"):
+    for outside in ("<script", 'src="http', "://"):
         assert outside not in page
+    assert "<title>one</title>" in page  # the run's name
+    places = [
+        page.index(text) for text in (f"<b>{numbers['frames']:,}</b>frames", "are proved", "<img", 'id="release"', "<h2>Rules")
+    ]
+    assert places == sorted(places)  # how much, how good, a picture, tables, formulas
 
 
 @pytest.mark.parametrize(

@@ -2,25 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 from cosfly.escaping import for_markdown
 from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import page
 from cosfly.products.coverage import Coverage
-from release.stats.cells import Absent, Cell, Stats, Table
+from release.record import ReleaseRecord
+from release.stats.tables import Cell, Stats, Table
 
 STYLE = """
-.tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; } .tables .wide { column-span: all; margin-top: 12px; }
-td.bar { width: 26%; min-width: 80px; } td.bar > i { display: block; height: 11px; margin-top: 6px; border-radius: 2px; min-width: 1px; } td.bar .stack { height: 11px; margin: 6px 0 0; }
+.tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; }
+.tables .wide { column-span: all; margin-top: 12px; } figure.first img { max-width: 100%; border-radius: 8px; }
+td.bar { width: 26%; min-width: 80px; } td.bar .stack { height: 11px; margin: 6px 0 0; }
+td.bar > i { display: block; height: 11px; margin-top: 6px; border-radius: 2px; min-width: 1px; }
 .k0 { --own: var(--good); } .k1 { --own: var(--bad); } .k2 { --own: var(--unread); }
 """
 
 
-def page_html(stats: Stats, coverage: Coverage) -> str:
-    """Give the page's text."""
+def page_html(
+    stats: Stats, coverage: Coverage, tiles: Sequence[tuple[str, str]] = (), picture: str | None = None
+) -> str:
+    """Give the page's text.
+
+    Args:
+        tiles: what a person asks first, how much and how good. picture: of one frame, JPEG in base64.
+    """
     return page(
-        "release/stats/page.html", title=stats.name, style=STYLE, stats=stats, coverage=coverage_html(coverage), shown=shown,
-        numeric_columns=_numeric_columns, greatest=_greatest,
+        "release/stats/page.html", title=", ".join(stats.runs) or stats.name, style=STYLE, stats=stats, tiles=tiles,
+        picture=picture, coverage=coverage_html(coverage), shown=shown, numeric_columns=_numeric_columns, greatest=_greatest,
     )  # fmt: skip
+
+
+def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
+    """Give what a person asks first: how much there is, and how good it is."""
+    numbers, captions, found = record.numbers, record.numbers.captions, record.history.flights
+    quality = {row[0]: row[1] for table in stats.tables if table.key == "quality_stats" for row in table.rows}
+    seen, proved = numbers.visibility.mean, captions.mean_proved["proved_en"]
+    values: list[tuple[str, Any, Any]] = [  # name, value or count, of how many
+        ("frames", numbers.frames, None),
+        ("flights", numbers.flights, None),
+        ("trajectories", numbers.trajectories, None),
+        ("towns", len(numbers.frames_by.town), None),
+        ("captions", captions.frames_with, None),
+        ("GB", round(numbers.files.bytes / 1e9, 2), None),
+        ("of the flights that were found are released", found.released, found.found),
+        ("of the frames show the person", numbers.frames_target_visible, numbers.frames),
+        ("of the person is seen, on average", seen, None if seen is None else 1),
+        ("mean smoothness score", quality["mean smoothness score S"], None),
+        ("of the decisions are those of the geometry", captions.decision_equals_label, captions.with_label),
+        ("of a caption's sentences are proved", proved, None if proved is None else 1),
+    ]
+    return [
+        (name, shown(value) if whole is None else f"{100 * value / whole:.1f} %")
+        for name, value, whole in values
+        if value is not None and whole != 0
+    ]
 
 
 def _numeric_columns(table: Table) -> list[bool]:
@@ -49,18 +87,16 @@ def markdown(stats: Stats) -> str:
         parts.append(f"## {for_markdown(table.title)}" + (f" ({for_markdown(table.paper)})" if table.paper else ""))
         parts += [for_markdown(table.note)] if table.note else []
         parts.append(_markdown_table(table.head, table.rows))
-    parts += ["## What this release cannot tell", _absent(stats.absent)]
+    absent: list[list[Cell]] = [[one.what, one.paper, one.why] for one in stats.absent]
+    parts += ["## What this release cannot tell", _markdown_table(["what", "of the paper", "why"], absent)]
+    parts += ["## Rules", *(for_markdown(f"{name}: {rule}.") for name, rule in stats.rules.items())]
     return "\n\n".join(parts) + "\n"
 
 
-def _absent(absent: list[Absent]) -> str:
-    return _markdown_table(["what", "of the paper", "why"], [[one.what, one.paper, one.why] for one in absent])
-
-
 def _markdown_table(head: list[str], rows: list[list[Cell]]) -> str:
-    lines = ["| " + " | ".join(for_markdown(name) for name in head) + " |", "|" + "|".join("---" for _ in head) + "|"]
-    lines += [
-        "| " + " | ".join(for_markdown(cell) if isinstance(cell, str) else shown(cell) for cell in row) + " |"
-        for row in rows
+    texts = [
+        [for_markdown(cell) if isinstance(cell, str) else shown(cell) for cell in row]
+        for row in [list[Cell](head), *rows]
     ]
-    return "\n".join(lines)
+    lines = [f"| {' | '.join(cells)} |" for cells in texts]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])

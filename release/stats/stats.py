@@ -10,8 +10,8 @@ from release.card.numbers import Counted, check_rows, row_lists
 from release.columns import SHORT_NAMES
 from release.record import read_record, release_folder
 from release.stats.counting import Counts
-from release.stats.page import markdown, page_html
-from release.stats.pixels import look_at
+from release.stats.page import markdown, page_html, tiles_of
+from release.stats.pixels import look_at, middle_picture
 from release.stats.tables import make_stats
 
 
@@ -38,5 +38,6 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     stats = make_stats(record, counts, looked)
     write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": card.coverage.model_dump(mode="json")})
     write_bytes(out / "stats.md", markdown(stats).encode())
-    write_bytes(out / "stats.html", page_html(stats, card.coverage).encode())
+    page = page_html(stats, card.coverage, tiles_of(record, stats), middle_picture(dataset, record))
+    write_bytes(out / "stats.html", page.encode())
     return out / "stats.html"

@@ -3,120 +3,72 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from statistics import fmean
+from typing import Literal
 
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.products.actions import shipped_actions
+from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
+from cosfly.products.captions import FIELDS
 from cosfly.products.frames import LEVEL_NAMES
 from cosfly.products.weather import TIMES, WEATHERS, preset_token
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
-from release.card.numbers import bounded, spread_of
-from release.columns import PICTURES
-from release.record import ReleaseRecord
-from release.stats import caption_tables
-from release.stats.cells import (
-    SPREAD,
-    Absent,
-    Cell,
-    Stats,
-    Table,
-    mean_cell,
-    mean_over,
-    pairs,
-    percent,
-    ratio,
-    rounded,
-    spread_over,
-    spread_row,
-)
-from release.stats.counting import ANNOTATIONS, Counts, FlightSums
+from release.card.numbers import Sum, bounded, spread_of
+from release.columns import LANGUAGE_NAMES, LANGUAGES, PICTURES, STATES
+from release.record import ReleaseRecord, Spread
+from release.stats.counting import ANNOTATIONS, TEXT_BIN, Counts, FlightSums
 from release.stats.pixels import Pixels
 
-
-def weather(counts: Counts) -> list[Table]:
-    """Frames by preset and time of day: no table where no frame names one, and sun and air where the frames tell these."""
-    tables = []
-    named = Counter(
-        {
-            (_token(weather), _token(time)): n
-            for (weather, time), n in counts.weather.items()
-            if weather is not None or time is not None
-        }
-    )
-    if named:
-        presets = list(WEATHERS)
-        presets += sorted({weather for weather, _ in named} - set(presets))
-        times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
-        rows: list[list[Cell]] = [[preset, *(named[preset, time] for time in times)] for preset in presets]
-        note = f"Frames. Presets of the paper are all listed; {len(named)} of {len(presets) * len(times)} pairs are in this release."
-        tables.append(
-            Table(
-                key="weather",
-                title="Weather and time of day",
-                paper="tab:weather_coverage",
-                note=note,
-                head=["preset", *times],
-                rows=rows,
-                plot="heat",
-            )
-        )
-    if counts.looks:
-        rows = [[look, count] for look, count in counts.looks.most_common(40)]
-        tables.append(
-            Table(
-                key="looks",
-                title="Sun and air",
-                note="Of the renderer's own settings.",
-                head=["look", "frames"],
-                rows=rows,
-            )
-        )
-    return tables
-
-
-def _token(text: str | None) -> str:
-    return "not told" if text is None else preset_token(text)
-
-
-def perturbation(counts: Counts) -> list[Table]:
-    tables = []
-    total = counts.states.total()
-    if total:
-        order = ("unperturbed", "position only", "rotation only", "full")
-        rows: list[list[Cell]] = [
-            [state, counts.states[state], percent(counts.states[state], total)] for state in order
-        ]
-        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer are perturbed than were drawn."
-        tables.append(
-            Table(
-                key="augmentation_states",
-                title="Perturbation",
-                paper="tab:augmentation_states",
-                note=note,
-                head=["state", "frames", "%"],
-                rows=rows,
-                plot="bars",
-            )
-        )
-        names = [name for name in counts.over_frames if name.endswith((", m", ", deg"))]
-        spreads = [spread_row(name, counts.over_frames[name].spread()) for name in names]
-        tables.append(
-            Table(
-                key="offsets", title="Size of the offsets", note="Where they are not zero.", head=SPREAD, rows=spreads
-            )
-        )
-    if counts.events:
-        rows = [[track, event, outcome, count] for (track, event, outcome), count in sorted(counts.events.items())]
-        tables.append(
-            Table(
-                key="events",
-                title="What became of each perturbation",
-                paper="sec:exp_zoom",
-                head=["track", "event", "outcome", "frames"],
-                rows=rows,
-            )
-        )
-    return tables
-
-
+Cell = str | int | float | None
+Rows = list[list[Cell]]
+Plot = Literal["bars", "stacked", "heat"]
+SPREAD = ["axis", "mean", "std", "least", "most", "values"]  # the head of a table of spread rows
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
+VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
+MOST_LOOKS = 40
+
+
+class Table(BaseModel):
+    """One table. paper: the label of the paper's; rows: as long as `head`; plot: how the page draws it beside.
+
+    bars: the second column as bars, named by the first. stacked: all columns of numbers, a bar a row. heat: the numbers of a row and column of names.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    key: str
+    title: str
+    head: list[str]
+    rows: Rows
+    paper: str | None = None
+    note: str = ""
+    plot: Plot | None = None
+
+
+class Absent(BaseModel):
+    """What the paper tells of its data and this release cannot: not in it, never made up."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    what: str
+    paper: str
+    why: str
+
+
+class Stats(BaseModel):
+    """The whole file. content_digest: of the release that was counted; runs: that it was made of;
+    rules: what they are, by what they decide."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    runs: list[str]
+    content_digest: str
+    tables: list[Table]
+    absent: list[Absent]
+    rules: dict[str, str] = {}
 
 
 def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> Stats:
@@ -126,63 +78,120 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
         pixels: of some frames' pictures; None where nobody looked at them.
     """
     tables = [
-        _release(record, counts), _annotations(record, counts), _dist(record, counts), _frames(counts), _quality(record, counts), _zoom(counts),
-        _fovs(counts), *caption_tables.of_captions(record, counts), _towns(record, counts), _splits(record), *weather(counts),
-        *perturbation(counts), _files(record), *_pixels(pixels),
+        _release(record, counts), _quality(record, counts), _dist(record, counts), _frames(counts), *_captions(record, counts),
+        _annotations(record, counts), _towns(record, counts), _splits(record), _zoom(counts), _fovs(counts), *weather(counts),
+        *_perturbation(counts), _files(record), *_pixels(pixels),
     ]  # fmt: skip
     return Stats(
-        name=record.name, content_digest=record.content_digest, tables=tables, absent=_absent(record, counts, pixels)
-    )
+        name=record.name, runs=[source.run for source in record.provenance.sources], content_digest=record.content_digest,
+        tables=[table for table in tables if table is not None], absent=_absent(record, counts, pixels),
+        rules={"Frames of a flight": record.frame_selection, "Splits": record.splits.rule},
+    )  # fmt: skip
+
+
+def _table(
+    key: str, title: str, head: list[str], rows: Rows, *, paper: str = "", note: str = "", plot: Plot | None = None
+) -> Table:
+    return Table(key=key, title=title, head=head, rows=rows, paper=paper or None, note=note, plot=plot)
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+
+
+def _pairs(front: str, counted: Iterable[tuple[str, int]]) -> Rows:
+    return [[front + name, count] for name, count in counted]
+
+
+def _spread_row(title: str, spread: Spread) -> list[Cell]:
+    """Give a row under the head SPREAD."""
+    return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
+
+
+def _over(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) -> Spread:
+    """Spread over flights of a flight's mean, of those that have one."""
+    means = (of(flight).spread().mean for flight in flights)
+    return spread_of(mean for mean in means if mean is not None)
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    known = list(values)
+    return round(fmean(known), 4) if known else None
+
+
+def _rounded(*values: float | None) -> list[Cell]:
+    return [None if value is None else round(value, 3) for value in values]
+
+
+def percent(count: int, total: int) -> float | None:
+    """Share of a total in percent, rounded; None of nothing."""
+    return round(100.0 * count / total, 2) if total else None
+
+
+# --- how much, how good -----------------------------------------------------------------------------------------------
 
 
 def _release(record: ReleaseRecord, counts: Counts) -> Table:
-    flights, history, numbers = counts.flights.values(), record.history, record.numbers
-    tracks = Counter(flight.track for flight in flights)
-    rendered = [flight.frames_available for flight in record.flights]
-    released = [flight.frames for flight in flights]
-    planned = history.trajectories
+    flights, numbers, planned = counts.flights.values(), record.numbers, record.history.trajectories
+    rendered, released = [one.frames_available for one in record.flights], [one.frames for one in flights]
     steps: Cell = ", ".join(f"{step:g}" for step in sorted(counts.step_s)) or None
     if len(counts.step_s) == 1:
         steps = next(iter(counts.step_s))  # a number stands where numbers stand
-    rows: list[list[Cell]] = [
+    kinds = record.settings.modalities
+    rows: Rows = [
         ["trajectories", numbers.trajectories],
-        *pairs("flights, ", sorted(tracks.items())),
+        *_pairs("flights, ", sorted(Counter(flight.track for flight in flights).items())),
         ["walks", len({flight.walk for flight in flights})],
         ["frames", counts.frames],
-        ["pictures (" + ", ".join(record.settings.modalities) + ")", counts.frames * len(record.settings.modalities)],
+        [f"pictures ({', '.join(kinds)})", counts.frames * len(kinds)],
         ["frames of a flight as rendered, least", min(rendered, default=None)],
         ["frames of a flight as rendered, most", max(rendered, default=None)],
         ["frames of a flight as released, least", min(released, default=None)],
         ["frames of a flight as released, most", max(released, default=None)],
         ["time step, s", steps],
-        *pairs("frames of ", counts.image_px.most_common()),
+        *_pairs("frames of ", counts.image_px.most_common()),
         ["captions", numbers.captions.frames_with],
-        ["trajectories planned for one accepted", ratio(planned.planned, planned.accepted) if planned else None],
+        [
+            "trajectories planned for one accepted",
+            round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None,
+        ],
     ]
-    note = f"Frames of a flight: {record.frame_selection}."
-    return Table(
-        key="release",
-        title="The release",
-        paper="sec:dataset_stats, sec:exp_release",
-        note=note,
-        head=["", "number"],
-        rows=rows,
-    )
+    paper = "sec:dataset_stats, sec:exp_release"
+    return _table("release", "The release", ["", "number"], rows, paper=paper)
 
 
-def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
-    rows: list[list[Cell]] = [
-        [f"picture: {PICTURES[file].name}", counts.frames, 100.0 if counts.frames else None]
-        for file in record.settings.modalities
+def _quality(record: ReleaseRecord, counts: Counts) -> Table:
+    planned, flights = record.history.trajectories, record.history.flights
+    rows: Rows = []
+    if planned is not None:
+        rows += [["trajectories generated", planned.planned]]
+        rows += _pairs("dropped before rendering: ", planned.dropped.items())
+        rows += [["trajectories rendered", planned.rendered], ["of these accepted", planned.accepted]]
+        rows += [["of these to review", planned.review], ["of these rejected", planned.rejected]]
+    rows += [["flights found", flights.found], *_pairs("flights left out: ", flights.left_out.items())]
+    known, within, scores = smoothness(counts)
+    five_ray = _five_ray(record, counts)
+    below = sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray) if five_ray else None
+    rows += [
+        ["flights released", flights.released],
+        ["mean five-ray visibility of clean flights, as inspected", _mean(five_ray)],
+        [f"of these below {FIVE_RAY_MEAN_MIN:.0%}", below],
+        ["mean RMS acceleration, m/s²", _mean(accel for accel, _ in known)],
+        ["mean RMS jerk, m/s³", _mean(jerk for _, jerk in known)],
+        ["mean smoothness score S", _mean(scores)],
+        [f"trajectories within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³", within],
+        [f"trajectories with S below {REVIEW_BELOW:g}", sum(score < REVIEW_BELOW for score in scores)],
+        ["trajectories whose motion is known", len(known)],
     ]
-    rows += [[name, counts.annotated[name], percent(counts.annotated[name], counts.frames)] for name in ANNOTATIONS]
-    return Table(
-        key="annotations",
-        title="Annotations of a frame",
-        paper="sec:dataset_stats",
-        head=["annotation", "frames", "%"],
-        rows=rows,
-    )
+    note = "The way to the release is as the record tells it. Acceleration and jerk: of the motion without perturbation, over frames in a row."
+    return _table("quality_stats", "Funnel and smoothness", ["", "value"], rows, paper="tab:quality_stats", note=note)
+
+
+def smoothness(counts: Counts) -> tuple[list[tuple[float, float]], int, list[float]]:
+    """Give acceleration and jerk of the trajectories whose motion is known, how many are within the paper's bounds, and their scores."""
+    dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(counts)]
+    known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
+    within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
+    return known, within, [smoothness_score(*pair) for pair in known]
 
 
 def _trajectories(counts: Counts) -> list[FlightSums]:
@@ -206,24 +215,18 @@ def _dist(record: ReleaseRecord, counts: Counts) -> Table:
     flights = _trajectories(counts)
     known = [flight for flight in flights if flight.is_known]
     rows = [
-        spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
-        spread_row("altitude over the person's ground, m", spread_over(known, lambda flight: flight.height)),
-        spread_row("target distance, m", spread_over(known, lambda flight: flight.distance)),
-        spread_row("rendered visibility", spread_over(flights, lambda flight: flight.visibility)),
-        spread_row("five-ray visibility, as inspected", spread_of(_five_ray(record, counts))),
+        _spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
+        _spread_row("altitude over the person's ground, m", _over(known, lambda flight: flight.height)),
+        _spread_row("target distance, m", _over(known, lambda flight: flight.distance)),
+        _spread_row("rendered visibility", _over(flights, lambda flight: flight.visibility)),
+        _spread_row("five-ray visibility, as inspected", spread_of(_five_ray(record, counts))),
     ]
     note = (
         "Means of each trajectory, as flown without perturbation: of its clean flight, else its perturbed one less the recorded offsets. "
         f"The length is that through the released frames: of {sum(f.frames for f in flights):,} frames."
     )
-    return Table(
-        key="dist_stats",
-        title="Per-axis statistics over trajectories",
-        paper="tab:dist_stats",
-        note=note,
-        head=SPREAD,
-        rows=rows,
-    )
+    title = "Per-axis statistics over trajectories"
+    return _table("dist_stats", title, SPREAD, rows, paper="tab:dist_stats", note=note)
 
 
 def _frames(counts: Counts) -> Table:
@@ -232,105 +235,121 @@ def _frames(counts: Counts) -> Table:
         "distance": "target distance, m",
         "visibility": "rendered visibility",
     }
-    rows = [spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
+    rows = [_spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
     note = "Both tracks, as the pictures show it, perturbation and all."
-    return Table(
-        key="dist_frames", title="The same over frames", paper="tab:dist_stats", note=note, head=SPREAD, rows=rows
+    return _table("dist_frames", "The same over frames", SPREAD, rows, paper="tab:dist_stats", note=note)
+
+
+# --- captions ---------------------------------------------------------------------------------------------------------
+
+
+def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
+    """What captions say: decisions, verdicts, repairs, evidence, lengths."""
+    repairs: Rows = [[name, n, percent(n, counts.repairs.total())] for name, n in counts.repairs.most_common()]
+    head = ["strategy", "captions", "%"]
+    return [
+        _decisions(record, counts), _confusion(record, counts), _verdicts(counts),
+        _table("repairs", "Repairs", head, repairs, paper="fig:regen_strategy", plot="bars"),
+        _teachers(record), *_evidence(counts), _lengths(counts), *_length_bins(counts),
+    ]  # fmt: skip
+
+
+def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
+    actions = record.actions or shipped_actions()
+    decisions, labels = counts.decisions, counts.labels
+    total, labelled = decisions.total(), labels.total() - labels["none"]
+    rows: Rows = []
+    for name in (*actions.tokens, *sorted(decisions.keys() - {*actions.tokens, "none"})):
+        group = actions.actions[name].group if name in actions.actions else ""
+        shares = percent(decisions[name], total), percent(labels[name], labelled)
+        rows.append([name, decisions[name], shares[0], labels[name], shares[1], group])
+    note = f"Decisions of {total:,} captions, and the labels that the later positions imply for {labelled:,} of them."
+    head = ["action", "decisions", "%", "labels", "% ", "group"]
+    return _table("decisions", "Decisions", head, rows, paper="tab:coc_actions", note=note, plot="bars")
+
+
+def _confusion(record: ReleaseRecord, counts: Counts) -> Table:
+    order = [name for name in (*record.closed_set, "none") if counts.labels[name] or counts.decisions[name]]
+    rows: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
+    title, paper = "Label (rows) against decision (columns)", "fig:confusion_patterns"
+    return _table("confusion", title, ["label", *order], rows, paper=paper, plot="heat")
+
+
+def _verdicts(counts: Counts) -> Table:
+    tracks = sorted({track for _, track in counts.verdicts})
+    names = [*VERDICTS, *sorted({name for name, _ in counts.verdicts} - set(VERDICTS))]
+    rows: Rows = []
+    for name in names:
+        own = [counts.verdicts[name, track] for track in tracks]
+        rows.append([name, sum(own), percent(sum(own), counts.verdicts.total()), *own])
+    note = "Of accepted captions, after repair: what the paper's figure shows is of first answers, before it."
+    title, head, paper = (
+        "Decision against the geometry",
+        ["verdict", "captions", "%", *tracks],
+        "fig:consistency_verdict",
     )
+    return _table("verdicts", title, head, rows, paper=paper, note=note, plot="bars")
 
 
-def _quality(record: ReleaseRecord, counts: Counts) -> Table:
-    planned, flights = record.history.trajectories, record.history.flights
-    rows: list[list[Cell]] = []
-    if planned is not None:
-        rows += [["trajectories generated", planned.planned]]
-        rows += [[f"dropped before rendering: {reason}", count] for reason, count in planned.dropped.items()]
-        rows += [["trajectories rendered", planned.rendered], ["of these accepted", planned.accepted]]
-        rows += [["of these to review", planned.review], ["of these rejected", planned.rejected]]
-    rows += [["flights found", flights.found]]
-    rows += [[f"flights left out: {reason}", count] for reason, count in flights.left_out.items()]
-    rows += [["flights released", flights.released]]
-    dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(counts)]
-    known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
-    scores = [smoothness_score(*pair) for pair in known]
-    within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
-    five_ray = _five_ray(record, counts)
-    below = sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray) if five_ray else None
-    rows += [
-        ["mean five-ray visibility of clean flights, as inspected", mean_cell(five_ray)],
-        [f"of these below {FIVE_RAY_MEAN_MIN:.0%}", below],
-        ["mean RMS acceleration, m/s²", mean_cell(accel for accel, _ in known)],
-        ["mean RMS jerk, m/s³", mean_cell(jerk for _, jerk in known)],
-        ["mean smoothness score S", mean_cell(scores)],
-        [f"trajectories within {ACCEL_RMS_MAX_MPS2:g} m/s² and {JERK_RMS_MAX_MPS3:g} m/s³", within],
-        [f"trajectories with S below {REVIEW_BELOW:g}", sum(score < REVIEW_BELOW for score in scores)],
-        ["trajectories whose motion is known", len(known)],
+def _teachers(record: ReleaseRecord) -> Table:
+    made = record.provenance
+    rows = _pairs("captions of ", [(f"{teacher.kind}: {teacher.model}", teacher.captions) for teacher in made.teachers])
+    rows += [["asks", made.asks], *_pairs("", [(name.replace("_", " "), count) for name, count in made.tokens.items()])]
+    rows += [["first answers that stood", made.repairs.first_answers]]
+    rows += _pairs("repaired by ", made.repairs.repaired_by_rung.items())
+    note = "As the record tells it, of all captions that were read."
+    return _table("teachers", "Teachers", ["", "number"], rows, paper="tab:caption_pipeline", note=note)
+
+
+def _evidence(counts: Counts) -> list[Table]:
+    if not counts.sentences:
+        return []
+    kinds = ("all proved", "a contradicted one", "some unread")
+    sentences: Rows = [
+        [LANGUAGE_NAMES[name], *(counts.sentences[name, state] for state in STATES)] for name in LANGUAGES
     ]
-    note = "The way to the release is as the record tells it. Acceleration and jerk: of the motion without perturbation, over frames in a row."
-    return Table(
-        key="quality_stats",
-        title="Funnel and smoothness",
-        paper="tab:quality_stats",
-        note=note,
-        head=["", "value"],
-        rows=rows,
-    )
-
-
-def _zoom(counts: Counts) -> Table:
-    groups: dict[tuple[float | None, str], list[FlightSums]] = defaultdict(list)
-    for flight in counts.flights.values():
-        groups[None if flight.zooms else round(flight.fov_deg, 1), flight.track].append(flight)
-    rows: list[list[Cell]] = []
-    for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-(pair[0][0] or 0.0), pair[0][1])):
-        means = [
-            mean_over(flights, of)
-            for of in (lambda f: f.width_px, lambda f: f.height_px, lambda f: f.visibility, lambda f: f.iou)
-        ]
-        visibility = None if means[2] is None else 100.0 * means[2]
-        level = "changing" if fov is None else LEVEL_NAMES.get(round(fov), "")
-        focal_px = (
-            None if fov is None else mean_cell(flight.focal_px for flight in flights if flight.focal_px is not None)
-        )
-        rows.append([level, fov, track, *rounded(focal_px), len(flights), *rounded(*means[:2], visibility, means[3])])
-    here = {round(fov) for fov, _ in groups if fov is not None}
-    missing = ", ".join(f"{name} ({fov} deg)" for fov, name in LEVEL_NAMES.items() if fov not in here)
-    note = (
-        "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of that box and the box of the person's pixels. "
-        'A flight of one field of view is in its row, one that zooms under "changing", so rows are of different flights; the paper\'s study of the same flights at four is another matter.'
-    )
-    note += f" Not in this release: {missing}." if missing else ""
-    head = [
-        "level",
-        "field of view, deg",
-        "track",
-        "focal length, px",
-        "flights",
-        "width, px",
-        "height, px",
-        "visibility, %",
-        "IoU",
+    captions: Rows = [[LANGUAGE_NAMES[name], *(counts.whole[name, kind] for kind in kinds)] for name in LANGUAGES]
+    note, title = "Sentences of the captions against the geometry of their flight.", "Evidence of sentences"
+    return [
+        _table("evidence", title, ["language", *STATES], sentences, note=note, plot="stacked"),
+        _table("evidence_captions", "Evidence of captions", ["language", *kinds], captions, plot="stacked"),
     ]
-    return Table(key="zoom_eval", title="Zoom", paper="tab:zoom_eval", note=note, head=head, rows=rows)
 
 
-def _fovs(counts: Counts) -> Table:
-    frames, trajectories = Counter[float](), Counter[float]()
-    for flight in counts.flights.values():
-        frames[_fov_of(flight)] += flight.frames
-    for flight in _trajectories(counts):
-        trajectories[_fov_of(flight)] += 1
-    rows: list[list[Cell]] = [
-        [f"{fov:g}" if fov else "changing", trajectories[fov], frames[fov]] for fov in sorted(frames)
-    ]
-    head = ["degrees", "trajectories", "frames"]
-    paper = "tab:zoom_config, sec:exp_release"
-    return Table(key="fovs", title="Fields of view", paper=paper, head=head, rows=rows, plot="bars")
+def _lengths(counts: Counts) -> Table:
+    rows: Rows = []
+    for language in LANGUAGES:
+        least = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
+        for name in FIELDS[:2]:
+            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
+            rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least[name]])
+    note, head = "Characters. The last column is the least that an answer may have.", ["text", *SPREAD[1:], "floor"]
+    return _table("text_lengths", "Length of the texts", head, rows, paper="fig:coc_lengths", note=note)
 
 
-def _fov_of(flight: FlightSums) -> float:
-    """Its field of view, degrees; 0 for one that zooms."""
-    return 0.0 if flight.zooms else round(flight.fov_deg, 1)
+def _length_bins(counts: Counts) -> list[Table]:
+    tables = []
+    for language in LANGUAGES:
+        for name in FIELDS[:2]:
+            found = {k: n for (own, field, k), n in counts.length_bins.items() if (own, field) == (language, name)}
+            width = TEXT_BIN[language]
+            bins = range(min(found, default=0), max(found, default=-1) + 1)
+            rows: Rows = [[f"{k * width} to {k * width + width - 1}", found.get(k, 0)] for k in bins]
+            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters"
+            key, head = f"lengths_{language}_{name}", ["characters", "captions"]
+            tables += [_table(key, title, head, rows, paper="fig:coc_lengths", plot="bars")] if rows else []
+    return tables
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
+    found = {f"picture: {PICTURES[file].name}": counts.frames for file in record.settings.modalities}
+    found |= {name: counts.annotated[name] for name in ANNOTATIONS}
+    rows: Rows = [[name, count, percent(count, counts.frames)] for name, count in found.items()]
+    head = ["annotation", "frames", "%"]
+    return _table("annotations", "Annotations of a frame", head, rows, paper="sec:dataset_stats")
 
 
 def _towns(record: ReleaseRecord, counts: Counts) -> Table:
@@ -338,33 +357,111 @@ def _towns(record: ReleaseRecord, counts: Counts) -> Table:
     for flight in counts.flights.values():
         frames[flight.town] += flight.frames
         captions[flight.town] += flight.captions
-    for flight in _trajectories(counts):
-        trajectories[flight.town] += 1
+    trajectories.update(flight.town for flight in _trajectories(counts))
     maps = {shown.town: f"{shown.name} ({shown.licence})" for shown in record.maps}
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [town, trajectories[town], frames[town], captions[town], maps.get(town, "")] for town in sorted(frames)
     ]
     head = ["town", "trajectories", "frames", "captions", "map (licence)"]
-    return Table(key="towns", title="Towns", paper="sec:exp_release", head=head, rows=rows, plot="bars")
+    return _table("towns", "Towns", head, rows, paper="sec:exp_release", plot="bars")
 
 
 def _splits(record: ReleaseRecord) -> Table:
-    rows: list[list[Cell]] = [
+    rows: Rows = [
         [split, own.frames, own.captions, own.flights, own.trajectories, len(own.walks), len(own.towns)]
         for split, own in record.splits.splits.items()
     ]
     head = ["split", "frames", "captions", "flights", "trajectories", "walks", "towns"]
-    return Table(
-        key="splits", title=f"Splits, by {record.splits.by}", note=record.splits.rule, head=head, rows=rows, plot="bars"
+    return _table("splits", f"Splits, by {record.splits.by}", head, rows, plot="bars")
+
+
+def _zoom(counts: Counts) -> Table:
+    groups: dict[tuple[float, str], list[FlightSums]] = defaultdict(list)
+    for flight in counts.flights.values():
+        groups[_fov_of(flight), flight.track].append(flight)
+    rows: Rows = []
+    for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-pair[0][0], pair[0][1])):
+        sizes = [_over(flights, of).mean for of in (lambda f: f.width_px, lambda f: f.height_px)]
+        visibility, iou = (_over(flights, of).mean for of in (lambda f: f.visibility, lambda f: f.iou))
+        focal_px = _mean(flight.focal_px for flight in flights if flight.focal_px is not None) if fov else None
+        level = LEVEL_NAMES.get(round(fov), "") if fov else "changing"
+        seen = None if visibility is None else 100.0 * visibility
+        rows.append([level, fov or None, track, *_rounded(focal_px), len(flights), *_rounded(*sizes, seen, iou)])
+    here = {round(fov) for fov, _ in groups}
+    missing = ", ".join(f"{name} ({fov} deg)" for fov, name in LEVEL_NAMES.items() if fov not in here)
+    note = (
+        "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of that box and the box of the person's pixels. "
+        'A flight of one field of view is in its row, one that zooms under "changing", so rows are of different flights; the paper\'s study of the same flights at four is another matter.'
     )
+    note += f" Not in this release: {missing}." if missing else ""
+    head = [
+        "level", "field of view, deg", "track", "focal length, px", "flights", "width, px", "height, px", "visibility, %", "IoU",
+    ]  # fmt: skip
+    return _table("zoom_eval", "Zoom", head, rows, paper="tab:zoom_eval", note=note)
+
+
+def _fovs(counts: Counts) -> Table:
+    frames = Counter[float]()
+    for flight in counts.flights.values():
+        frames[_fov_of(flight)] += flight.frames
+    trajectories = Counter(map(_fov_of, _trajectories(counts)))
+    rows: Rows = [[f"{fov:g}" if fov else "changing", trajectories[fov], frames[fov]] for fov in sorted(frames)]
+    head, paper = ["degrees", "trajectories", "frames"], "tab:zoom_config, sec:exp_release"
+    return _table("fovs", "Fields of view", head, rows, paper=paper, plot="bars")
+
+
+def _fov_of(flight: FlightSums) -> float:
+    """Its field of view, degrees; 0 for one that zooms."""
+    return 0.0 if flight.zooms else round(flight.fov_deg, 1)
+
+
+def weather(counts: Counts) -> list[Table]:
+    """Frames by preset and time of day: no table where no frame names one, and sun and air where the frames tell these."""
+    tables = []
+    named = Counter(
+        {(_token(a), _token(b)): n for (a, b), n in counts.weather.items() if a is not None or b is not None}
+    )
+    if named:
+        presets = [*WEATHERS, *sorted({weather for weather, _ in named} - set(WEATHERS))]
+        times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
+        rows: Rows = [[preset, *(named[preset, time] for time in times)] for preset in presets]
+        note = f"Frames. Presets of the paper are all listed; {len(named)} of {len(presets) * len(times)} pairs are in this release."
+        title, head = "Weather and time of day", ["preset", *times]
+        tables += [_table("weather", title, head, rows, paper="tab:weather_coverage", note=note, plot="heat")]
+    if counts.looks:
+        looks, note = _pairs("", counts.looks.most_common(MOST_LOOKS)), "Of the renderer's own settings."
+        tables += [_table("looks", "Sun and air", ["look", "frames"], looks, note=note)]
+    return tables
+
+
+def _token(text: str | None) -> str:
+    return "not told" if text is None else preset_token(text)
+
+
+def _perturbation(counts: Counts) -> list[Table]:
+    tables = []
+    total = counts.states.total()
+    if total:
+        order = ("unperturbed", "position only", "rotation only", "full")
+        rows: Rows = [[state, counts.states[state], percent(counts.states[state], total)] for state in order]
+        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer are perturbed than were drawn."
+        key, head = "augmentation_states", ["state", "frames", "%"]
+        tables += [_table(key, "Perturbation", head, rows, paper=f"tab:{key}", note=note, plot="bars")]
+        sizes = {name: values for name, values in counts.over_frames.items() if name.endswith((", m", ", deg"))}
+        rows = [_spread_row(name, values.spread()) for name, values in sizes.items()]
+        tables += [_table("offsets", "Size of the offsets", SPREAD, rows, note="Where they are not zero.")]
+    if counts.events:
+        rows = [[*names, count] for names, count in sorted(counts.events.items())]
+        title, head = "What became of each perturbation", ["track", "event", "outcome", "frames"]
+        tables += [_table("events", title, head, rows, paper="sec:exp_zoom")]
+    return tables
 
 
 def _files(record: ReleaseRecord) -> Table:
-    files = record.numbers.files
-    frames = max(1, record.numbers.frames)
-    rows: list[list[Cell]] = [[name, size, round(size / frames, 1)] for name, size in files.bytes_by_modality.items()]
-    rows.append(["all shards", files.bytes, round(files.bytes / frames, 1)])
-    return Table(key="files", title="Bytes", note=f"{files.shards} shards.", head=["", "bytes", "a frame"], rows=rows)
+    files, frames = record.numbers.files, max(1, record.numbers.frames)
+    sizes = {**files.bytes_by_modality, "all shards": files.bytes}
+    rows: Rows = [[name, size, round(size / frames, 1)] for name, size in sizes.items()]
+    return _table("files", "Bytes", ["", "bytes", "a frame"], rows, note=f"{files.shards} shards.")
 
 
 def _pixels(pixels: Pixels | None) -> list[Table]:
@@ -372,73 +469,30 @@ def _pixels(pixels: Pixels | None) -> list[Table]:
         return []
     tables = []
     note = f"Of {pixels.frames:,} frames, spread evenly over the release."
-    depths: list[list[Cell]] = [[f"{100 * share:g} %", metres] for share, metres in pixels.percentiles_m()]
+    depths: Rows = [[f"{100 * share:g} %", metres] for share, metres in pixels.percentiles_m()]
     if depths:
         seen = int(pixels.depths.sum()) + pixels.sky + pixels.invalid
-        shares = f" Sky: {percent(pixels.sky, seen)} % of the pixels, invalid: {percent(pixels.invalid, seen)} %."
-        tables.append(
-            Table(
-                key="depth",
-                title="Depth, percentiles",
-                paper="sec:step6",
-                note=note + shares,
-                head=["pixels nearer than", "m"],
-                rows=depths,
-                plot=None,
-            )
-        )
-    kinds: list[list[Cell]] = [
-        [kind, round(100 * share, 3), round(100 * shown, 1)] for kind, share, shown in pixels.by_kind()
-    ]
+        sky, invalid = percent(pixels.sky, seen), percent(pixels.invalid, seen)
+        shares = f"{note} Sky: {sky} % of the pixels, invalid: {invalid} %."
+        head = ["pixels nearer than", "m"]
+        tables += [_table("depth", "Depth, percentiles", head, depths, paper="sec:step6", note=shares)]
+    kinds: Rows = [[kind, round(100 * share, 3), round(100 * shown, 1)] for kind, share, shown in pixels.by_kind()]
     if kinds:
-        tables.append(
-            Table(
-                key="semantics",
-                title="Kinds in the pictures",
-                paper="sec:step6",
-                note=note,
-                head=["kind", "% of pixels", "% of frames"],
-                rows=kinds,
-                plot="bars",
-            )
-        )
+        head = ["kind", "% of pixels", "% of frames"]
+        tables += [_table("semantics", "Kinds in the pictures", head, kinds, paper="sec:step6", note=note, plot="bars")]
     return tables
 
 
 def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> list[Absent]:
     """Name what the paper has and this release cannot tell."""
-    absent = [
-        Absent(what="the same flights at four fields of view", paper="tab:zoom_eval", why="needs rendering: each flight of a release has one field of view"),
-        Absent(what="boxes of the maps, before and after simplification", paper="sec:dataset_stats", why="a release holds no map: see simplify_report.json"),
-        Absent(what="verdicts of first answers", paper="fig:consistency_verdict", why="a release holds accepted captions alone: see caption_report.json"),
+    no_weather = all(weather is None and time is None for weather, time in counts.weather)
+    table = [
+        (True, "the same flights at four fields of view", "tab:zoom_eval", "needs rendering: each flight of a release has one field of view"),
+        (True, "boxes of the maps, before and after simplification", "sec:dataset_stats", "a release holds no map: see simplify_report.json"),
+        (True, "verdicts of first answers", "fig:consistency_verdict", "a release holds accepted captions alone: see caption_report.json"),
+        (not _five_ray(record, counts), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats", "no flight of this release was inspected against its map"),
+        (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage", "no frame of this release names a preset"),
+        (not counts.events, "fallbacks of the perturbation", "sec:exp_zoom", "no frame of this release tells what became of it"),
+        (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6", "the pictures were not looked at: --pixels"),
     ]  # fmt: skip
-    if not _five_ray(record, counts):
-        why = "no flight of this release was inspected against its map"
-        absent.append(
-            Absent(what="five-ray visibility of the planner", paper="tab:dist_stats, tab:quality_stats", why=why)
-        )
-    if all(weather is None and time is None for weather, time in counts.weather):
-        absent.append(
-            Absent(
-                what="weather and time of day, 15 x 4",
-                paper="tab:weather_coverage",
-                why="no frame of this release names a preset",
-            )
-        )
-    if not counts.events:
-        absent.append(
-            Absent(
-                what="fallbacks of the perturbation",
-                paper="sec:exp_zoom",
-                why="no frame of this release tells what became of it",
-            )
-        )
-    if pixels is None:
-        absent.append(
-            Absent(
-                what="percentiles of depth, kinds in the pictures",
-                paper="sec:step6",
-                why="the pictures were not looked at: --pixels",
-            )
-        )
-    return absent
+    return [Absent(what=what, paper=paper, why=why) for is_absent, what, paper, why in table if is_absent]
