@@ -257,7 +257,8 @@ def test_a_release_is_counted_again(dataset, tmp_path):
         assert outside not in page
     assert "<title>one</title>" in page  # the run's name
     places = [
-        page.index(text) for text in (f"<b>{numbers['frames']:,}</b>frames", "are proved", "<img", 'id="release"', "<h2>Rules")
+        page.index(text)
+        for text in (f"<b>{numbers['frames']:,}</b>frames", "are proved", "<img", 'id="release"', "<h2>Rules")
     ]
     assert places == sorted(places)  # how much, how good, a picture, tables, formulas
 

@@ -15,7 +15,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 import cosfly
-from cosfly.escaping import for_terminal
+from cosfly.escaping import for_markdown, for_terminal, markdown_code
 from cosfly.reading.files import read_text
 from cosfly.work.store import dump_json
 
@@ -37,6 +37,11 @@ def page(template: str, *, title: str, style: str = "", script: str = "", **valu
 def fragment(template: str, **values: Any) -> str:
     """Give a part of a page, which another template prints as it is."""
     return Markup(_environment().get_template(template).render(**values))
+
+
+def markdown(template: str, **values: Any) -> str:
+    """Give a page of Markdown, of a template by its path from the folder of the packages."""
+    return _markdown_environment().get_template(template).render(**values)
 
 
 def run_name(folder: Path) -> str:
@@ -69,3 +74,27 @@ def _printed(value: Any) -> Any:
     if isinstance(value, str) and not isinstance(value, Markup):
         return for_terminal(value)
     return "–" if value is None else value
+
+
+@lru_cache(maxsize=1)
+def _markdown_environment() -> Environment:
+    environment = Environment(
+        undefined=StrictUndefined, finalize=_in_markdown, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True, loader=FunctionLoader(lambda name: read_text(ROOT / name)),
+    )  # fmt: skip
+    environment.filters |= {
+        "code": lambda text: Markup(markdown_code(text)),
+        "codes": lambda names: Markup(", ".join(map(markdown_code, names))),
+        "thousands": "{:,}".format,
+        "g": "{:g}".format,
+        "share": lambda count, total: f"{100.0 * count / total:.1f} %" if total else "-",
+        "safe": Markup,
+    }
+    return environment
+
+
+def _in_markdown(value: Any) -> Any:
+    """Escape texts, unless they are marked as ours; a space at an end stays."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return " " * value.startswith(" ") + for_markdown(value) + " " * (value.endswith(" ") and len(value) > 1)
