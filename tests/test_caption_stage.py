@@ -196,9 +196,8 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     clean = next(tree.rglob("ORI")) / "trajectory.json"
     whole = clean.read_bytes()
     clean.write_bytes(whole[:100])
-    out = tmp_path / "out"
     with pytest.raises(NothingKept):
-        run(CaptionConfig(), tree, out)
+        run(CaptionConfig(), tree, tmp_path / "out")
     clean.write_bytes(whole)
-    found = list(read_captions(run(CaptionConfig(), tree, out)))
+    found = list(read_captions(run(CaptionConfig(), tree, tmp_path / "again")))
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
