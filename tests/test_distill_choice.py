@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.products.actions import action_tokens
-from distill.prepare.choice import Ranks, cost_of, limit_to
+from distill.prepare.choice import Ranks, cost_of, keeps, limit_to
 
 
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
@@ -17,7 +17,7 @@ def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
     return [(decision, f"{decision}_{i}") for decision, count in counts.items() for i in range(count)]
 
 
-def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tuple[str, str]]:
+def balanced(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tuple[str, str]]:
     ranks = Ranks(seed)
     for i, (decision, name) in enumerate(windows):
         ranks.add(f"group_{i % 3}", decision, name)
@@ -32,27 +32,15 @@ def kept(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tu
 )
 def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, ratio, seed):
     windows = windows_of(counts)
-    found = kept(windows, ratio, seed)
+    found = balanced(windows, ratio, seed)
     most = max(1, int(ratio * len(windows) / len(counts)))
     assert Counter(decision for decision, _ in found) == {name: min(count, most) for name, count in counts.items()}
-    assert set(kept(windows[::-1], ratio, seed)) == set(found)
-
-
-def test_who_stays_at_a_low_bound_stays_at_a_higher_one():
-    windows = windows_of({"track_straight": 100, "hover": 20})
-    assert set(kept(windows, 0.2)) < set(kept(windows, 0.9))
+    assert set(balanced(windows[::-1], ratio, seed)) == set(found)
 
 
 def test_stray_decisions_do_not_take_the_others_with_them():
     counts = {"track_straight": 600, "yaw_left_to_follow": 390, "hover": 4, "slow_down": 3, "ascend": 2, "descend": 1}
-    assert len(kept(windows_of(counts), 1.0)) == 166 + 166 + 10
-
-
-def test_only_the_groups_that_are_asked_for_count():
-    ranks = Ranks(0)
-    for decision, name in windows_of({"track_straight": 4, "hover": 4}):
-        ranks.add("train_1" if decision == "hover" else "val_1", decision, name)
-    assert ranks.cut(["train_1"], 1.0).windows == {"hover": 4}
+    assert len(balanced(windows_of(counts), 1.0)) == 166 + 166 + 10
 
 
 def test_the_cost_by_hand():
@@ -71,42 +59,32 @@ def test_the_cost_by_hand():
 
 # --- so many and no more ----------------------------------------------------------------------------------------------
 
-TABLES = st.dictionaries(
-    st.sampled_from([f"flight_{i}" for i in range(12)]),
-    st.dictionaries(st.sampled_from(action_tokens()[:6]), st.integers(1, 30), min_size=1),
-    min_size=1,
+
+@given(
+    counts=st.dictionaries(st.sampled_from(action_tokens()), st.integers(1, 60), min_size=1),
+    part=st.floats(0.0, 1.2),
+    seed=st.integers(0, 2),
+    ratio=st.sampled_from([0.0, 0.5, 1.0]),
 )
+def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, part, seed, ratio):
+    """Half of the flights are cut first, as those of train are."""
+    windows = [(f"flight_{i % 5}", *window) for i, window in enumerate(windows_of(counts))]
 
+    def limited(windows: list[tuple[str, str, str]]) -> tuple[list, list, object]:
+        ranks = Ranks(seed)
+        for window in windows:
+            ranks.add(*window)
+        train = [flight for flight in ranks.flights if flight < "flight_2"]
+        cut = ranks.cut(train, ratio) if ratio and train else None
+        cuts = {flight: cut if flight in train else None for flight in ranks.flights}
+        left = [one for one in windows if (found := cuts[one[0]]) is None or found.keeps(*one[1:])]
+        limit = limit_to(ranks, int(part * len(left)), cuts)
+        return [one for one in left if limit is None or keeps(limit, seed, *one[1:])], left, limit
 
-def limited(table: dict[str, dict[str, int]], num_windows: int, seed: int = 0, ratio: float = 0.0):
-    """Give the windows that stay, (flight, decision, name), and the limit."""
-    ranks = Ranks(seed)
-    windows = [(f, d, f"{f}_{d}_{i}") for f, counts in table.items() for d, n in counts.items() for i in range(n)]
-    for window in windows:
-        ranks.add(*window)
-    cut = ranks.cut(table, ratio) if ratio else None
-    limit = limit_to(ranks, num_windows, dict.fromkeys(table, cut))
-    left = [window for window in windows if cut is None or cut.keeps(*window[1:])]
-    return [window for window in left if limit is None or limit.keeps(*window)], left, limit
-
-
-@given(TABLES, st.floats(0.0, 1.2), st.integers(0, 2), st.sampled_from([0.0, 0.5, 1.0]))
-def test_a_limit_is_exact_and_each_decision_and_flight_has_its_share(table, part, seed, ratio):
-    _, left, _ = limited(table, 0, seed, ratio)
-    num_windows = int(part * len(left))
-    kept, left, limit = limited(table, num_windows, seed, ratio)
-    assert len(kept) == min(num_windows, len(left))
-    assert (limit is None) == (num_windows >= len(left))
-    share = len(kept) / len(left)
-    for place, slack in ((1, 1.0), (0, 2.0)):
-        before, after = (Counter(window[place] for window in found) for found in (left, kept))
-        for name, count in before.items():
-            assert abs(after[name] - share * count) <= slack + 1e-9, (name, count, after[name])
-
-
-def test_a_limit_by_hand():
-    table = {"a": {"hover": 60, "track_straight": 20}, "b": {"hover": 20}}
-    kept, _, _ = limited(table, 10)
-    assert Counter(window[:2] for window in kept) == {("a", "hover"): 6, ("a", "track_straight"): 2, ("b", "hover"): 2}
-    assert set(kept) != set(limited(table, 10, seed=1)[0])
-    assert set(kept) == set(limited(dict(reversed(table.items())), 10)[0])
+    kept, left, limit = limited(windows)
+    wanted = int(part * len(left))
+    assert len(kept) == min(wanted, len(left))
+    assert (limit is None) == (wanted >= len(left))
+    before, after = (Counter(decision for _, decision, _ in found) for found in (left, kept))
+    assert all(abs(after[name] - len(kept) / len(left) * count) < 1 for name, count in before.items())
+    assert set(limited(windows[::-1])[0]) == set(kept)

@@ -107,14 +107,6 @@ def test_a_row_has_the_same_answer_alone_and_among_others(student, rows):
     assert decode(student, rows[::-1], max_tokens=MOST)[::-1] == together
 
 
-def test_answers_end_at_the_end_token(student, rows):
-    ending = ending_at(student, rows)
-    found = decode(ending, rows, max_tokens=MOST)
-    assert found == generated(ending, rows)
-    assert len({answer.num_tokens for answer in found}) >= 3
-    assert decode(ending, rows, max_tokens=1) == generated(ending, rows, 1)
-
-
 def test_rows_that_ended_leave_the_batch(student, rows, monkeypatch):
     ending = ending_at(student, rows)
     expected, sizes = generated(ending, rows), []
@@ -127,12 +119,6 @@ def test_rows_that_ended_leave_the_batch(student, rows, monkeypatch):
     assert sum(sizes) == needed
     assert needed <= work <= needed / (1 - 0.25)
     assert sizes[0] == len(rows) > sizes[-1]
-
-
-def test_rows_without_pictures_only(student, rows):
-    blind = [row for row in rows if not len(row.image_grids)]
-    assert len(blind) == 2
-    assert decode(student, blind, max_tokens=MOST) == generated(student, blind)
 
 
 def test_features_seen_before_give_the_same(student, rows):

@@ -11,8 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import InputError, NothingKept
-from cosfly.products.playback import STATES, read_flight, write_flight
+from cosfly.products.playback import STATES, read_flight
 from cosfly.products.splits import SPLITS
 from cosfly.work.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
@@ -111,21 +110,6 @@ def test_the_four_states_of_a_flight():
     assert flight.states == list(STATES) == ["unperturbed", "position only", "rotation only", "full"]
 
 
-def test_states_of_a_public_flight_are_what_it_tells(tmp_path):
-    """Public files say that there was a perturbation, not which."""
-    flight, _ = make_flight(4, variant="aug_001", trajectory="trajectory_1")
-    folder = tmp_path / "Town01/trajectory_1/aug_001"
-    folder.mkdir(parents=True)
-    write_flight(folder, flight)
-    raw = json.loads((folder / "trajectory.json").read_text())
-    told = [{"drone_position": True, "drone_rotation": False}, {"drone_position": False, "drone_rotation": True},
-            {"drone_position": True, "drone_rotation": True}, {}]  # fmt: skip
-    for point, events in zip(raw["points"], told, strict=True):
-        point["perturbation"] = events
-    (folder / "trajectory.json").write_text(json.dumps(raw))
-    assert read_flight(folder, strict=False).states == ["position only", "rotation only", "full", None]
-
-
 # --- what cannot be used ----------------------------------------------------------------------------------------------
 
 
@@ -155,17 +139,6 @@ def test_windows_over_a_gap_are_left_out(own_tree, tmp_path):
     # Of the begins 0, 3, 6, 9, 12 those of 3, 6, 9 reach over the step from frame 11 to frame 12.
     assert read_manifest(out).facts["windows_left_out"] == {"uneven_steps": 3}
     assert sum(read_track_set(out).samples.values()) == 4 * 5 - 3
-
-
-def test_flights_too_short_give_one_error(tmp_path):
-    tree = make_playback_tree(tmp_path / "run/render", num_flights=1, num_points=9, with_images=False)
-    with pytest.raises(NothingKept, match=r"shorter_than_a_window 1.*a perturbed flight of 10 frames"):
-        run(tree, tmp_path / "set")
-
-
-def test_too_few_walks_to_split_is_an_error_unless_told(tree, tmp_path):
-    with pytest.raises(InputError, match=r"too few towns with both tracks.*dual_track\.too_few=fill"):
-        dual_track.run(DualTrackConfig(val_fraction=0.3, test_fraction=0.3, split_by="town"), [tree], tmp_path / "set")
 
 
 def test_the_command(tree, tmp_path):

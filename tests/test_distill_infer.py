@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from PIL import Image
 from specimens_distill import make_captions, prepared
@@ -20,9 +19,7 @@ from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
 from distill.inference import outcome
 from distill.inference import stage as infer
-from distill.inference.stage import make_request
-from distill.schema import open_split, resolve_trees
-from distill.student.encoding import load_pictures
+from distill.schema import open_split
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 1, "timeout_s": 5.0, "concurrency": 3}
@@ -68,16 +65,6 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
     sent = [Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) for url in urls]
     assert len(sent) == len(sample.images)
     assert all(image.width * image.height <= 300 for image in sent)
-
-
-def test_a_small_picture_is_sent_as_it_is(place):
-    sample = open_split(place / "set", "train")[0]
-    trees = resolve_trees(place / "set", [place / "tree"])
-    request = make_request(sample, trees, settings().sampling, 0)
-    parts = [part for part in request.messages[1]["content"] if part["type"] == "image_url"]
-    for part, picture in zip(parts, load_pictures(sample, trees), strict=True):
-        data = base64.b64decode(part["image_url"]["url"].partition(",")[2])
-        assert np.array_equal(Image.open(io.BytesIO(data)), picture)
 
 
 def test_nothing_answered_is_asked_twice(place, tmp_path):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +19,8 @@ from cosfly.chat.student_chat import TAUGHT  # noqa: E402
 from cosfly.cli import app  # noqa: E402
 from cosfly.errors import ConfigError, InputError  # noqa: E402
 from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
-from cosfly.work.store import dump_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
-from distill.inference.outcome import make_prediction  # noqa: E402
 from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
 from distill.student.checkpoint import ADAPTER_FACTS  # noqa: E402
 from distill.student.decoding import decode  # noqa: E402
@@ -75,18 +71,6 @@ def told(predictions: list[Prediction]) -> dict[str, str]:
     return {prediction.key: prediction.raw for prediction in predictions}
 
 
-def test_progress_comes_by_batches_not_by_shelves(place, tmp_path, monkeypatch):
-    counts: list[int] = []
-
-    @contextlib.contextmanager
-    def counted(label: str, total: int) -> Iterator[Any]:
-        yield lambda count: counts.append(count)
-
-    monkeypatch.setattr(infer, "progress_bar", counted)
-    answer(place, tmp_path, batch_size=2, max_samples=5)
-    assert [count for count in counts if count] == [2, 2, 1], "five samples are of one shelf"
-
-
 def test_each_sample_has_the_answer_that_it_has_alone(place, clean):
     student = load_student(
         place / "student", device="cpu", max_pixels=ADAPTER_PIXELS, adapter=place / "trained" / "adapter"
@@ -119,16 +103,6 @@ def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     )
     assert alone == beside
     assert sum(base) > sum(beside)
-
-
-def test_time_and_tokens_of_each_answer_are_kept(place, clean):
-    kept = {f"{line['sample_id']}/{line['purpose']}": line for line in kept_answers(clean.parent)}
-    predictions = read_predictions(clean)
-    assert {p.key: p.num_tokens for p in predictions} == {
-        key: line["usage"]["completion_tokens"] for key, line in kept.items()
-    }
-    assert all(line["latency_s"] > 0 and line["usage"]["prompt_tokens"] > 0 for line in kept.values())
-    assert counts_of(clean.parent) == {"input": len(kept), "kept": len(kept), "dropped": {}, "failed": {}}
 
 
 def test_each_picture_is_looked_at_once_and_rows_of_like_length_go_together(place, clean, tmp_path, monkeypatch):
@@ -246,15 +220,6 @@ def test_a_memory_too_small_for_one_is_one_clear_line(place, tmp_path, monkeypat
         answer(place, tmp_path / "out")
 
 
-def test_a_memory_too_small_for_the_model_is_one_clear_line(place, tmp_path, monkeypatch):
-    def load(*args: Any, **more: Any) -> Any:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB")
-
-    monkeypatch.setattr(infer, "load_student", load)
-    with pytest.raises(ConfigError, match=r"memory is full.*9\.00 GiB"):
-        answer(place, tmp_path / "out")
-
-
 # --- what is answered -------------------------------------------------------------------------------------------------
 
 
@@ -284,10 +249,3 @@ def test_an_adapter_of_another_student_is_refused(place, tmp_path):
         infer.run(
             settings(), place / "set", [place / "tree"], other, tmp_path / "out", adapter=place / "trained" / "adapter"
         )
-
-
-def test_predictions_with_odd_line_separators_survive(place, tmp_path):
-    record = make_prediction(samples_of(place)[0], "train", "a\u2028b\x85c\x0b", 3, True)
-    path = tmp_path / "predictions.jsonl"
-    path.write_text(dump_json(record.model_dump(mode="json")) + "\n", encoding="utf-8")
-    assert read_predictions(path) == [record]

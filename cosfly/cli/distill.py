@@ -41,7 +41,7 @@ def distill_prepare(
     ] = None,
     data: options.Trees = None,
     limit: Annotated[
-        int | None, Option(help="Windows in all splits together, of each decision and flight its share; 0: all."), Sets("distill.prepare.limit")
+        int | None, Option(help="Windows in all splits together, of each decision its share; 0: all."), Sets("distill.prepare.limit")
     ] = None,
 ) -> None:  # fmt: skip
     """Captions of one run or several to a training set with splits that share no walk."""

@@ -7,7 +7,6 @@ captions nor the number of workers matters. A window goes or stays with all its 
 from __future__ import annotations
 
 import hashlib
-import heapq
 import math
 from array import array
 from collections import defaultdict
@@ -24,6 +23,11 @@ def _rank(sample_id: str, seed: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
 
 
+def keeps(last_rank: Mapping[str, int], seed: int, decision: str, sample_id: str) -> bool:
+    """Tell whether a window stays; last_rank: decision -> rank of the last window that does, none where all do."""
+    return decision not in last_rank or _rank(sample_id, seed) <= last_rank[decision]
+
+
 @dataclass(frozen=True)
 class Cut:
     """Which windows of the training split stay."""
@@ -35,7 +39,7 @@ class Cut:
     last_rank: Mapping[str, int]  # decision that has too many -> rank of the last window that stays
 
     def keeps(self, decision: str, sample_id: str) -> bool:
-        return decision not in self.last_rank or _rank(sample_id, self.seed) <= self.last_rank[decision]
+        return keeps(self.last_rank, self.seed, decision, sample_id)
 
 
 class Ranks:
@@ -92,77 +96,31 @@ class Ranks:
 # --- so many and no more ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Limit:
-    """Which windows stay of all: of each flight and decision those up to a rank."""
-
-    seed: int
-    last_rank: Mapping[tuple[str, str], int]
-
-    def keeps(self, flight: str, decision: str, sample_id: str) -> bool:
-        return _rank(sample_id, self.seed) <= self.last_rank.get((flight, decision), -1)
-
-
-def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> Limit | None:
-    """Choose exactly so many windows, of each decision and each flight its share; None where there are no more anyway.
-
-    The shares of the decisions are rounded first. Then each decision's windows are dealt to its flights, and what a flight got too
-    much or too little of is made up for by its next decision.
+def limit_to(ranks: Ranks, num_windows: int, cuts: Mapping[str, Cut | None]) -> Mapping[str, int] | None:
+    """Choose exactly so many windows, of each decision its share, rounded by largest remainders; None where there are no more anyway.
 
     Args:
         cuts: flight -> what has been cut of it already.
+    Returns:
+        decision -> rank of the last window that stays, -1 where none does.
     """
-    left: dict[str, dict[str, np.ndarray]] = defaultdict(dict)  # decision -> flight -> ranks, in order
+    left: dict[str, list[np.ndarray]] = defaultdict(list)
     for (flight, decision), own in ranks.by_kind().items():
         cut = cuts[flight]
         last = None if cut is None else cut.last_rank.get(decision)
-        left[decision][flight] = own if last is None else own[: np.searchsorted(own, np.uint64(last), side="right")]
-    counts = {decision: sum(map(len, flights.values())) for decision, flights in left.items()}
+        left[decision].append(own if last is None else own[own <= np.uint64(last)])
+    counts = {decision: sum(map(len, found)) for decision, found in left.items()}
     total = sum(counts.values())
     if num_windows >= total:
         return None
-    share = num_windows / total
-    order = sorted(counts, key=lambda decision: _rank(decision, ranks.seed))
-    wanted = _dealt(num_windows, {decision: (counts[decision] * share, counts[decision]) for decision in order})
-    carried: dict[str, float] = defaultdict(float)
-    last_rank: dict[tuple[str, str], int] = {}
-    for decision in order:
-        flights = sorted(left[decision], key=lambda flight: _rank(f"{decision}/{flight}", ranks.seed))
-        fraction = wanted[decision] / max(1, counts[decision])
-        have = {flight: len(left[decision][flight]) for flight in flights}
-        for flight, number in _dealt(
-            wanted[decision], {flight: (fraction * have[flight] + carried[flight], have[flight]) for flight in flights}
-        ).items():
-            carried[flight] += share * have[flight] - number
-            if number:
-                last_rank[flight, decision] = int(left[decision][flight][number - 1])
-    return Limit(ranks.seed, last_rank)
-
-
-def _dealt(total: int, wishes: Mapping[str, tuple[float, int]]) -> dict[str, int]:
-    """Deal `total` in whole numbers as near to the wishes as can be: name -> number.
-
-    Args:
-        wishes: name -> (wish, most); the mosts add up to `total` or more. Of equal wishes the first comes first.
-    """
-    dealt = {name: min(most, max(0, math.floor(wish))) for name, (wish, most) in wishes.items()}
-    missing = total - sum(dealt.values())
-    step = 1 if missing > 0 else -1
-    places = {name: place for place, name in enumerate(wishes)}
-
-    def key(name: str) -> tuple[float, int, str]:
-        return step * (dealt[name] - wishes[name][0]), places[name], name
-
-    heap = [key(name) for name, (_, most) in wishes.items() if 0 <= dealt[name] + step <= most]
-    heapq.heapify(heap)
-    for _ in range(abs(missing)):
-        name = heap[0][2]
-        dealt[name] += step
-        if 0 <= dealt[name] + step <= wishes[name][1]:
-            heapq.heapreplace(heap, key(name))
-        else:
-            heapq.heappop(heap)
-    return dealt
+    wanted = {decision: num_windows * count // total for decision, count in counts.items()}
+    by_remainder = sorted(counts, key=lambda name: (-(num_windows * counts[name] % total), _rank(name, ranks.seed)))
+    for decision in by_remainder[: num_windows - sum(wanted.values())]:
+        wanted[decision] += 1
+    return {
+        decision: int(np.sort(np.concatenate(found))[wanted[decision] - 1]) if wanted[decision] else -1
+        for decision, found in left.items()
+    }
 
 
 # --- what it cost -----------------------------------------------------------------------------------------------------

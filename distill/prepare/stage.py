@@ -29,7 +29,7 @@ from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import dump_json
-from distill.prepare.choice import Cut, Limit, Ranks, cost_of, limit_to
+from distill.prepare.choice import Cut, Ranks, cost_of, keeps, limit_to
 from distill.prepare.sources import CaptionedFlight, Flights, Source, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split
@@ -85,7 +85,7 @@ class PrepareConfig(SplitConfig):
     )
 
     limit: int = Field(
-        0, ge=0, description="windows in all splits together, of each decision and flight its share; 0: all there are"
+        0, ge=0, description="windows in all splits together, of each decision its share; 0: all there are"
     )
 
     @model_validator(mode="after")
@@ -242,7 +242,8 @@ class _Selection:
     walks: Mapping[str, str]
     split_of: Mapping[str, Split]
     cut: Cut | None
-    limit: Limit | None
+    limit: Mapping[str, int] | None
+    seed: int
 
     def group(self, town: str, key: str) -> str:
         return town_family(town) if self.cfg.split_by == "town" else self.walks[key]
@@ -255,8 +256,7 @@ class _Selection:
         cut = self.cut if self.split(window) == "train" else None
         if cut is not None and not cut.keeps(window.decision, window.sample_id):
             return "balance"
-        name = f"{window.flight.key}/{window.flight.variant}"
-        if self.limit is not None and not self.limit.keeps(name, window.decision, window.sample_id):
+        if self.limit is not None and not keeps(self.limit, self.seed, window.decision, window.sample_id):
             return "limit"
         return None
 
@@ -316,7 +316,7 @@ def _survey(windows: _Windows, seed: int) -> tuple[Ranks, Counter[str]]:
 
 def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _Selection:
     windows.walks = windows.flights.walks()
-    chosen = _Selection(cfg, windows.walks, {}, None, None)
+    chosen = _Selection(cfg, windows.walks, {}, None, None, seed)
     group_of = {}
     for flight in ranks.flights:
         key = flight.rpartition("/")[0]
@@ -330,7 +330,7 @@ def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _
     cut = ranks.cut(train, cfg.balance_ratio) if cfg.balance == "decisions" else None
     cuts = {flight: cut if split_of[group] == "train" else None for flight, group in group_of.items()}
     limit = limit_to(ranks, cfg.limit, cuts) if cfg.limit else None
-    return _Selection(cfg, windows.walks, split_of, cut, limit)
+    return _Selection(cfg, windows.walks, split_of, cut, limit, seed)
 
 
 def _write(
