@@ -256,14 +256,22 @@ class _Loop:
 
     async def _answer(self, question: Question) -> Draft | Refused:
         """Ask, and while the answer is refused for what it says ask for a correction. A wrong structure has no complaint."""
+        taken: Draft | None = None  # which its writer is asked to better
         for number in range(self.cfg.correction_asks + 1):
             reply = await self.teacher.ask(question)
             answer = self._draft(reply, question)
-            if isinstance(answer, Draft) or not answer.complaint:
+            if isinstance(answer, Draft):
+                if taken is not None or not answer.doubt or number == self.cfg.correction_asks:
+                    return answer
+                taken = answer
+                self._refused.append("unread")
+            elif not answer.complaint:
                 break
-            self._refused.append(answer.reason)
-            question = replace(question, correction=Correction(reply.text, answer.complaint, number + 1))
-        return answer
+            else:
+                self._refused.append(answer.reason)
+            complaint = answer.doubt if isinstance(answer, Draft) else answer.complaint
+            question = replace(question, correction=Correction(reply.text, complaint, number + 1))
+        return taken or answer
 
     def _draft(self, reply: Reply, question: Question) -> Draft | Refused:
         parsed = self._read(reply, "en")

@@ -14,7 +14,7 @@ from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe
 from caption.truth.facts import Facts
 from cosfly.products.actions import actions_in_use
 
-MODEL = "rules-5"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-6"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
 DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
 MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3
@@ -163,8 +163,8 @@ def _turn(side: int, f: Facts, c: Cues) -> Both | None:
     if side * c.last_turn_deg < 0.5 or side * f.yaw_deg[-1] < 1.0:
         return None
     return (
-        "Keeping the target framed has already taken {yaw} of yaw to the {side:yaw}, and the turn goes on.",
-        "为保持目标在画面内，偏航角已向{side:yaw}转动 {yaw}，且转动仍在继续。",
+        "To keep the target in the image, the nose has turned {yaw} to the {side:yaw}.",
+        "为跟踪目标，机头已向{side:yaw}转动 {yaw}。",
     )
 
 
@@ -172,8 +172,8 @@ def _bend(side: int, f: Facts, c: Cues) -> Both | None:
     if f.target_turn_deg is None or side * f.target_turn_deg < BEND_DEG:
         return None
     return (
-        "The target bends to the {side:target_heading}, so the line of sight keeps turning.",
-        "目标向{side:target_heading}转弯，视线方向持续变化。",
+        "The target bends to the {side:target_heading}, and the nose should follow.",
+        "目标向{side:target_heading}转弯，机头应跟踪。",
     )
 
 
@@ -181,8 +181,8 @@ def _climb(side: int, f: Facts, c: Cues) -> Both | None:
     if word_of(f, "trend:altitude") != _TREND[side] or side * c.last_climb_m <= 0:
         return None
     return (
-        "The altitude {trend:altitude} to {altitude} and the viewing angle is not settled yet.",
-        "高度{trend:altitude}到 {altitude}，俯视角度尚未确定。",
+        "The altitude {trend:altitude} to {altitude} over the observed frames.",
+        "观测期间高度{trend:altitude}到 {altitude}。",
     )
 
 
@@ -208,8 +208,8 @@ def _steady(f: Facts, c: Cues) -> Both | None:
     if not f.is_visible_now or word_of(f, "side:offset_x") != "centred" or abs(c.last_turn_deg) >= 1.0:
         return None
     return (
-        "The target is {side:offset_x} in the image and the yaw follows its path.",
-        "目标在画面中{side:offset_x}，偏航方向与其路径一致。",
+        "The target is {side:offset_x} in the image.",
+        "目标在画面中{side:offset_x}。",
     )
 
 
@@ -217,8 +217,8 @@ def _lost(f: Facts, c: Cues) -> Both | None:
     if f.is_visible_now:
         return None
     return (
-        "The target is {visibility}, so its motion can no longer be followed directly.",
-        "目标{visibility}，无法再直接跟随其运动。",
+        "The target is {visibility}, so the tracking needs a change.",
+        "目标{visibility}，因此需要应对。",
     )
 
 
@@ -226,8 +226,8 @@ def _standing(f: Facts, c: Cues) -> Both | None:
     if word_of(f, "target_motion") != "standing":
         return None
     return (
-        "The target {target_motion} in place, so there is nothing to catch up with.",
-        "目标原地{target_motion}，无需追赶。",
+        "The target {target_motion}, so there is nothing to follow.",
+        "目标{target_motion}，因此不需跟踪。",
     )
 
 

@@ -177,7 +177,7 @@ def _pace(f: Facts) -> tuple[Both, ...]:
 def _altitude(f: Facts) -> tuple[Both, ...]:
     plain = (
         ("The altitude is about {altitude}.", "高度约为 {altitude}。"),
-        ("The drone holds an altitude near {altitude}.", "无人机高度维持在约 {altitude}。"),
+        ("The drone flies at an altitude near {altitude}.", "无人机飞行高度约为 {altitude}。"),
     )
     return _course(f, "altitude", "The altitude", "高度", plain)
 

@@ -144,7 +144,7 @@ def references_of(claim: Claim) -> list[Reference]:
 def _is_of_span(reference: Reference) -> bool:
     if reference.aspect == "side":
         return reference.quantity in TURNING
-    return reference.aspect not in ("", "comparison")
+    return reference.aspect not in ("", "comparison", "compared")
 
 
 def judge_claim(

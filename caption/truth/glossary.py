@@ -47,6 +47,15 @@ class _Forms(Config):
     zh: list[str] = Field(min_length=1, description="and in Chinese")
 
 
+class _Beside(Config):
+    drone: _Pair = Field(description="names of the drone")
+    target: _Pair = Field(description="names of the person")
+    quantities: dict[str, _Pair] = Field(description="quantities -> words that speak of them")
+    now: _Pair = Field(description="words for the current frame")
+    whole: _Pair = Field(description="words for the whole window")
+    neutral: _Pair = Field(description="words that state nothing measurable")
+
+
 class _GlossaryFile(Config):
     schema_: str = Field(alias="schema", description="cosfly.glossary")
     schema_version: str = Field(description="version of this layout")
@@ -60,6 +69,7 @@ class _GlossaryFile(Config):
         description="kind -> what is true -> the words that a slot is filled with"
     )
     states: _Spellings = Field(description="words beside slots for what a slot can say")
+    beside: _Beside = Field(description="words beside slots with which a sentence may be proved")
     idioms: _Spellings = Field(description="patterns in which an opposite states nothing of this window")
 
 
@@ -214,6 +224,15 @@ def written_units(language: Language) -> dict[str, Unit]:
             for spelling in filter(None, map(str.strip, spellings.split(","))):
                 units.setdefault(spelling, Unit(name, float(factor)))
     return units
+
+
+@cache
+def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
+    """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks of."""
+    beside = _file().beside
+    kinds = [(kind, frozenset[str](), getattr(beside, kind)) for kind in ("neutral", "now", "whole", "target", "drone")]
+    kinds += [("quantity", frozenset(names.split()), pair) for names, pair in beside.quantities.items()]
+    return {word.strip(): (kind, names) for kind, names, pair in kinds for word in getattr(pair, language).split(",")}
 
 
 @in_place.kept()

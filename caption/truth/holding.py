@@ -15,6 +15,7 @@ from caption.truth.references import (
     QUANTITIES,
     STILL_MPS,
     TRENDS,
+    TURNED,
     TURNING,
     Fact,
     Reference,
@@ -25,7 +26,7 @@ from caption.truth.references import (
     speeds_of,
 )
 
-_VOCABULARY = {"trend": TRENDS, "comparison": COMPARISONS}  # another word is true of nothing
+_VOCABULARY = {"trend": TRENDS, "comparison": COMPARISONS, "compared": COMPARISONS}  # another word is true of nothing
 
 
 def number_holds(value: float, digits: int, fact: Fact, slack: float = 0.0) -> bool:
@@ -52,6 +53,10 @@ def word_holds(word: str, reference: Reference, facts: Facts) -> bool | None:
         return word == "visible" and fact.value == "partly_occluded"
     if reference.quantity in MOTIONS:
         return _motion_holds(word, reference, facts)
+    if reference.quantity in ("framing", "walking"):
+        return None if reference.quantity == "walking" and "across" in (word, fact.value) else False
+    if reference.aspect == "compared":
+        return _comparison_holds(TURNED.get(word, word), facts, reference.first)
     if reference.aspect == "comparison":
         return _comparison_holds(word, facts, reference.first)
     if reference.aspect == "trend":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from caption.truth.references import TURNED
 from cosfly.products.actions import kin_of
 from cosfly.products.captions import Claim
 
@@ -52,6 +53,10 @@ def poles_of(claim: Claim) -> set[Pair]:
     value = claim.value
     if name == "decision":
         return set(_decision_poles(str(value)))
+    if name == "framing":
+        return {("centre", "centred" if value == "centred" else "off")}
+    if name == "walking":
+        return {("gap", "near" if value == "towards" else "far")} if value != "across" else set()
     if name == "visibility":
         return {
             "visible": {("seen", "visible"), ("seen", "full"), ("seen", "glimpsed")},
@@ -61,7 +66,9 @@ def poles_of(claim: Claim) -> set[Pair]:
         is_still = value in ("standing", "hovering")
         still: set[Pair] = {("motion", "standing"), ("course", "steady"), ("pace", "slower")}
         return still if is_still else {("motion", "walking"), ("pace", "faster")}
-    if aspect == "comparison":
+    if aspect == "compared":  # of the target against the drone
+        value = TURNED.get(str(value), value)
+    if aspect in ("comparison", "compared"):
         return {("pace", str(value)), ("compared", str(value))}
     if aspect == "side":
         return _side_poles(str(value))

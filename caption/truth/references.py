@@ -3,7 +3,7 @@
     distance@t4            the value at a frame; without `@` at the current one
     change:distance@t0-t4  last less first of a span; without `@` of the whole window. So too
     rate: (per second)  growth: (percent)  mean:  min:  max:  trend:  side:  comparison:
-    visibility@t2          a word instead of a number
+    visibility@t2          a word instead of a number; framing: in the picture; walking: towards the drone, away or across
 
 `look_up` gives the fact; whether somebody's value is true of it: holding.py.
 """
@@ -18,7 +18,7 @@ from itertools import pairwise
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
-from caption.truth.facts import STANDING_MPS, Facts
+from caption.truth.facts import STANDING_MPS, Facts, wrapped
 
 Series = Sequence[float | None]
 Missing = Literal["unknown_reference", "unobserved_frame", "unknown_fact"]
@@ -101,7 +101,8 @@ TRENDS = ("increasing", "decreasing", "steady", "mixed")
 COMPARISONS = ("faster", "slower", "matching")
 STILL_MPS = {"target_motion": STANDING_MPS, "drone_motion": HOVERING_MPS}
 MOTIONS = {"target_motion": ("standing", "walking"), "drone_motion": ("hovering", "moving")}
-ASPECTS = ("change", "rate", "growth", "mean", "min", "max", "trend", "side", "comparison")
+ASPECTS = ("change", "rate", "growth", "mean", "min", "max", "trend", "side", "comparison", "compared")
+TURNED = {"faster": "slower", "slower": "faster"}  # of the target against the drone
 ANGLES = frozenset({"heading", "target_heading"})  # whose differences are turns
 # Known between two frames only: the oldest frame has no value, and a span from it begins with the first step.
 STEPS = frozenset(
@@ -132,7 +133,8 @@ class Fact(NamedTuple):
 
 
 _REFERENCE = re.compile(r"(?:([a-z]+):)?([a-z_]+)(?:@t(\d{1,2})(?:\s*[-–]\s*t(\d{1,2}))?)?")
-_WORDS_ONLY = {"visibility", *MOTIONS}
+_WORDS_ONLY = {"visibility", "framing", "walking", *MOTIONS}
+ACROSS_DEG = 45.0  # nearer than this to the line of sight a walk is towards or away
 
 
 @lru_cache(maxsize=4096)
@@ -145,7 +147,7 @@ def parse_reference(text: str) -> Reference | None:
     first, last = (None if digits is None else int(digits) for digits in (match[3], match[4]))
     if quantity in _WORDS_ONLY:
         is_known = not aspect and last is None
-    elif aspect == "comparison":
+    elif aspect in ("comparison", "compared"):
         is_known = quantity == "speed" and last is None
     elif quantity not in QUANTITIES or (aspect and aspect not in ASPECTS):
         return None
@@ -189,7 +191,14 @@ def find_fact(reference: Reference, facts: Facts) -> Fact | Missing:
         return Fact(facts.visibility[count - 1 if first is None else first])
     if name in MOTIONS:
         return _motion(name, facts, first)
-    return _comparison(facts, first) if aspect == "comparison" else _over_span(reference, facts)
+    if name in ("framing", "walking"):
+        return _framing(facts, first) if name == "framing" else _walking(facts, first)
+    if aspect not in ("comparison", "compared"):
+        return _over_span(reference, facts)
+    fact = _comparison(facts, first)
+    return (
+        fact if aspect == "comparison" or not isinstance(fact, Fact) else Fact(TURNED.get(str(fact.value), fact.value))
+    )
 
 
 def _at(series: Series, frame: int) -> float | None:
@@ -283,6 +292,26 @@ def dead_band_of(reference: Reference, facts: Facts) -> float:
 def _side(quantity: Quantity, value: float, dead_band: float) -> str:
     positive, negative, between = quantity.sides or ("", "", "")
     return between if abs(value) < dead_band else positive if value > 0 else negative
+
+
+def _framing(facts: Facts, frame: int | None) -> Fact | Missing:
+    offsets = [_at(series, -1 if frame is None else frame) for series in (facts.offset_x_px, facts.offset_y_px)]
+    if None in offsets:
+        return "unknown_fact"
+    is_centred = max(abs(offset) for offset in offsets if offset is not None) < max(2.0, CENTRED_SHARE * facts.width_px)
+    return Fact("centred" if is_centred else "off_centre")
+
+
+def _walking(facts: Facts, frame: int | None) -> Fact | Missing:
+    """Give whether the target walks towards the drone, away from it or across its line of sight."""
+    at = -1 if frame is None else frame
+    course, heading, bearing = (
+        _at(series, at) for series in (facts.target_headings_deg, facts.heading_deg, facts.bearing_deg)
+    )
+    if course is None or heading is None or bearing is None:
+        return "unknown_fact"
+    off_deg = abs(wrapped(course - heading - bearing))
+    return Fact("away" if off_deg < ACROSS_DEG else "towards" if off_deg > 180.0 - ACROSS_DEG else "across")
 
 
 def _motion(name: str, facts: Facts, frame: int | None) -> Fact | Missing:

@@ -30,13 +30,14 @@ DECISION_REASON = "decision_against_reasoning"
 class Draft:
     """A caption in one language: its plain text, and what that came from. therefore: of the English alone.
 
-    states: of its sentences, where making the text has told them.
+    states: of its sentences, where making the text has told them. doubt: what its writer is asked to mend once, though it is taken as it stands.
     """
 
     coc: Coc
     therefore: str | None = None
     template: Template | None = None
     states: tuple[SentenceState, ...] = ()
+    doubt: str = ""
     claims: tuple[Claim, ...] = ()
 
     @property

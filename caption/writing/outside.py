@@ -80,10 +80,10 @@ def _is_too_much(match: re.Match[str], num_frames: int, step_s: float) -> bool:
     return value > ((num_frames - 1) * step_s + 0.01 if is_time else num_frames)
 
 
-def holds_state(text: str, language: Language) -> bool:
-    """Tell whether a text holds a word for what a slot could have said: it may stand there, but nobody compared it."""
+def states_beside(text: str, language: Language) -> tuple[str, ...]:
+    """Give the words of a text for what a slot could have said: they may stand there, but nobody compared them."""
     glossary = load_glossary()
-    return bool(glossary.states(glossary.without_idioms(text, language), language))
+    return tuple(glossary.states(glossary.without_idioms(text, language), language))
 
 
 # What a text asks for -> how, and the decisions that say the opposite.

@@ -71,6 +71,7 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
     filler, num_frames = Filler(facts, written.flight_decision, language), len(facts)
     states: list[SentenceState] = []
     problems: list[Refused] = []
+    doubts: list[str] = []
     texts: dict[str, str] = {}
     for name in TEXTS:
         filled: list[str] = []
@@ -81,6 +82,8 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
             )
             if isinstance(plain, str) and isinstance(sentence, Sentence):
                 states.append(sentence.state)
+                if sentence.doubtful and sentence.state == "unread":
+                    doubts.append(f'{name}, sentence {number}: "{sentence.doubtful[0]}" is said by no slot.')
                 filled.append(plain)
             elif isinstance(plain, Refused):
                 problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
@@ -88,7 +91,13 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
     if problems:
         return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))
     template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
-    return Draft(Coc(**texts, flight_decision=written.flight_decision), therefore, template, tuple(states))
+    return Draft(
+        Coc(**texts, flight_decision=written.flight_decision),
+        therefore,
+        template,
+        tuple(states),
+        " ".join(doubts[:MAX_COMPLAINTS]),
+    )
 
 
 def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:

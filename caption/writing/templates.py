@@ -28,7 +28,8 @@ from caption.truth.references import (
     parse_reference,
 )
 from caption.writing.contract import Refused
-from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, holds_state
+from caption.writing.earned import is_earned
+from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
 from cosfly.errors import nearest
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Language, SentenceState
@@ -37,9 +38,14 @@ from cosfly.work import in_place
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
 TURNS = {"yaw": "yaw", "heading": "yaw", "target_heading": "target_heading"}
-_WORDS = ("trend", "side", "comparison")
+_WORDS = ("trend", "side", "comparison", "compared")
+# Other names of slots.
+_ALIASES = {
+    "compare:drone_speed,target_speed": "comparison:speed", "compare:speed,target_speed": "comparison:speed",
+    "compare:target_speed,drone_speed": "compared:speed", "compare:target_speed,speed": "compared:speed", "side:target": "side:offset_x",
+}  # fmt: skip
 NEITHER = ("straight", "centred")
-_WITHOUT = ("visibility", *MOTIONS)  # a direction
+_WITHOUT = ("visibility", "framing", "walking", *MOTIONS)  # a direction
 
 Form = Literal[0, 1, 2, 3]  # of the glossary's slot_words: verb, after "is", after "has", after "to"
 
@@ -90,6 +96,8 @@ class Slot:
         if self.reference is None or self.reference.quantity in _WITHOUT:
             return None
         aspect, quantity = self.reference.aspect, self.reference.quantity
+        if aspect == "compared":
+            return None
         if aspect == "comparison" or quantity == "speed_difference":
             return "comparison"
         is_turn = quantity in TURNS
@@ -128,7 +136,7 @@ class Sentence:
     """A sentence that may be filled.
 
     pattern: its text for `%`, with a place for each of the slots. names: of the slots, sorted. sizes: the numbers without a sign, each
-    with the words that state its direction. state: proved with a slot, unless words stand in it that nobody compared. decisions: that
+    with the words that state its direction. state: proved or unread (earned.py); doubtful: its words for what a slot could say. decisions: that
     its words come to, as they stand there. opposed: those that it argues against, were it of the reasoning.
     """
 
@@ -139,6 +147,7 @@ class Sentence:
     begins_with_slot: bool
     is_in_script: bool
     state: SentenceState
+    doubtful: tuple[str, ...]
     decisions: tuple[str, ...]
     opposed: tuple[str, ...]
     terms: tuple[tuple[str, str], ...]  # of the glossary, in English, with their translations
@@ -184,7 +193,8 @@ def read_sentence(text: str, language: Language, num_frames: int, step_s: float)
         sizes=tuple((slot, _words_of(slot, slots)) for slot in slots if slot.is_size and not slot.is_word),
         begins_with_slot=begins_with_slot,
         is_in_script=is_in_script(beside, language),
-        state="proved" if slots and not holds_state(beside, language) else "unread",
+        state="proved" if is_earned(beside, [slot.reference for slot in slots], num_frames, language) else "unread",
+        doubtful=states_beside(beside, language),
         decisions=decisions_named(beside) if language == "en" else (),
         opposed=decisions_opposed(beside) if language == "en" else (),
         terms=load_glossary().terms_in(beside) if language == "en" else (),
@@ -259,7 +269,7 @@ def _related(slots: list[Slot], last: int) -> list[Slot]:
 
 
 def _unknown(written: str) -> Refused:
-    names = [*QUANTITIES, *MOTIONS, "visibility", "box", "decision", "comparison:speed"]
+    names = [*QUANTITIES, *MOTIONS, "visibility", "framing", "walking", "box", "decision", "comparison:speed"]
     bare = written.partition(":")[2] or written
     near = nearest(bare.partition("@")[0].strip(), names)
     return Refused(
@@ -269,6 +279,7 @@ def _unknown(written: str) -> Refused:
 
 def _read_slot(written: str, before: str, after: str, language: Language) -> Slot | None:
     name = re.sub(r"\s+", "", written.lower()).replace("–", "-")
+    name = _ALIASES.get(name, name)
     kind, _, rest = name.partition(":")
     if name in ("decision", "side:decision", "box") or re.fullmatch(r"box@t\d{1,2}", name):
         return Slot(name, parse_reference(name.replace("box", "box_height")), 0, name == "side:decision")
@@ -276,7 +287,7 @@ def _read_slot(written: str, before: str, after: str, language: Language) -> Slo
     reference = parse_reference(f"trend:{rest}" if is_participle else name)
     if reference is None:
         return None
-    if reference.aspect == "comparison":
+    if reference.aspect in ("comparison", "compared"):
         return Slot(str(reference), reference, 0 if _compares(after, language) else 1)
     if reference.aspect == "side":
         if reference.quantity == "yaw" and reference.first is not None and reference.last is None:
@@ -321,7 +332,9 @@ def _compares(after: str, language: Language) -> bool:
     """Tell whether what the drone is compared with stands behind the slot."""
     after = after.lstrip()
     if language == "zh":
-        return after.startswith(("目标", "行人", "其", "它", "他", "她", "对方", "该", "被", "人", "步行"))
+        return after.startswith(
+            ("目标", "行人", "其", "它", "他", "她", "对方", "该", "被", "人", "步行", "无人机", "本机")
+        )
     return bool(after) and after[0] not in ",.;:)!?"
 
 
@@ -329,7 +342,7 @@ def _without_repetition(slot: Slot, after: str, language: Language) -> str | Ref
     """Take off what a slot brings itself: the unit of a number, the "than" of a comparison."""
     if slot.reference is None or slot.name.startswith("side:"):
         return after
-    if slot.reference.aspect == "comparison":
+    if slot.reference.aspect in ("comparison", "compared"):
         return re.sub(r"^\s+(?:than|as)\b", "", after) if language == "en" else after
     unit = _unit_of(slot)
     match = _unit_pattern(language).match(after) if unit else None
@@ -351,7 +364,7 @@ def _unit_pattern(language: Language) -> re.Pattern[str]:
 def _unit_of(slot: Slot) -> str:
     reference = slot.reference
     assert reference is not None
-    if reference.quantity not in QUANTITIES or reference.aspect in ("trend", "side", "comparison"):
+    if reference.quantity not in QUANTITIES or reference.aspect in _WORDS:
         return ""
     unit = QUANTITIES[reference.quantity].unit
     if reference.aspect == "growth":
