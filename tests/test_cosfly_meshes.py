@@ -140,21 +140,35 @@ def one_triangle(places: list[float], **changes) -> bytes:
 
 FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 ONE_ACCESSOR = {"bufferView": 0, "componentType": 5126, "type": "VEC3"}
+DRACO = {
+    "primitives": [
+        {
+            "attributes": {"POSITION": 0},
+            "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}},
+        }
+    ]
+}
 HOSTILE = {
     "no_numbers.glb": (one_triangle([float("nan"), *FLAT[1:]]), "not finite"),
     "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or too far"),
-    "count.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]), "more numbers than bytes"),
+    "count.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]), "mesh_triangles"),
+    "short_buffer.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 6}]), "malformed"),
+    "repeated.glb": (one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": 36}] * 9), "more numbers than bytes"),
     "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
     "sparse.glb": (one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}]), "sparse"),
     "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
-    "draco.glb": (one_triangle(FLAT, extensionsRequired=["KHR_draco_mesh_compression"]), "plain glTF"),
+    "packed.glb": (one_triangle(FLAT, extensionsRequired=["EXT_meshopt_compression"]), "plain glTF"),
+    "draco.glb": (
+        one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}], meshes=[DRACO]),
+        "Draco",
+    ),
     "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "outside of its folder"),
     "encoded.glb": (
         one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "%2e%2e/secret.bin"}]),
         "outside of its folder",
     ),
     "web.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "http://host/x.bin"}]), "outside of its folder"),
-    "index.glb": (one_triangle(FLAT, nodes=[{"mesh": 7}]), "no such member"),
+    "index.glb": (one_triangle(FLAT, nodes=[{"mesh": 7}]), "out of range"),
     "short.glb": (one_triangle(FLAT)[:-10], "cut short"),
     "other.glb": (b"not a mesh at all, whatever its name says", "not a binary glTF"),
     "deep.gltf": (b'{"asset": {}, "nodes": ' + b"[" * 90 + b"]" * 90 + b"}", "deep"),

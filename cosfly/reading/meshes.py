@@ -1,13 +1,15 @@
 """Meshes of glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj): triangles and their plain colours, a node each. No textures.
 
-Read here and not by a library: what such a file names or counts is checked before anything is opened or made of it. glTF's +y is up and becomes
-+z; OBJ has no rule, and is taken as it stands, z up. Source: Khronos glTF 2.0; the OBJ appendix of Wavefront's manual.
+What a file names or counts is checked before anything is opened or made of it. glTF is then read by trimesh, which gets neither names of files nor
+what is not needed; OBJ is read here, since trimesh counts relative indices from the end of the file. glTF's +y is up and becomes +z; OBJ has
+no rule, and is taken as it stands, z up. Source: Khronos glTF 2.0; the OBJ appendix of Wavefront's manual.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
+import io
+import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,8 +29,11 @@ WHAT = "mesh"
 SUFFIXES = (".glb", ".gltf", ".obj")
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
 GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+DRACO = "KHR_draco_mesh_compression"
+PLACING = ("children", "matrix", "translation", "rotation", "scale")  # of a node
+MOST_NUMBERS = 12  # of vertices, their colours and indices, for a triangle; three of each are usual
+# What trimesh raises on a document that contradicts itself.
+NOT_READ = (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, NotImplementedError)
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes; points and lines have no surface
 DISPLAY_GAMMA = 2.2  # an OBJ's colours are those of a screen
 LARGEST_M = 1e7
@@ -106,203 +111,133 @@ def _read_glb(data: bytes, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]
             raise InputError("the mesh is cut short", where=path, got=f"{len(data)} bytes", expected=f"{at + 8 + size}")
         chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
-    return _Gltf(
-        parse_document(chunks.get(JSON_CHUNK, b""), path, what=WHAT), chunks.get(BINARY_CHUNK), path, tree
-    ).nodes()
+    return _read_gltf(chunks.get(JSON_CHUNK, b""), path, tree, chunks.get(BINARY_CHUNK))
 
 
-def _read_gltf(data: bytes, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
-    return _Gltf(parse_document(data, path, what=WHAT), None, path, tree).nodes()
+def _read_gltf(data: bytes, path: Path, tree: Path, binary: bytes | None = None) -> Iterator[tuple[str, Mesh]]:
+    """Yield the mesh of every node."""
+    document = parse_document(data, path, what=WHAT)
+    try:
+        yield from _nodes(document, binary, path, tree)
+    except NOT_READ as error:
+        raise _malformed(path, "glTF", "malformed", f"{type(error).__name__}: {error}"[:120], "glTF 2.0") from None
 
 
-class _Gltf:
-    """One glTF document and the bytes that it counts in."""
-
-    def __init__(self, document: Any, binary: bytes | None, path: Path, tree: Path) -> None:
-        self._document, self._binary, self._path, self._tree = document, binary, path, tree
-        self._buffers: dict[int, bytes] = {}
-        if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
-            raise self._wrong("asset", "not a glTF document")
-        if needed := document.get("extensionsRequired"):
-            raise self._wrong("extensionsRequired", "needs what is not read here", str(needed)[:80], "plain glTF 2.0")
-
-    def _wrong(
-        self, field: str, what: str = "malformed", got: str | None = None, expected: str | None = None
-    ) -> InputError:
-        return InputError(
-            f"the mesh cannot be read: {what}", where=f"{self._path}: {field}", got=got, expected=expected
-        )
-
-    def _item(self, name: str, number: Any) -> dict:
-        """Member `number` of a list of objects of the document."""
-        items = self._document.get(name)
-        if not isinstance(items, list) or type(number) is not int or not 0 <= number < len(items):
-            count = len(items) if isinstance(items, list) else 0
-            raise self._wrong(name, "no such member", repr(number)[:40], f"0 to {count - 1}")
-        if not isinstance(items[number], dict):
-            raise self._wrong(f"{name}[{number}]", got=type(items[number]).__name__, expected="an object")
-        return items[number]
-
-    def _number(self, value: dict, name: str, where: str, default: int | None = None) -> int:
-        number = value.get(name, default)
-        if type(number) is not int or number < 0:
-            raise self._wrong(f"{where}.{name}", got=repr(number)[:40], expected="a whole number from 0")
-        return number
-
-    # --- the tree of nodes ---
-
-    def nodes(self) -> Iterator[tuple[str, Mesh]]:
-        """Every mesh where its node stands, with the node's name."""
-        roots = self._roots()
-        todo = [(number, np.eye(4)) for number in reversed(roots)]
-        seen: set[int] = set()
-        num_triangles = 0
-        while todo:
-            number, world = todo.pop()
-            node = self._item("nodes", number)
-            if number in seen:
-                raise self._wrong(f"nodes[{number}]", "a node with two parents")
-            seen.add(number)
-            world = world @ self._placement(node, f"nodes[{number}]")
-            if "mesh" in node:
-                name = node.get("name", f"node_{number}")
-                for mesh in self._mesh(node["mesh"]):
-                    num_triangles += len(mesh)
-                    _check_count(num_triangles, self._path)
-                    corners = (mesh.corners_m @ world[:3, :3].T + world[:3, 3]) @ Z_UP.T
-                    mirrored = np.linalg.det(world[:3, :3]) < 0
-                    yield str(name), Mesh(corners[:, ::-1] if mirrored else corners, mesh.colors)
-            todo += [(child, world) for child in reversed(self._numbers(node, "children", f"nodes[{number}]"))]
-
-    def _roots(self) -> list[int]:
-        if "scenes" in self._document:
-            scene = self._item("scenes", self._document.get("scene", 0))
-            return self._numbers(scene, "nodes", "scenes")
-        every = self._document.get("nodes")
-        count = len(every) if isinstance(every, list) else 0
-        children = {c for n in range(count) for c in self._numbers(self._item("nodes", n), "children", f"nodes[{n}]")}
-        return [number for number in range(count) if number not in children]
-
-    def _numbers(self, value: dict, name: str, where: str) -> list[int]:
-        numbers = value.get(name, [])
-        if not isinstance(numbers, list) or not all(type(n) is int for n in numbers):
-            raise self._wrong(f"{where}.{name}", got=repr(numbers)[:40], expected="whole numbers")
-        return numbers
-
-    def _placement(self, node: dict, where: str) -> np.ndarray:
-        """A node's matrix, (4, 4)."""
-        if "matrix" in node:
-            return self._vector(node["matrix"], 16, f"{where}.matrix").reshape(4, 4).T  # by columns
-        matrix = np.eye(4)
-        x, y, z, w = self._vector(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-        matrix[:3, :3] *= self._vector(node.get("scale", [1, 1, 1]), 3, f"{where}.scale")
-        matrix[:3, 3] = self._vector(node.get("translation", [0, 0, 0]), 3, f"{where}.translation")
-        return matrix
-
-    def _vector(self, values: Any, count: int, where: str) -> np.ndarray:
-        numbers = isinstance(values, list) and len(values) == count and all(type(v) in (int, float) for v in values)
-        vector = np.array(values, dtype=np.float64) if numbers else np.full(count, np.nan)
-        if not (np.abs(vector) <= LARGEST_M).all():
-            raise self._wrong(where, got=repr(values)[:60], expected=f"{count} finite numbers")
-        return vector
-
-    # --- triangles ---
-
-    def _mesh(self, number: Any) -> Iterator[Mesh]:
-        primitives = self._item("meshes", number).get("primitives")
-        if not isinstance(primitives, list):
-            raise self._wrong(f"meshes[{number}].primitives", got=type(primitives).__name__, expected="a list")
-        for k, primitive in enumerate(primitives):
-            where = f"meshes[{number}].primitives[{k}]"
-            attributes = primitive.get("attributes") if isinstance(primitive, dict) else None
-            if not isinstance(attributes, dict) or "POSITION" not in attributes:
-                raise self._wrong(f"{where}.attributes", "no places of vertices", expected="POSITION")
-            mode = primitive.get("mode", TRIANGLES)
-            if mode not in (TRIANGLES, STRIP, FAN):
-                continue
-            places = self._accessor(attributes["POSITION"], 3)
-            rows = np.arange(len(places))
-            if "indices" in primitive:
-                rows = self._accessor(primitive["indices"], 1)[:, 0].astype(np.int64)
-                if rows.max(initial=-1) >= len(places):
-                    raise self._wrong(f"{where}.indices", "no such vertex", str(rows.max()), f"0 to {len(places) - 1}")
-            triangles = _triangles_of(rows, mode)
-            colors = np.tile(self._color(primitive.get("material"), where), (len(triangles), 1))
-            if "COLOR_0" in attributes:
-                painted = self._accessor(attributes["COLOR_0"], None, normalized=True)[:, :3]
-                if len(painted) != len(places) or painted.shape[1] != 3:
-                    raise self._wrong(f"{where}.attributes.COLOR_0", got=str(painted.shape), expected="one a vertex")
-                colors = np.where(np.isnan(colors), 1.0, colors) * painted[triangles].mean(axis=1)
-            yield Mesh(places[triangles], np.clip(colors, 0.0, 1.0))
-
-    def _color(self, number: Any, where: str) -> np.ndarray:
-        """The plain colour of a material, NaN where there is none or a picture has it."""
-        if number is None:
-            return np.full(3, np.nan)
-        value = self._item("materials", number).get("pbrMetallicRoughness", {})
-        if not isinstance(value, dict) or "baseColorTexture" in value or "baseColorFactor" not in value:
-            return np.full(3, np.nan)
-        return self._vector(value["baseColorFactor"], 4, f"{where}.material")[:3]
-
-    def _accessor(self, number: Any, width: int | None, *, normalized: bool = False) -> np.ndarray:
-        """Numbers of an accessor, (n, width) float64 or whole."""
-        value, where = self._item("accessors", number), f"accessors[{number}]"
-        form, columns = COMPONENTS.get(value.get("componentType", 0)), WIDTHS.get(str(value.get("type")))
-        if form is None or columns is None or (width is not None and columns != width):
-            got = f"{value.get('componentType')}, {value.get('type')}"
-            raise self._wrong(where, "another kind of numbers", got[:60])
-        if "sparse" in value or "bufferView" not in value:
-            raise self._wrong(where, "sparse numbers are not read here", expected="a bufferView")
-        view, dtype = self._item("bufferViews", value["bufferView"]), np.dtype(form)
-        data = self._buffer(view.get("buffer"))
-        first = self._number(view, "byteOffset", "bufferViews", 0)
-        span = data[first : first + self._number(view, "byteLength", "bufferViews")]
-        offset, count = self._number(value, "byteOffset", where, 0), self._number(value, "count", where)
-        stride = self._number(view, "byteStride", "bufferViews", 0) or columns * dtype.itemsize
-        if count and offset + (count - 1) * stride + columns * dtype.itemsize > len(span):
-            raise self._wrong(where, "more numbers than bytes", f"{count} of {stride} bytes", f"{len(span)} bytes")
-        if not count:
-            return np.zeros((0, columns))
-        numbers = np.ndarray((count, columns), dtype, span, offset, (stride, dtype.itemsize)).astype(np.float64)
-        return numbers / np.iinfo(dtype).max if normalized and dtype.kind != "f" else numbers
-
-    def _buffer(self, number: Any) -> bytes:
-        buffer = self._item("buffers", number)
-        if number not in self._buffers:
-            uri = buffer.get("uri")
-            if uri is None:
-                if self._binary is None:
-                    raise self._wrong(f"buffers[{number}]", "no bytes", expected="a uri, or the binary part of a .glb")
-                self._buffers[number] = self._binary
-            elif not isinstance(uri, str):
-                raise self._wrong(f"buffers[{number}].uri", got=type(uri).__name__, expected="a text")
-            elif uri.startswith("data:"):
-                try:
-                    self._buffers[number] = base64.b64decode(uri.partition(",")[2], validate=True)
-                except (binascii.Error, ValueError):
-                    raise self._wrong(f"buffers[{number}].uri", "not base64") from None
-            else:
-                self._buffers[number] = _beside(uri, self._path, self._tree)
-        return self._buffers[number]
+def _malformed(path: Path, field: str, what: str, got: str | None = None, expected: str | None = None) -> InputError:
+    return InputError(f"the mesh cannot be read: {what}", where=f"{path}: {field}", got=got, expected=expected)
 
 
-def _triangles_of(rows: np.ndarray, mode: int) -> np.ndarray:
-    """Vertex indices of triangles, (k, 3), of a list, strip or fan of vertices."""
-    if mode == TRIANGLES:
-        return rows[: len(rows) // 3 * 3].reshape(-1, 3)
-    count = max(len(rows) - 2, 0)
-    k = np.arange(count)
-    if mode == FAN:
-        return np.stack(
-            [np.zeros(count, int) if count == 0 else np.full(count, rows[0]), rows[k + 1], rows[k + 2]], axis=1
-        )
-    odd = k % 2
-    return np.stack([rows[k], rows[k + 1 + odd], rows[k + 2 - odd]], axis=1)
+def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
+    """Let trimesh read a document of which only what is drawn is left, and in which each drawn node has one triangle mesh and both have numbers
+    for names."""
+    if unknown := set(document.get("extensionsRequired", ())) - {DRACO}:
+        got = ", ".join(sorted(unknown))[:80]
+        raise _malformed(path, "extensionsRequired", "needs what is not read here", got, "plain glTF 2.0, or Draco")
+    nodes, scenes = document.get("nodes", []), document.get("scenes")
+    children = [child for node in nodes for child in node.get("children", ())]
+    roots = (
+        sorted(set(range(len(nodes))) - set(children))
+        if scenes is None
+        else scenes[document.get("scene", 0)].get("nodes", [])
+    )
+    if len({*children, *roots}) < len(children) + len(roots):
+        raise _malformed(path, "nodes", "a node with two parents")
+    pieces = [
+        [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
+        for mesh in document.get("meshes", ())  # points and lines have no surface
+    ]
+    flat_nodes = [{key: node[key] for key in PLACING if key in node} | {"name": str(k)} for k, node in enumerate(nodes)]
+    owners, accessors, num_numbers = list[tuple[int, dict]](), document.get("accessors", []), 0
+    for k, node in enumerate(nodes):
+        for piece in pieces[node["mesh"]] if "mesh" in node else ():
+            num_numbers += 1 + sum(accessors[n]["count"] for n in _used(piece))  # trimesh makes a copy for each node
+            _check_count(num_numbers // MOST_NUMBERS, path)
+            below = flat_nodes[k]["children"] = list(flat_nodes[k].get("children", ()))
+            below.append(len(flat_nodes))
+            flat_nodes.append({"name": f"piece {len(owners)}", "mesh": len(owners)})
+            owners.append((k, piece))
+    buffers = {str(k): _buffer(b, binary, path, tree) for k, b in enumerate(document.get("buffers", ()))}
+    views = document.get("bufferViews", [])
+    if sum(view["byteLength"] for view in views) > 2 * sum(map(len, buffers.values())):
+        raise _malformed(path, "bufferViews", "more numbers than bytes")
+    flat = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "nodes": flat_nodes, "bufferViews": views,
+        "meshes": [{"name": str(k), "primitives": [_drawn(piece, path)]} for k, (_, piece) in enumerate(owners)],
+        "accessors": _accessors(accessors, [piece for _, piece in owners], path),
+        "buffers": [{"uri": name} for name in buffers],
+    }  # fmt: skip
+    import trimesh
+
+    text = io.BytesIO(json.dumps(flat).encode())
+    scene = trimesh.load_scene(text, file_type="gltf", resolver=buffers, skip_materials=True)
+    placed = [scene.graph[name] for name in scene.graph.nodes_geometry]
+    num_triangles = 0
+    for number, world in sorted((int(str(key)), world) for world, key in placed):
+        k, piece = owners[number]
+        shape = scene.geometry[str(number)]
+        num_triangles += len(shape.faces)
+        _check_count(num_triangles, path)
+        if DRACO in piece.get("extensions", ()) and not shape.vertices.any():  # trimesh leaves zeros, and warns
+            raise _malformed(
+                path, "meshes", "the packed vertices do not unpack", expected="Draco, and DracoPy installed"
+            )
+        yield str(nodes[k].get("name", f"node_{k}")), _placed(shape, world, _color(piece, document))
+
+
+def _drawn(piece: dict, path: Path) -> dict:
+    """What is needed of a primitive."""
+    if piece.get("mode") == FAN:
+        raise _malformed(path, "meshes", "a fan of triangles", expected="triangles, or strips of them")
+    attributes = {name: piece["attributes"][name] for name in ("POSITION", "COLOR_0") if name in piece["attributes"]}
+    extensions = {name: value for name, value in piece.get("extensions", {}).items() if name == DRACO}
+    return {key: piece[key] for key in ("mode", "indices") if key in piece} | {
+        "attributes": attributes, "extensions": extensions,
+    }  # fmt: skip
+
+
+def _used(piece: dict) -> list[int]:
+    """The accessors that a primitive needs."""
+    attributes = piece["attributes"]
+    return [n for n in (attributes["POSITION"], attributes.get("COLOR_0"), piece.get("indices")) if n is not None]
+
+
+def _accessors(accessors: list[dict], pieces: list[dict], path: Path) -> list[dict]:
+    """The accessors that the pieces need; in the place of others stands an empty one."""
+    packed = {n for piece in pieces if DRACO in piece.get("extensions", ()) for n in _used(piece)}
+    used = {n for piece in pieces for n in _used(piece)}
+    for k in used:  # of sparse numbers trimesh gives the others alone
+        if "sparse" in accessors[k] or (k not in packed and "bufferView" not in accessors[k]):
+            raise _malformed(path, f"accessors[{k}]", "sparse numbers are not read here", expected="a bufferView")
+    nothing = {"componentType": 5121, "type": "SCALAR", "count": 0}
+    return [accessor if k in used else nothing for k, accessor in enumerate(accessors)]
+
+
+def _buffer(buffer: dict, binary: bytes | None, path: Path, tree: Path) -> bytes:
+    if "uri" not in buffer:
+        if binary is None:
+            raise _malformed(path, "buffers", "no bytes", expected="a uri, or the binary part of a .glb")
+        return binary
+    uri = buffer["uri"]
+    return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else _beside(uri, path, tree)
+
+
+def _color(piece: dict, document: dict) -> np.ndarray:
+    """The plain colour of a primitive, linear RGB; NaN where it has none or a picture has it."""
+    material = document["materials"][piece["material"]] if "material" in piece else {}
+    surface = material.get("pbrMetallicRoughness", {})
+    is_plain = "baseColorFactor" in surface and "baseColorTexture" not in surface
+    return np.array(surface["baseColorFactor"] if is_plain else [np.nan] * 4, np.float64).reshape(4)[:3]
+
+
+def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
+    """A mesh of trimesh's where its node stands."""
+    corners = (shape.vertices[shape.faces] @ world[:3, :3].T + world[:3, 3]) @ Z_UP.T
+    colors = np.tile(color, (len(corners), 1))
+    if shape.visual.kind == "vertex":
+        painted = np.asarray(shape.visual.vertex_colors)[shape.faces][..., :3].mean(axis=1) / 255
+        colors = np.where(np.isnan(colors), 1.0, colors) * painted
+    mirrored = np.linalg.det(world[:3, :3]) < 0
+    return Mesh(corners[:, ::-1] if mirrored else corners, np.clip(colors, 0.0, 1.0))
 
 
 # --- OBJ --------------------------------------------------------------------------------------------------------------
