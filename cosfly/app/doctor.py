@@ -19,16 +19,15 @@ from cosfly.errors import EnvironmentMissing, TeacherError
 
 State = Literal["ok", "missing", "optional"]
 
-OPTIONAL_PACKAGES = {
-    "torch": "students",
-    "transformers": "students",
-    "peft": "students",
-    "bert_score": "evaluation of students",
-    "datasets": "opening the release as a user would",
-    "vllm": "a teacher in this process",
-    "pyrender": "the second renderer",
+OPTIONAL_PACKAGES = {  # what it is for, and what brings it
+    "torch": ("students", "cosfly[distill]"),
+    "transformers": ("students", "cosfly[distill]"),
+    "peft": ("students", "cosfly[distill]"),
+    "bert_score": ("evaluation of students", "cosfly[distill]"),
+    "datasets": ("opening the release as a user would", "datasets"),
+    "vllm": ("a teacher in this process", "cosfly[vllm]"),
+    "pyrender": ("the second renderer", "cosfly[pyrender]"),
 }
-EXTRA_OF = {"vllm": "vllm", "pyrender": "pyrender"}  # the others come with "distill"
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,8 @@ def _gpu() -> Check:
 
 def _package(name: str) -> Check:
     if importlib.util.find_spec(name) is None:
-        extra = EXTRA_OF.get(name, "distill")
-        return Check(name, "optional", f'not installed; for {OPTIONAL_PACKAGES[name]}: pip install "cosfly[{extra}]"')
+        purpose, brings = OPTIONAL_PACKAGES[name]
+        return Check(name, "optional", f'not installed; for {purpose}: pip install "{brings}"')
     return Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
 
 

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class _Root(typer.core.TyperGroup):
-    """The command of commands. What it says of a value that an option does not take is for people: Typer hands on what pydantic says."""
+    """The command of commands. Of a value that an option does not take it says what is wrong, in words for people."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -87,7 +87,7 @@ def _root(
 
 
 def options_first(words: Sequence[str]) -> list[str]:
-    """Move the options of all commands before the command, so that they may stand anywhere: `cosfly run quickstart -v`."""
+    """Move the options of all commands before the command, so that they may stand anywhere."""
     ours, others = list[str](), list(words)
     end = others.index("--") if "--" in others else len(others)
     number = 0
@@ -133,8 +133,8 @@ def _fail(message: str, status: int) -> None:
 
 
 def _end(status: int | str | None) -> None:
-    """End the process. One of several, as a launcher starts them, ends at once: threads that the libraries of such a group leave behind
-    abort the interpreter's own end now and then (2 of some 200), which a launcher takes for a failure of the whole training.
+    """End the process. One of several, as a launcher starts them, ends at once: threads of their libraries abort the
+    interpreter's own end now and then (2 of some 200), which a launcher takes for a failure of the whole training.
     """
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:  # a process may be started with either closed

@@ -18,13 +18,11 @@ if TYPE_CHECKING:
 
 app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
-TEACHER = (
-    "rules, the URL of an OpenAI-compatible endpoint, vllm:MODEL_DIR, file:PATH or student:PATH (what `distill infer` wrote)."
-)  # fmt: skip
+TEACHER = "rules, an OpenAI-compatible endpoint's URL, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
 READERS = (
     "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
 )
-STUDENT = "What `distill train` or `distill merge` wrote: the teacher is that student behind a server, asked as it was taught."
+STUDENT = "Folder of `distill train` or `merge`: the teacher is that student behind a server, asked as it was taught."
 Teacher = Annotated[str | None, Option(show_default="rules", help=TEACHER), Sets("caption.teacher")]
 Model = Annotated[
     str | None, Option(help="Model name at the endpoint; by default its only one."), Sets("caption.endpoint.model")
@@ -99,7 +97,7 @@ def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
 def caption_doctor(
     job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")], model: Model = None
 ) -> None:
-    """Try what an endpoint can do: images, schema, thinking, context length, ways of writing. Exit 1 if captioning cannot work."""
+    """Try what an endpoint can do: images, schema, thinking, context, ways of writing. Exit 1 if it cannot caption."""
     from caption.writing.contract import WAYS
 
     _examine_endpoint(url, job.cfg.caption, tuple(WAYS))
@@ -141,7 +139,7 @@ def caption_actions(
     export: Annotated[Path | None, Option(help="File to write the actions that ship to, to begin with.")] = None,
     check: Annotated[Path | None, Option(help="File with actions of yours: say what is wrong with it.")] = None,
 ) -> None:
-    """Write the closed set of actions into a file, or check a file of yours; --set caption.actions=FILE captions with it."""
+    """Write the closed set of actions into a file, or check one of yours, for --set caption.actions=FILE."""
     import numpy as np
 
     from caption.schema import LabelConfig

@@ -15,11 +15,13 @@ app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set,
 
 Dataset = Annotated[Path, Option(help="Training set, the output of `distill prepare`.")]
 Runs = Annotated[list[Path] | None, Argument(help="Run folders, as `cosfly run` makes them; all are taken together.")]
-STUDENTS = "Who learns: a model folder, a repository as Qwen/Qwen3.5-2B, or, of random weights, tiny, tiny:small, tiny:medium, random."
+STUDENTS = (
+    "A model folder, a repository as Qwen/Qwen3.5-2B, or of random weights: tiny, tiny:small, tiny:medium, random."
+)
 ENGINES = "transformers, endpoint (a server) or vllm."
 JUDGED = (
-    "captions.jsonl that `caption --teacher student:` made of these predictions, one a tree; of a floor's as shuffled=... or constant=..."
-)  # fmt: skip
+    "captions.jsonl of `caption --teacher student:`, one a tree; of a floor's answers as shuffled=... or constant=..."
+)
 
 
 @app.command("tiny-student")
@@ -36,14 +38,14 @@ def distill_prepare(
     job: Job,
     out: options.Out,
     runs: Runs = None,
-    captions: Annotated[
-        list[Path] | None, Option(help="captions.jsonl of a tree; repeat both for several.")
-    ] = None,
+    captions: Annotated[list[Path] | None, Option(help="captions.jsonl of a tree; repeat both for several.")] = None,
     data: options.Trees = None,
     limit: Annotated[
-        int | None, Option(help="Windows in all splits together, of each decision its share; 0: all."), Sets("distill.prepare.limit")
+        int | None,
+        Option(help="Windows in all splits together, of each decision its share; 0: all."),
+        Sets("distill.prepare.limit"),
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Captions of one run or several to a training set with splits that share no walk."""
     from distill.prepare import stage as prepare
     from distill.prepare.sources import Source
@@ -136,7 +138,7 @@ def distill_floors(
     out: options.Out,
     split: Annotated[Literal["train", "val", "test"], Option(help="Samples to answer.")] = "test",
 ) -> None:
-    """Answers without a look at a window, as predictions: `caption --teacher student:` judges their sentences beside a student's."""
+    """Answers without a look at a window, as predictions that `caption --teacher student:` judges as a student's."""
     from distill.evaluation.floors import write_floors
 
     for path in write_floors(dataset, split, out, job.cfg.seed):
@@ -158,17 +160,14 @@ def distill_evaluate(
     ] = None,
     judged: Annotated[list[str] | None, Option(metavar="[NAME=]CAPTIONS", help=JUDGED)] = None,
 ) -> None:
-    """Parse rate, decisions, verdicts on the true future, BERTScore and evidence, each beside its floors and with its interval."""
+    """Parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
 
     job.begin(out, predictions, dataset)
     given: Any = {"en": bertscore_en, "zh": bertscore_zh}
-    typer.echo(
-        evaluate.run(
-            job.cfg.distill.evaluate, predictions, dataset, out, judged=_judged(judged or []), seed=job.cfg.seed, resume=job.resume,
-            bertscore_models={language: folder for language, folder in given.items() if folder is not None},
-        )
-    )  # fmt: skip
+    models = {language: folder for language, folder in given.items() if folder is not None}
+    more: Any = {"judged": _judged(judged or []), "seed": job.cfg.seed, "resume": job.resume}
+    typer.echo(evaluate.run(job.cfg.distill.evaluate, predictions, dataset, out, bertscore_models=models, **more))
 
 
 def _judged(given: list[str]) -> dict[str, list[Path]]:

@@ -1,10 +1,10 @@
-"""What the commands share: `takes`, which gives them their common options; types of options; how they tell what they made."""
+"""What the commands share: `takes`, which gives them their common options; types of options; tables."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,8 +24,8 @@ Out = Annotated[Path, Option(help="Output folder.")]
 Map = Annotated[Path, Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
 Trees = Annotated[
     list[Path] | None,
-    Option("--data", show_default="that of the run folder one stands in", help="Playback tree; of commands that take several, repeat it."),
-]  # fmt: skip
+    Option("--data", show_default="that of this run folder", help="Playback tree; repeat it where several are taken."),
+]
 
 
 # --- the decorator ----------------------------------------------------------------------------------------------------
@@ -33,34 +33,38 @@ Trees = Annotated[
 
 @dataclass(frozen=True)
 class Sets:
-    """Stands beside an option that is short for a setting. words: what a word of the option is as a value of the setting."""
+    """Stands beside an option that is short for a setting. words: an option's word -> the setting's value."""
 
     path: str
     words: Mapping[str, Any] = field(default_factory=dict)
 
+    def value_of(self, given: Any) -> Any:
+        return self.words.get(given, given) if isinstance(given, str) else given
+
 
 Track = Literal["clean", "perturbed", "both"]
 TRACKS = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
-GLOB_HELP = "Only flights whose folder in the tree, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; may be repeated."
+GLOB_HELP = "Only flights whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 TRACKS_HELP = "Only flights of this track."
 RESUME_HELP = "A folder that holds work: refuse it, or continue if settings and inputs are the same."
-SHARED: dict[str, tuple[Any, Any]] = {  # name -> type and default, in the order of the help
-    "flights": (Annotated[list[str] | None, Option(metavar="GLOB", help=GLOB_HELP), Sets("match")], None),
-    "tracks": (
-        Annotated[Track | None, Option(show_default="both", help=TRACKS_HELP), Sets("tracks", TRACKS)],
-        None,
-    ),
-    "config": (Annotated[Path | None, Option("--config", "-c", help="YAML file with the settings of a run.")], None),
+VERIFY_HELP = "First compare every file of the stages that are read with its sha256."
+REPAIR_HELP = "First set aside, as FILE.aside, what is broken in the folder's journals."
+SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default, in the order of the help
+    "flights": (list[str] | None, Option(metavar="GLOB", help=GLOB_HELP), None),
+    "tracks": (Track | None, Option(show_default="both", help=TRACKS_HELP), None),
+    "config": (Path | None, Option("--config", "-c", help="YAML file with the settings of a run."), None),
     "overrides": (
-        Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override one setting; may be repeated.")],
+        list[str] | None,
+        Option("--set", "-s", metavar="A.B=C", help="Override a setting; repeat it."),
         None,
     ),
-    "seed": (Annotated[int | None, Option(help="Seed; every random choice derives from it."), Sets("seed")], None),
-    "workers": (Annotated[int | None, Option(help="Worker processes; 0 takes one per core."), Sets("workers")], None),
-    "verify": (Annotated[bool, Option("--verify", help="First compare every file of the stages that are read with its sha256.")], False),
-    "resume": (Annotated[Literal["never", "if-same"], Option(help=RESUME_HELP)], "if-same"),
-    "repair": (Annotated[bool, Option("--repair", help="First set aside, as FILE.aside, what is broken in the folder's journals.")], False),
-}  # fmt: skip
+    "seed": (int | None, Option(help="Seed; every random choice derives from it."), None),
+    "workers": (int | None, Option(help="Worker processes; 0 takes one per core."), None),
+    "verify": (bool, Option("--verify", help=VERIFY_HELP), False),
+    "resume": (Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
+    "repair": (bool, Option("--repair", help=REPAIR_HELP), False),
+}
+SET_BY = {"flights": Sets("match"), "tracks": Sets("tracks", TRACKS), "seed": Sets("seed"), "workers": Sets("workers")}
 STAGE = ("seed", "workers", "verify", "resume", "repair")  # of a stage that does items by workers
 
 
@@ -109,10 +113,10 @@ class Job:
 
 
 def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of a configuration, and those of SHARED that are named; its function takes a Job first.
+    """Give a command the options of a configuration and the named ones of SHARED; its function takes a Job first.
 
-    An option of its own with `Sets` beside its type is a setting; one that is called as a shared one stands for it. Of a command
-    with further commands below it, nothing is done where one of those is called.
+    An option of its own with `Sets` beside its type is a setting; one that is called as a shared one stands for it.
+    Of a command with further commands below it, nothing is done where one of those is called.
 
     Args:
         flights: section of the settings that --flights and --tracks choose in; None: the command has neither.
@@ -120,37 +124,36 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
     names = ("config", "overrides", *names, *(("flights", "tracks") if flights else ()))
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        _, *own = (
-            one.replace(kind=Parameter.KEYWORD_ONLY) for one in signature(function, eval_str=True).parameters.values()
-        )
+        _, *own = signature(function, eval_str=True).parameters.values()
+        own = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in own]
         taken = {one.name for one in own}
-        shared = [
-            Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for name, (kind, default) in SHARED.items()
-            if name in names and name not in taken
-        ]
-        settings = {
-            one.name: sets
-            for one in (*own, *shared)
-            for sets in getattr(one.annotation, "__metadata__", ())
-            if isinstance(sets, Sets)
+        shared = {name: option for name, option in SHARED.items() if name in names and name not in taken}
+        sets = {
+            one.name: found
+            for one in own
+            for found in getattr(one.annotation, "__metadata__", ())
+            if isinstance(found, Sets)
         }
+        for name in shared.keys() & SET_BY.keys():
+            is_choice = name in ("flights", "tracks")
+            sets[name] = replace(SET_BY[name], path=f"{flights}.{SET_BY[name].path}") if is_choice else SET_BY[name]
 
         @functools.wraps(function)
         def command(context: typer.Context, **given: Any) -> None:
             if context.invoked_subcommand is not None:
                 return
-            extra = {
-                f"{flights}.{sets.path}" if name in ("flights", "tracks") and name not in taken else sets.path:
-                sets.words.get(given[name], given[name]) if isinstance(given[name], str) else given[name]
-                for name, sets in settings.items() if given[name] not in (None, [])
-            }  # fmt: skip
-            cfg = resolve(given["config"], given.get("overrides"), extra)
+            chosen = {name: one for name, one in sets.items() if given[name] not in (None, [])}
+            extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
             manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
-            function(Job(cfg, **manner), **{name: given[name] for name in taken})
+            job = Job(resolve(given["config"], given.get("overrides"), extra), **manner)
+            function(job, **{name: given[name] for name in taken})
 
+        parameters = [
+            Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
+            for name, (kind, option, default) in shared.items()
+        ]
         context = Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
-        command.__signature__ = Signature([context, *own, *shared])  # type: ignore[attr-defined]
+        command.__signature__ = Signature([context, *own, *parameters])  # type: ignore[attr-defined]
         command.__annotations__ = {}
         return command
 
@@ -213,7 +216,7 @@ def _config_path(config: Path | None) -> Path | None:
 
 
 def data_folder(data: list[Path] | None) -> Path:
-    """The playback tree: given, or that of the run folder one stands in; raises InputError where there is none, or several are given."""
+    """The playback tree: given, or that of the run folder one stands in; InputError where there is not one."""
     trees = data_folders(data)
     if len(trees) > 1:
         raise InputError(
@@ -246,7 +249,7 @@ def tell_table(
     left: Sequence[str] = (),
     **style: Any,
 ) -> None:
-    """Print a table. head: names of the columns, none of a table without; numbers stand right, the first column and `left` do not."""
+    """Print a table. head: names of the columns, or none; all stand right but the first column and `left`."""
     from rich.table import Table
 
     style = style if head else {"box": None}
@@ -259,7 +262,7 @@ def tell_table(
 
 
 def tell_checks(checks: Sequence[Any], console: Console, title: str | None = None) -> None:
-    """Print what was examined, each with name, state and detail; exit 1 where something that is needed does not work."""
+    """Print what was examined: name, state, detail; exit 1 where something that is needed does not work."""
     from rich.text import Text
 
     colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}

@@ -33,12 +33,18 @@ def release_build(
         list[Path] | None,
         Option(help="Playback tree, also of others; by default that of the run folder one stands in."),
     ] = None,
-    flights: Annotated[list[str] | None, Option(metavar="GLOB", help=options.GLOB_HELP), Sets("release.flights")] = None,
-    tracks: Annotated[options.Track | None, Option(help=options.TRACKS_HELP), Sets("release.tracks", options.TRACKS)] = None,
-    frames: Annotated[
-        str | None, Option(metavar="N|all", help="Frames of each flight, in evenly spread runs; or all of them."), Sets("release.num_frames", {"all": None})
+    flights: Annotated[
+        list[str] | None, Option(metavar="GLOB", help=options.GLOB_HELP), Sets("release.flights")
     ] = None,
-) -> None:  # fmt: skip
+    tracks: Annotated[
+        options.Track | None, Option(help=options.TRACKS_HELP), Sets("release.tracks", options.TRACKS)
+    ] = None,
+    frames: Annotated[
+        str | None,
+        Option(metavar="N|all", help="Frames of each flight, in evenly spread runs; or all of them."),
+        Sets("release.num_frames", {"all": None}),
+    ] = None,
+) -> None:
     """Select frames of one run or several, join captions, write parquet, data-set card and checksums."""
     from release.package import stage as package
     from release.package.sources import Source
@@ -113,7 +119,7 @@ def release_sign(
         Literal["structure", "rows", "pixels"], Option(help="How far the release is verified before.")
     ] = "pixels",
 ) -> None:
-    """Verify a release, then sign its list of checksums with your key: `release verify --public-key` tells a forged one."""
+    """Verify a release, then sign its checksums with your key, for `release verify --public-key`."""
     from caption.run.released import read_released
     from cosfly.app.settings import manner_of_work
     from release import sign
@@ -180,7 +186,7 @@ def release_viewer(
     picture_px: Annotated[int, Option(help="Width of a colour picture, px; depth and mask have half of it.")] = 320,
     max_mb: Annotated[int, Option(help="Size of the page, MB: what would make it larger loses its pictures.")] = 64,
 ) -> None:
-    """Make one page that works offline: flights, frames (colour, depth, mask), tracks from above, captions with verdict and evidence, filters."""
+    """Make one page that works offline: flights, frames, tracks from above, captions with verdict and evidence."""
     from cosfly.work.config import build
     from release.viewer import page
     from release.viewer.content import ViewerConfig
@@ -238,7 +244,7 @@ def release_get(
         Option(help="What rows say that cannot be true: refuse the release, or keep it and say so."),
     ] = "refuse",
 ) -> None:
-    """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and all that can be checked is."""
+    """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and are checked."""
     from cosfly.work.config import build
     from release.get import stage as get
     from release.get.stage import Choice

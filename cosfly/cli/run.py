@@ -1,4 +1,4 @@
-"""The command `cosfly run`, what looks at runs, and what tells of this installation: `cosfly config ...` and `cosfly doctor`."""
+"""The command `cosfly run`, what looks at runs, `cosfly config ...` and `cosfly doctor`."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cosfly.app.settings import RunConfig
 
 app = typer.Typer()
+CONFIG = "YAML file, one that ships (quickstart, diverse, learning, simworld, delft), or a run folder, to continue."
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
@@ -25,15 +26,13 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 @takes(*STAGE)
 def run(
     job: Job,
-    config: Annotated[
-        Path, Argument(help="YAML file, or one that ships: quickstart, diverse, learning, simworld, delft; or a run folder, to continue.")
-    ],
+    config: Annotated[Path, Argument(help=CONFIG)],
     out: Annotated[Path | None, Option(show_default="runs/<name>, or that of the run.yaml", help="Run folder.")] = None,
     dry_run: Annotated[
         bool, Option("--dry-run", help="Say what it would take (time, disk, tokens by stage) and write nothing.")
     ] = False,
-) -> None:  # fmt: skip
-    """Make a data set from a configuration: all stages in order. Run it again, or with the run's folder, to continue."""
+) -> None:
+    """Make a data set from a configuration: all stages in order. Run it again to continue."""
     from cosfly.app import pipeline
 
     if (config / "run.yaml").is_file():
@@ -112,10 +111,10 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     at_work = ", at work now" if seen.is_at_work else ""
     complete = f"{seen.num_complete} of {len(seen.stages)} stages complete"
     answer_console.print(f"{run}: {seen.cfg.name}, {complete}, {size(seen.size_bytes)}{at_work}")
-    rows = [
-        (one.name, one.state, _items_of(one), "" if one.seconds is None else f"{one.seconds:.1f}", size(one.size_bytes) if one.size_bytes else "")
-        for one in seen.stages
-    ]  # fmt: skip
+    rows = []
+    for one in seen.stages:
+        seconds = "" if one.seconds is None else f"{one.seconds:.1f}"
+        rows.append((one.name, one.state, _items_of(one), seconds, size(one.size_bytes) if one.size_bytes else ""))
     head = ("stage", "state", "items", "seconds", "on disk")
     options.tell_table(answer_console, head, rows, left=("state", "items"), **PLAIN)
     lines = ["settings that are not the defaults:"] if seen.differing else []
@@ -199,7 +198,7 @@ app.add_typer(config_app, name="config")
 @config_app.command("check")
 @takes()
 def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the name of one that ships.")]) -> None:
-    """Check a configuration without running it; reports all problems at once, also files that are missing and a licence that nobody names."""
+    """Check a configuration without running it: all problems at once, also missing files and licences."""
     from cosfly.app import pipeline
 
     pipeline.check_with_files(job.cfg)
@@ -217,9 +216,10 @@ def config_show(
     markdown: Annotated[bool, Option("--markdown", help="With --describe: as a page.")] = False,
     changed: Annotated[bool, Option("--changed", help="Only what is not the default.")] = False,
     find: Annotated[
-        list[str] | None, Option(metavar="WORD", help="Only settings with this word in name, value or meaning; may be repeated.")
+        list[str] | None,
+        Option(metavar="WORD", help="Only settings with this word in name, value or meaning; repeat it."),
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Print the resolved configuration: every setting with its value, and with --describe or --find what it means."""
     import yaml
 

@@ -1,4 +1,4 @@
-"""The commands of steps 1 to 6 and of pictures that are there: `cosfly maps`, `simplify`, `pedestrians`, `plan`, `render`, `gallery`, `inspect`."""
+"""The commands of steps 1 to 6: `cosfly maps`, `simplify`, `pedestrians`, `plan`, `render`, `gallery`, `inspect`."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def inspect_review(
     reason: Annotated[str | None, Option(help="Why.")] = None,
     decisions: Annotated[Path | None, Option(help="What review.html saved: take its decisions.")] = None,
 ) -> None:
-    """Decide flights that the inspection left to a person: make review.html, or take what was decided, into review.jsonl."""
+    """Decide flights that were left to a person: make review.html, or take decisions into review.jsonl."""
     from cosfly.inspection import review
     from cosfly.products.review import Verdict
 

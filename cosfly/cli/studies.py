@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Option
@@ -21,9 +21,13 @@ def study_depth(
     out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
     data: options.Trees = None,
     frame: Annotated[
-        Path | None, Option(show_default="one that shows the target whole", help="Folder of a frame, in the tree or a path, or a .npy of depth in metres.")
+        Path | None,
+        Option(
+            show_default="one that shows the target whole",
+            help="Folder of a frame, in the tree or a path; or a .npy, in metres.",
+        ),
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
     from cosfly.look.gallery import best_frame, frame_in
     from cosfly.studies import depth
@@ -64,9 +68,8 @@ def study_weather(
     cfg = build(RenderConfig, job.cfg.render.model_dump() | mode | given, "--weather-pool, --tod-pool")
     presets = read_pools(cfg)
     with progress_bar("study weather: pictures", len(presets.weathers) * len(presets.times)) as advance:
-        product = weather.run(
-            cfg, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=job.cfg.seed, advance=lambda: advance(1),
-        )  # fmt: skip
+        chosen: Any = {"trajectory": trajectory, "frame": frame, "fov_deg": fov, "seed": job.cfg.seed}
+        product = weather.run(cfg, map_, traces, out, **chosen, advance=lambda: advance(1))
     for path in product:
         typer.echo(path)
 

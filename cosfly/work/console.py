@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +51,14 @@ class _Lines(logging.Handler):
         console.print(self.format(record), soft_wrap=True)
 
 
+class _File(logging.FileHandler):
+    """Writes records to a file. One that cannot be written any more is told once, and the command goes on without."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # the name of the library
+        logging.getLogger().removeHandler(self)
+        log.warning("the log %s cannot be written any more: %s", self.baseFilename, sys.exc_info()[1])
+
+
 LINE, WHEN = "%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z"
 
 
@@ -72,7 +81,7 @@ def set_up_logging(level: int, file: Path | None = None) -> None:
     handlers: list[logging.Handler] = [handler]
     if file is not None:
         try:
-            handlers.append(logging.FileHandler(file, encoding="utf-8"))
+            handlers.append(_File(file, encoding="utf-8"))
         except OSError as error:
             raise StorageError(
                 "cannot write the log", where=file, got=error.strerror, fix="choose another --log-file"
