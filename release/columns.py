@@ -40,6 +40,7 @@ from cosfly.products.frames import (
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.weather import WeatherMode, WeatherParams
+from cosfly.work.store import dump_json
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
@@ -194,6 +195,14 @@ def _text(language: Language, name: str, caption: Caption) -> str | None:
     return None if coc is None else getattr(coc, name)
 
 
+def _evidence(caption: Caption) -> str:
+    evidence = caption.evidence
+    if evidence.reader is not None:
+        models = [published_name(model) for model in evidence.reader.models]
+        evidence = evidence.model_copy(update={"reader": evidence.reader.model_copy(update={"models": models})})
+    return dump_json(evidence.model_dump(mode="json", exclude_none=True))
+
+
 def _prompt(language: Language, part: str, caption: Caption) -> str | None:
     prompt = caption.prompt.get(language)
     return None if prompt is None else getattr(prompt, part)
@@ -328,6 +337,7 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         Column(f"{name}_{language}", "string", of_caption=partial(_prompt, language, part))
         for language in LANGUAGES for name, part in (("system", "system"), ("prompt", "user"))
     ),
+    Column("evidence", "string", of_caption=_evidence, required=True, title="evidence of its sentences"),
     Column(WINDOW, "indices", of_caption=lambda c: c.window, required=True, title="window", shown=True),
     Column(PICTURE_PX, "indices", of_caption=lambda c: list(c.picture_px), required=True),
 )  # fmt: skip
@@ -335,8 +345,8 @@ SCALARS = (*FRAME, *CAPTION)
 SCALAR_NAMES = [column.name for column in SCALARS]
 CAPTION_NAMES = [column.name for column in CAPTION]
 COUNTED = [column.name for column in CAPTION if column.counted]
-# All but the prompts, which are long, and the same for many captions.
-SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_"))]
+# All but the prompts and the evidence, which are long.
+SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_", "evidence"))]
 REQUIRED = frozenset(column.name for column in FRAME if column.required)
 
 

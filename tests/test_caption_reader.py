@@ -12,14 +12,21 @@ from measure_prose import answers_of, loses, misquotes, misreads, perfect_readin
 from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
+from caption.run.released import state_lies
 from caption.run.stage import run
-from caption.schema import CaptionConfig, ReaderConfig
+from caption.run.windows import cut_windows
+from caption.schema import CaptionConfig, EvidenceConfig, ReaderConfig, WindowConfig
 from caption.teachers.reader import Reader, ReaderCheck, measure_reader, prompt_digest, read_reading
+from caption.truth.facts import measure_facts
 from caption.truth.gold import GoldCaption, read_gold
 from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.contract import Reply
 from cosfly.cli import app
 from cosfly.products.captions import Claim, Coc, Usage, read_captions
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
+from release.columns import caption_values
+from release.verify.rows import shown_caption
 from specimens import make_playback_tree
 
 
@@ -113,6 +120,11 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
                 "reasoning_trace": "There is nothing to say against this manoeuvre here.",
                 "flight_decision": caption.label or "hover",
             },
+            "zh": {
+                "critical_components": f"我们以 {altitude + 5 * (number % 2):.1f} m 的高度在道路上空飞行。",
+                "reasoning_trace": "此处没有任何理由反对这一机动动作。",
+                "flight_decision": caption.label or "hover",
+            },
         }
         for number, (caption, altitude) in enumerate(zip(rules, altitudes, strict=True))
     ]
@@ -123,13 +135,26 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
     with server:
         cfg = CaptionConfig.model_validate({"teacher": f"file:{path}", "reader": {"urls": [server.url]}})
         found = list(read_captions(run(cfg, tree, tmp_path / "out")))
-        assert len(server.bodies) == 2 * len(lines)
+        assert len(server.bodies) == 4 * len(lines)
         run(cfg, tree, tmp_path / "out")
-        assert len(server.bodies) == 2 * len(lines)  # nothing is asked twice
+        assert len(server.bodies) == 4 * len(lines)  # nothing is asked twice
     assert [c.checks.sentences["en"][0] for c in found] == [
         "contradicted" if n % 2 else "proved" for n in range(len(found))
     ]
     assert all(c.reader.prompt == prompt_digest() and c.reader.claims["en"][0].quote for c in found)
+    windows = list(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
+    lie_of_state, lie_of_claim = 0, 0
+    for caption, window in zip(found, windows, strict=True):
+        row = caption_values(caption) | {"sample_id": caption.sample_id, "frame_index": caption.frame_index}
+        facts = measure_facts(window.observed, caption.picture_px)
+        assert state_lies(shown_caption(row), facts, EvidenceConfig()) == []  # from the row alone: nobody is asked
+        states = ["unread", *row["sentence_states_en"][1:]]
+        lie_of_state += len(state_lies(shown_caption(row | {"sentence_states_en": states}), facts, EvidenceConfig()))
+        evidence = row["evidence"].replace('"value":', '"value":9')
+        lie_of_claim += len(state_lies(shown_caption(row | {"evidence": evidence}), facts, EvidenceConfig()))
+        assert state_lies(shown_caption(row | {"evidence": "[]"}), facts, EvidenceConfig())[0].code == "evidence"
+    assert lie_of_state == len(found)
+    assert lie_of_claim >= len(found) // 2  # what was proved no longer is
 
 
 def test_the_command_measures_an_endpoint():

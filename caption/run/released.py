@@ -6,20 +6,25 @@ where a stride left them out) is not judged.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from caption.run.windows import LabelMotion, cut_future, frames_of, label_motion
-from caption.schema import FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
+from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
+from caption.teachers.reader import judge_text
 from caption.truth.actions import label_of, measure, verdict_of
-from caption.truth.facts import measure_facts
+from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose import check_prose
+from caption.writing.contract import WAYS, Draft, Refused, way_of
 from cosfly.products.actions import actions_in_use
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Coc, Evidence, Language, Writing
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
+from cosfly.reading.documents import parse_json
 from cosfly.work import in_place
 
 NUDGE = 1e-9  # of a threshold: what taking offsets off again may cost
@@ -35,6 +40,7 @@ def read_released(shown: ShownFlight) -> list[Lie]:
 def _read_released(shown: ShownFlight) -> list[Lie]:
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
     motion, frames = label_motion(shown.flight, shown.twin), frames_of(shown.flight)
+    evidence_cfg = EvidenceConfig.model_validate((shown.settings or {}).get("evidence", {}))
     lies: list[Lie] = []
     for caption in shown.captions:
         picked = [rows.get(index) for index in caption.window]
@@ -43,7 +49,7 @@ def _read_released(shown: ShownFlight) -> list[Lie]:
         mission = _mission_of(caption)
         window = _window(shown, frames, caption, [row for row in picked if row is not None], mission)
         lies += _prompt_lies(window, caption)
-        lies += _text_lies(window, caption)
+        lies += _text_lies(window, caption, evidence_cfg)
         lies += _label_lies(shown, motion, caption, rows, mission)
     return lies
 
@@ -103,24 +109,66 @@ def _difference(found: str, wanted: str) -> str:
 # --- texts ------------------------------------------------------------------------------------------------------------
 
 
-def _text_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
-    """Texts must be true of the window, as far as their record says that they are, and say the same in both languages."""
+def _text_lies(window: ObservedWindow, caption: ShownCaption, cfg: EvidenceConfig) -> list[Lie]:
+    """Texts must be what their templates give, each sentence of the state that its evidence gives, and the same in both languages."""
     facts = measure_facts(window, caption.picture_px)
-    lies = []
-    for language, coc in caption.answers.items():
-        found = check_prose(coc, facts, language)
-        allowed = caption.contradicted.get(language, 0)
-        if caption.writing == "claims":  # claims say what a word was meant of, and are not released
-            allowed += 1
-        if len(found) > allowed:
-            got = f"{found[0][:MOST_SHOWN]}" + (f" and {len(found) - 1} more" if len(found) > 1 else "")
-            expected = f"at most {allowed} that the flight contradicts, as its record says"
-            lies.append(Lie("caption_text", f"{caption.sample_id}: {language}", got, expected))
+    lies = [] if caption.evidence is None or caption.writing not in WAYS else state_lies(caption, facts, cfg)
     if len(caption.answers) == 2:
         reason = check_mirror(caption.answers["en"], caption.answers["zh"], flight_numbers(facts))
         if reason is not None:
             lies.append(Lie("languages", caption.sample_id, f"another {reason}", "the same in English and in Chinese"))
     return lies
+
+
+def state_lies(caption: ShownCaption, facts: Facts, cfg: EvidenceConfig) -> list[Lie]:
+    assert caption.evidence is not None
+    try:
+        evidence = Evidence.model_validate(parse_json(caption.evidence))
+    except ValueError as error:
+        got = " ".join(str(error).split())[:MOST_SHOWN]
+        return [Lie("evidence", f"{caption.sample_id}: evidence", got, "JSON of what its states follow from")]
+    drafts = drafts_of(caption.answers, caption.writing, evidence, facts)
+    if isinstance(drafts, Refused):
+        got = f"{drafts.reason}: {drafts.complaint}"[:MOST_SHOWN]
+        return [Lie("evidence", f"{caption.sample_id}: evidence", got, "templates that the flight fills")]
+    lies = []
+    for language, draft in drafts.items():
+        where, shown = f"{caption.sample_id}: {language}", caption.answers[language]
+        if draft.coc != shown:
+            name = next(name for name in Coc.model_fields if getattr(draft.coc, name) != getattr(shown, name))
+            got = _difference(getattr(shown, name), getattr(draft.coc, name))
+            lies.append(Lie("caption_text", where, got, "the text that its template gives of the flight"))
+            continue
+        states = caption.states.get(language)
+        judged = judge_text(draft, caption.writing, evidence.reader, facts, cfg, language)
+        wrong = [n for n, one in enumerate(judged) if states is not None and states[n : n + 1] != (one.state,)]
+        if wrong:
+            one, called = judged[wrong[0]], (states or ())[wrong[0] : wrong[0] + 1]
+            got = f"{one.text or f'sentence {wrong[0] + 1}'} is called {''.join(called) or 'nothing'}"[:MOST_SHOWN]
+            expected = f"{one.state}, by flight and evidence" + (f" ({one.problems[0]})" if one.problems else "")
+            lies.append(Lie("caption_text", where, got, expected[:MOST_SHOWN]))
+    return lies
+
+
+def drafts_of(
+    answers: Mapping[Language, Coc], writing: Writing, evidence: Evidence, facts: Facts
+) -> dict[Language, Draft] | Refused:
+    """Make the texts of a caption again, from its templates where it was written with slots."""
+    if writing != "slots":
+        claims = tuple(evidence.claims or ()) if writing == "claims" else ()
+        return {language: Draft(coc, claims=claims) for language, coc in answers.items()}
+    written: dict[Language, Parsed] = {
+        language: Parsed(Coc(**template.model_dump(), flight_decision=answers[language].flight_decision))
+        for language, template in (evidence.slots or {}).items()
+        if language in answers
+    }
+    if set(written) != set(answers):
+        return Refused("slots", f"templates in {', '.join(written) or 'no language'}")
+    english = way_of("slots").read(written["en"], facts)
+    if isinstance(english, Refused) or "zh" not in written:
+        return english if isinstance(english, Refused) else {"en": english}
+    chinese = way_of("slots").read_mirror(written["zh"], english, facts)
+    return chinese if isinstance(chinese, Refused) else {"en": english, "zh": chinese}
 
 
 # --- labels -----------------------------------------------------------------------------------------------------------

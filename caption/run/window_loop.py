@@ -14,7 +14,7 @@ from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.reader import Reader, judge_reading
+from caption.teachers.reader import Reader, judge_text
 from caption.teachers.teacher import Teacher, terms_of
 from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
 from caption.truth.facts import Facts
@@ -405,14 +405,14 @@ class _Loop:
         drafts: dict[Language, Draft] = {"en": self.english}
         if self.chinese is not None:
             drafts["zh"] = self.chinese
+        writing, facts = self.terms.writing, question.facts
+        if self.reader is not None and writing == "prose":
+            texts = {language: draft.coc for language, draft in drafts.items()}
+            self.reading = await self.reader.record(texts, facts, question.window.sample_id)
         judged: dict[Language, list[Judged]] = {
-            language: self.way.judge(draft, question.facts, self.cfg.evidence, language)
+            language: judge_text(draft, writing, self.reading, facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
         }
-        if self.reader is not None and self.terms.writing == "prose":
-            texts = {language: draft.coc for language, draft in drafts.items()}
-            self.reading = await self.reader.record(texts, question.facts, question.window.sample_id)
-            judged = {language: self._with_reading(language, judged[language], question.facts) for language in judged}
         self.checks["sentences"] = {
             language: [sentence.state for sentence in sentences] for language, sentences in judged.items()
         }
@@ -424,14 +424,6 @@ class _Loop:
         ]
         self.checks["evidence"] = found or "ok"
         return "evidence" if found and self.cfg.evidence.drop else None
-
-    def _with_reading(self, language: Language, judged: list[Judged], facts: Facts) -> list[Judged]:
-        """Take what the readings of a text prove or contradict, and of sentences that they leave unread what was found without them."""
-        assert self.reading is not None
-        coc = self.chinese.coc if language == "zh" and self.chinese else self.english.coc if self.english else None
-        assert coc is not None
-        read = judge_reading(coc, self.reading.claims[language], facts, self.cfg.evidence, language)
-        return [one if one.state != "unread" else other for one, other in zip(read, judged, strict=True)]
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1

@@ -26,14 +26,14 @@ from caption.truth.sentences import Judged
 from caption.truth.sizes import numeral_of, same_size
 from caption.truth.stated import read_stated
 from caption.writing.claims import CLAIM_SCHEMA, MAX_CLAIMS, read_claims
-from caption.writing.contract import Refused
+from caption.writing.contract import Draft, Refused, way_of
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
-from cosfly.products.captions import Claim, Coc, Language, ReaderRecord, Usage
+from cosfly.products.captions import Claim, Coc, Language, ReaderRecord, Usage, Writing
 from cosfly.products.places import flight_of
 from cosfly.products.sentences import sentences_of
 from cosfly.reading.objects import find_object
@@ -130,6 +130,20 @@ def judge_reading(
         _judge_sentence(name, text, [c for c in claims if c.sentence == name], coc.flight_decision, facts, cfg, language)
         for name, text in sentences_of(coc)
     ]  # fmt: skip
+
+
+def judge_text(
+    draft: Draft, writing: Writing, reader: ReaderRecord | None, facts: Facts, cfg: EvidenceConfig, language: Language
+) -> list[Judged]:
+    """Give the state of every sentence of a text from what stands in its record, which asks nobody.
+
+    reader: what it proves or contradicts counts; a sentence that it leaves unread keeps what was found without it.
+    """
+    judged = way_of(writing).judge(draft, facts, cfg, language)
+    if reader is None or language not in reader.claims:
+        return judged
+    read = judge_reading(draft.coc, reader.claims[language], facts, cfg, language)
+    return [one if one.state != "unread" else other for one, other in zip(read, judged, strict=True)]
 
 
 def _judge_sentence(

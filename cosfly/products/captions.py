@@ -203,6 +203,22 @@ class Template(BaseModel):
     reasoning_trace: str
 
 
+class Evidence(BaseModel):
+    """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column `evidence` of a release.
+
+    slots: the templates that the texts were filled from. claims: what the English text states, by its writer. reader: what language models
+    read in texts that came without claims. problems: what is contradicted. contradicted: decisions that the flight contradicts.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    slots: _Given[dict[Language, Template]] = None
+    claims: _Given[list[Claim]] = None
+    reader: _Given[ReaderRecord] = None
+    problems: list[str] = []
+    contradicted: list[str] = []
+
+
 class Checks(BaseModel):
     """What was checked. structure, bilingual: `ok` or a reason. refused: why answers of the right structure were
     not taken, one reason each. evidence: `ok` or the contradictions. sentences: language -> state of
@@ -263,6 +279,14 @@ class Caption(BaseModel):
     checks: Checks = Checks()
     status: Literal["accepted", "dropped"]
     drop_reason: str | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        problems = self.checks.evidence if isinstance(self.checks.evidence, list) else []
+        return Evidence(
+            slots=self.slots, claims=self.claims, reader=self.reader, problems=problems,
+            contradicted=self.checks.contradicted or [],
+        )  # fmt: skip
 
     def coverage(self, language: Language) -> float | None:
         """Share of a language's sentences that are proved; None where none was judged."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosfly.products.captions import Coc, Language
+from cosfly.products.captions import Coc, Language, Writing
 from cosfly.products.playback import Flight
 
 
@@ -20,7 +20,8 @@ class ShownCaption:
     """One caption of a flight. frame_index: its current frame; window: indices of what its prompt shows, as it says.
 
     prompts, systems: user prompts by language and what stood before each, empty where none is shown. picture_px: (width, height).
-    contradicted: by language, how many of its sentences its record says the flight contradicts; empty where it does not say.
+    states: by language, of its sentences, as its record says; empty where it does not say. evidence: what they follow from, as JSON; None
+    where it is not shown.
     """
 
     sample_id: str
@@ -34,8 +35,9 @@ class ShownCaption:
     label: str | None
     label_from: str
     verdict: str | None
-    writing: str
-    contradicted: dict[Language, int]
+    writing: Writing
+    states: dict[Language, tuple[str, ...]]
+    evidence: str | None
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ class FlightRows:
 
 def shown_caption(row: Row) -> ShownCaption:
     """Give the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found elsewhere."""
-    contradicted = {language: row.get(f"contradicted_sentences_{language}") for language in LANGUAGES}
+    states = {language: row.get(f"sentence_states_{language}") for language in LANGUAGES}
     return ShownCaption(
         sample_id=row["sample_id"],
         frame_index=row["frame_index"],
@@ -201,5 +201,6 @@ def shown_caption(row: Row) -> ShownCaption:
         label_from=row["label_from"],
         verdict=row["verdict"],
         writing=row["writing"],
-        contradicted={language: count for language, count in contradicted.items() if count is not None},
+        states={language: tuple(found) for language, found in states.items() if found},
+        evidence=row.get("evidence"),
     )
