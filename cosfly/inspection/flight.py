@@ -288,7 +288,7 @@ def _check_frames(
     check_others(flight, told, cfg.clearance_min_m, report, metrics)
     checksums = Checksums(flight, report, is_wanted=cfg.check_checksums)
     chosen = choose_frames(list(metas), cfg.check_pixels, cfg.pixel_sample)
-    numbers = check_frames(flight, chosen, metas, told, checksums, cfg, report)
+    numbers = check_frames(flight, chosen, told, checksums, cfg, report)
     checksums.compare_others()
     return numbers
 

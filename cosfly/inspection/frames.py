@@ -23,7 +23,6 @@ from cosfly.products.frames import (
     FILE_NAMES,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
-    FrameMeta,
     OthersMeta,
     frame_name,
 )
@@ -67,7 +66,6 @@ def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int
 def check_frames(
     flight: Flight,
     indices: list[int],
-    metas: Mapping[int, FrameMeta | None],
     told: Mapping[int, OthersMeta],
     checksums: Checksums,
     cfg: InspectConfig,
@@ -78,7 +76,7 @@ def check_frames(
     Each file is read once, for its checksum too.
 
     Args:
-        metas, told: annotations, and what they tell of others, by frame.
+        told: what annotations tell of others, by frame.
     """
     assert flight.folder is not None
     numbers, jumps, tree = FrameNumbers(), Jumps(flight), tree_of_flight(flight.folder)
@@ -103,8 +101,7 @@ def check_frames(
         look = look_at(picture, left_out, cfg.flat_pairs_min)
         _check_surfaces(look, where, cfg, report)
         if picture.depth.size and _check_depth(picture.depth, where, numbers, report):
-            meta = metas.get(i)
-            jumps.see(i, picture, None if meta is None else meta.weather or meta.look)
+            jumps.see(i, picture)
             if picture.instance.size:
                 _check_mask(flight, i, picture, look, left_out, cfg.mask_visibility_min, numbers, report)
     numbers.num_compared = jumps.judge(cfg, report)

@@ -97,19 +97,6 @@ class InspectConfig(Config):
         description="share of what stood still that is where the poses put it, seen from the frame before; less goes to review (the rest is "
         "hidden by what is nearer); renders have 0.8 and more; 0 turns the rule off",
     )
-    jump_colour_drop: float = Field(
-        0.35,
-        gt=0,
-        le=2,
-        description="correlation of what stands still with the frame before, so much below the flight's usual one, goes to review; renders of "
-        "three maps differ by 0.2 at most, another picture of the same place by 0.4 and more; 2 turns the rule off",
-    )
-    jump_brightness_max: float = Field(
-        12.0,
-        gt=0,
-        description="median change of brightness of what stands still, between frames of one weather; more goes to review, grey levels; renders "
-        "have 1.4 at most",
-    )
     thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
     page_mb: float = Field(
         25.0,
