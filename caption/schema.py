@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -113,10 +113,6 @@ class Window:
 
 
 class WindowConfig(Config):
-    formerly: ClassVar[dict[str, str]] = {
-        "label_without_perturbation": "labels always come from the motion without its perturbation now; take the line out"
-    }
-
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, one time step apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
@@ -191,8 +187,6 @@ class EvidenceConfig(Config):
 class JudgeConfig(Config):
     """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
 
-    formerly: ClassVar[dict[str, str]] = {"open_flights": "judgements are kept a flight at a time; take the line out"}
-
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
     max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
@@ -249,8 +243,6 @@ class ReaderConfig(Config):
 
 
 class RepairConfig(Config):
-    formerly: ClassVar[dict[str, str]] = {"verdicts": "now hard_conflict and soft_conflict: keep | repair | drop"}
-
     hard_conflict: Treatment = Field(
         "repair", description="a decision that the flight contradicts: repair (ask again), drop, or keep as it is"
     )

@@ -28,7 +28,7 @@ from cosfly.products.splits import SPLITS, Split
 from cosfly.reading.documents import read_model, validation_errors
 from cosfly.reading.tables import TableRows
 from cosfly.work import in_place
-from cosfly.work.provenance import fingerprint, fingerprints
+from cosfly.work.provenance import fingerprint
 from cosfly.work.store import atomic_file, write_bytes, write_model
 
 RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
@@ -158,7 +158,7 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     run_of = {tree.sha256: tree.run for tree in record.trees}
     trees: dict[str, Path] = {}
     for path in data:
-        run = next((run_of[digest] for digest in fingerprints(path) if digest in run_of), None)
+        run = run_of.get(fingerprint(path))
         if run is None:
             raise InputError(
                 "the training set was not made of this playback tree", where=path, got=f"fingerprint {fingerprint(path)}",

@@ -21,7 +21,6 @@ from cosfly.errors import ConfigError, EnvironmentMissing, InputError, nearest
 from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import frame_name
-from cosfly.products.places import stand
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.documents import read_object
@@ -120,7 +119,7 @@ class _Tree:
     def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]:
         whole: dict[Path, set[int]] = {}
         for caption in read_captions(self.captions):
-            folder = stand(self.tree, f"{caption.town}/{caption.trajectory}/{caption.variant}")
+            folder = inside(self.tree, f"{caption.town}/{caption.trajectory}/{caption.variant}", beside=True)
             if folder not in whole:
                 whole[folder] = _frames_in(folder)
             if caption.status != "accepted":

@@ -21,8 +21,6 @@ from rich.console import Console
 from specimens_distill import make_caption
 from teacher_server import TeacherServer, is_mirror, kept_answers
 
-from caption.run.compare import run as compare_strategies
-from caption.run.forecast import make_forecast
 from caption.run.progress import Display, duration
 from caption.run.stage import run
 from caption.schema import CaptionConfig
@@ -30,7 +28,7 @@ from cosfly.chat import answers
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
 from cosfly.chat.protocol import encode_body, with_image_ids
-from cosfly.errors import ConfigError, ResumeError, TeacherError
+from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import Usage, read_captions
 from cosfly.work.journal import Journal
 from specimens import make_playback_tree
@@ -331,35 +329,6 @@ def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
     lines = file.getvalue().splitlines()
     assert "caption" not in lines[0]
     assert lines[1].strip() == "caption: 43 of 100 windows"
-
-
-# --- a folder of an earlier version -----------------------------------------------------------------------------------
-
-
-def test_a_folder_whose_answers_stand_in_one_file_is_refused_and_nothing_is_paid_twice(tree, tmp_path):
-    out = tmp_path / "out"
-    with hovering() as server:
-        cfg = settings(server.url, limit=3)
-        path = run(cfg, tree, out)
-        num_asked = len(server.bodies)
-        Journal(out / "answers.jsonl").append({"key": "k"})
-        assert run(cfg, tree, out) == path  # complete: nothing would be asked
-        with pytest.raises(ResumeError, match=r"answers.jsonl.*earlier version"):
-            run(cfg.model_copy(update={"limit": 5}), tree, out)
-        assert (out / "manifest.json").exists()
-        (out / "manifest.json").unlink()
-        before = sorted((path, path.read_bytes()) for path in out.rglob("*") if path.is_file())
-        other = settings(server.url, endpoint={"temperature": 0.1})
-        refused = r"answers.jsonl.*earlier version.*the version that began it, or choose another --out"
-        for changed in (cfg, other):
-            with pytest.raises(ResumeError, match=refused):
-                run(changed, tree, out)
-            with pytest.raises(ResumeError, match=refused):
-                make_forecast(changed, tree, out)
-        with pytest.raises(ResumeError, match=refused):
-            compare_strategies(cfg, tree, out)
-        assert before == sorted((path, path.read_bytes()) for path in out.rglob("*") if path.is_file())
-    assert len(server.bodies) == num_asked
 
 
 # --- the book of answers ----------------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """Settings: strict, all problems at once, the nearest name."""
 
-from typing import ClassVar
-
 import pytest
 from pydantic import BaseModel, Field
 from typer.testing import CliRunner
@@ -14,7 +12,6 @@ from cosfly.work.config import Config, apply_overrides, load, shipped
 
 
 class Inner(Config):
-    formerly: ClassVar = {"flies_at": "did you mean 'altitude_m'?"}
     altitude_m: float = Field(20.0, gt=0, description="")
 
 
@@ -117,11 +114,6 @@ def test_a_wrong_override_is_not_laid_at_the_files_door(tmp_path):
     file.write_text("seed: 3\n")
     with pytest.raises(ConfigError, match=r"c\.yaml with --set: plan: not a group of settings, got 3"):
         load(Outer, file, ["plan=3"])
-
-
-def test_a_former_name_leads_to_the_present_one():
-    with pytest.raises(ConfigError, match=r"plan\.flies_at: unknown setting \(did you mean 'altitude_m'\?\)"):
-        load(Outer, None, ["plan.flies_at=3"])
 
 
 @pytest.mark.parametrize(

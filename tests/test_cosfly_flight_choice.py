@@ -13,15 +13,13 @@ from typer.testing import CliRunner
 from caption.run.released import read_released
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig
-from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.errors import ConfigError, InputError
+from cosfly.errors import InputError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin, track_of
 from cosfly.products.inspection import read_inspection
 from cosfly.products.places import FlightChoice, place_of
 from cosfly.products.playback import read_flight
-from cosfly.work.config import build
 from cosfly.work.provenance import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.sources import Source as Prepared
@@ -185,18 +183,3 @@ def test_a_missing_field_is_called_missing(tree, tmp_path):
     ) as told:
         read_flight(flight)
     assert "None" not in str(told.value)
-
-
-def test_what_became_of_a_setting_is_said():
-    for section, name, told in (
-        ("render", "png_compression", "pictures are packed by an encoder of cosfly's own"),
-        ("caption", "window.label_without_perturbation", "labels always come from the motion without"),
-    ):
-        inner: dict = {}
-        *groups, last = name.split(".")
-        node = inner
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[last] = 6
-        with pytest.raises(ConfigError, match=rf"{section}\.{name}: unknown setting \(.*{told}"):
-            build(RunConfig, {section: inner}, "run.yaml")

@@ -463,11 +463,6 @@ def test_settings_that_contradict_are_refused():
             PlanConfig.model_validate(bad)
 
 
-def test_the_former_name_of_the_bound_on_sight_is_known():
-    with pytest.raises(ConfigError, match="did you mean 'five_ray_mean_min'"):
-        load(PlanConfig, None, ["visibility_min=0.3"])
-
-
 def test_settings_are_read_without_compiled_code():
     code = "import sys, cosfly.planners.contract, cosfly.planners.stage; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -132,13 +132,6 @@ def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
         provenance.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
 
 
-def test_a_converted_tree_goes_with_the_captions_of_the_older_one(run):
-    converted = make(
-        run / "new", "convert-tree", {"Town1/trajectory_1/ORI/trajectory.json": "new"}, data=run / "render"
-    )
-    provenance.checked_inputs({"data": converted, "captions": run / "caption/captions.jsonl"})
-
-
 def test_a_file_and_a_folder_beside_it_are_verified_as_one_types_them(run, monkeypatch):
     monkeypatch.chdir(run)
     (run / "render/Town1/trajectory_1/ORI/frames_playback/frame_00000/rgb.png").write_text("another")
@@ -170,12 +163,6 @@ def test_a_stage_that_kept_nothing_is_told_from_one_that_is_not_finished(tmp_pat
         stage.finish([product], Tally(input=2, dropped={"missing_file": 2}))
     with pytest.raises(VerifyError, match=r"kept nothing.*got 2 items, all dropped.*another --out"):
         provenance.checked_inputs({"inspect": product})
-
-
-def test_a_forged_record_of_a_conversion_of_nothing(run):
-    record = read_json(run / "render/stage.json")
-    write_json(run / "render/stage.json", record | {"stage": "convert-tree", "inputs": {}})
-    provenance.checked_inputs({"data": run / "render", "captions": run / "caption/captions.jsonl"})
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other file systems have no such names")

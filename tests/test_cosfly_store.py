@@ -166,33 +166,6 @@ def test_other_settings_are_named(tmp_path, changes, words):
         _open(tmp_path / "out", **changes, resume="never")
 
 
-def test_a_setting_that_came_later_is_no_other_setting_while_it_has_its_default(tmp_path):
-    stage = _open(tmp_path / "out")
-    write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally(input=1, kept=1))
-    assert _open(stage.path, config=Newer()).is_complete
-    for other, words in (
-        ({"solids": False}, "solids was None, is False"),
-        ({"extra": Demo(a={"b": 5})}, "extra.a.b was None, is 5"),
-    ):
-        with pytest.raises(ResumeError, match=words):
-            _open(stage.path, config=Newer(**other))
-    with pytest.raises(ResumeError, match=r"a\.b was 1, is 2"):
-        _open(stage.path, config=Newer(a={"b": 2}))
-
-
-def test_of_a_group_on_record_only_what_it_lacks_is_taken_as_by_default(tmp_path):
-    stage = _open(tmp_path / "out", config=Newer(extra=Demo(a={"c": 1})))
-    write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally(input=1, kept=1))
-    record = read_json(stage.path / "stage.json")
-    del record["config"]["solids"]
-    write_json(stage.path / "stage.json", record)
-    assert _open(stage.path, config=Newer(extra=Demo(a={"c": 1}))).is_complete
-    with pytest.raises(ResumeError, match=r"extra\.a\.b was None, is 1; extra\.a\.c was 1, is None"):
-        _open(stage.path, config=Newer())
-
-
 def test_a_command_that_is_refused_before_it_did_anything_leaves_nothing(tmp_path):
     (tmp_path / "mine").mkdir()
     for out in (tmp_path / "new/deep", tmp_path / "mine"):

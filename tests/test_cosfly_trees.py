@@ -1,4 +1,4 @@
-"""Trees as others read and write them: the strictest public reader on ours, our readers on theirs, and trees of before.
+"""Trees as others read and write them: the strictest public reader on ours, our readers on theirs.
 
 QUIRKS is the place for the next thing that a foreign tree does otherwise.
 """
@@ -27,14 +27,12 @@ from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.frames import read_meta
 from cosfly.products.inspection import read_inspection
-from cosfly.products.places import Place, flight_ids, stand, town_folder
+from cosfly.products.places import Place, flight_ids, town_folder
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.documents import read_json
-from cosfly.reading.files import sha256_file
 from cosfly.work.stage_folder import read_failures
-from cosfly.work.store import write_checksums, write_json
+from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
 from distill.prepare.sources import Source as Prepared
 from distill.prepare.stage import PrepareConfig
@@ -114,50 +112,6 @@ def test_other_folders_are_not_found_by_the_public_reader(ours, tmp_path):
         read_public(tmp_path / "tree")
 
 
-# --- trees of before ----------------------------------------------------------------------------------------------------
-
-
-def make_older(tree: Path, target: Path, town: str = "delft") -> Path:
-    """Give a tree the form that cosfly wrote at first."""
-    copied(tree, target)
-    (target / "Town01").rename(target / town)
-    for folder in find_flights(target):
-
-        def change(value: dict, folder: Path = folder) -> None:
-            value["trace_dir"] = folder.parent.name
-            for point in value["points"][:-1]:
-                point["nav_waypoint"]["t1_world"] = list(point["nav_waypoint"]["t1_world"].values())
-
-        change_file(folder, change)
-        for path in sorted(folder.rglob("meta.json")):
-            meta = read_meta(path.parent).model_copy(update={"town": town})
-            path.unlink()
-            path.write_bytes(meta.to_bytes())
-        names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-        write_checksums(folder, {name: sha256_file(folder / name) for name in names})
-    (target / town / "map.json").write_text("{}")
-    return target
-
-
-@pytest.fixture(scope="module")
-def older(ours, tmp_path_factory) -> Path:
-    return make_older(ours, tmp_path_factory.mktemp("older"))
-
-
-def same_flight(one: Path, two: Path) -> None:
-    first, second = read_flight(one), read_flight(two)
-    for name, value in vars(first).items():
-        if isinstance(value, np.ndarray):
-            assert_array_equal(getattr(second, name), value, err_msg=name)
-
-
-def test_a_tree_of_before_is_read(ours, older):
-    with pytest.raises(Refused):
-        read_public(older)
-    for theirs, mine in zip(find_flights(older), find_flights(ours), strict=True):
-        same_flight(theirs, mine)
-
-
 # --- names --------------------------------------------------------------------------------------------------------------
 
 
@@ -168,19 +122,6 @@ def test_a_tree_of_before_is_read(ours, older):
 )  # fmt: skip
 def test_town_folders(name, folder):
     assert town_folder(name) == folder
-
-
-def test_a_town_is_found_under_either_name(older, tmp_path):
-    new = copied(older, tmp_path / "new")
-    (new / "delft").rename(new / "Town_delft")
-    for tree, name in ((older, "delft"), (new, "Town_delft")):
-        for town in ("delft", "Town_delft"):
-            assert stand(tree, f"{town}/trajectory_1776047127/ORI") == tree / name / "trajectory_1776047127/ORI"
-    for deeper in ("", "trajectory_1776047127", "trajectory_1776047127/ORI"):  # --data may name a part of a tree
-        root = older / "delft" / deeper
-        assert stand(root, find_flights(root)[0].relative_to(root).as_posix()).name == "ORI"
-    with pytest.raises(InputError, match="leads out"):
-        stand(older, "../x/y")
 
 
 def test_ids_are_plain_where_they_can_be_and_longer_where_they_must():
@@ -233,7 +174,6 @@ QUIRKS = {
     "no waypoints": Quirk(each(lambda p: p.pop("nav_waypoint")), is_strict=False),
     "waypoints as lists": Quirk(each(listed)),
     "waypoints and flat times": Quirk(old_times, is_strict=False),
-    "trace_dir is the parent's": Quirk(lambda v: v.update(trace_dir="trajectory_1777083733")),
     "trace_dir is another's": Quirk(lambda v: v.update(trace_dir="aug_002"), is_strict=False),
     "perturbation left out": Quirk(each(lambda p: p.pop("perturbation"))),
     "perturbation is null": Quirk(each(lambda p: p.update(perturbation=None))),

@@ -24,7 +24,6 @@ from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
-from cosfly.chat.answers import refuse_one_file
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.chat.student_chat import student_files
 from cosfly.errors import ConfigError, ResumeError, TeacherError
@@ -123,11 +122,8 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     """Open the stage's folder for these settings.
 
     Raises:
-        ResumeError: it holds work made with another prompt, model or input; names what differs. Or the answers of an
-            earlier version.
+        ResumeError: it holds work made with another prompt, model or input; names what differs.
     """
-    if not (out / "manifest.json").exists():
-        refuse_one_file(out / ANSWERS)
     inputs = {"data": data} if cfg.caption_file is None else {"data": data, "captions": cfg.caption_file}
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
@@ -147,7 +143,6 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
     limit = read_manifest(stage.path).facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
-    refuse_one_file(stage.path / ANSWERS)
     stage.reopen()
     return True
 
@@ -167,7 +162,6 @@ def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
             got=f"{num_windows} windows", expected=f"at most {cfg.limit} (caption.limit)",
             fix="leave --limit out, or raise it",
         )  # fmt: skip
-    refuse_one_file(stage.path / ANSWERS)
     stage.reopen()
     return True
 

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
 from cosfly.chat.protocol import answer_key
-from cosfly.errors import CosflyError, ResumeError
+from cosfly.errors import CosflyError
 from cosfly.products.captions import Usage
 from cosfly.reading.objects import CONTEXT_FULL
 from cosfly.work.journal import Journal
@@ -41,21 +41,6 @@ def journal_name(flight: str) -> str:
     """Give the file name of a flight's journal: its own name where that is a plain one, else one made from its digest."""
     is_plain = _PLAIN_NAME.fullmatch(flight) is not None and len(flight.encode()) <= 200
     return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
-
-
-def refuse_one_file(folder: Path) -> None:
-    """Refuse to go on where an earlier version kept the answers in one file, `answers.jsonl`: all would be asked again.
-
-    Raises:
-        ResumeError: there is such a file.
-    """
-    one_file = folder.with_name(f"{folder.name}.jsonl")
-    if one_file.exists():
-        raise ResumeError(
-            "an earlier version kept the answers in this file; this one would ask and pay for them again",
-            where=one_file,
-            fix="finish the folder with the version that began it, or choose another --out",
-        )
 
 
 Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into a folder
@@ -120,10 +105,8 @@ class AnswerBook:
         """Count what the journals of earlier runs hold.
 
         Raises:
-            ResumeError: an earlier version kept the answers in one file.
             InputError: a journal holds a line that cannot be used.
         """
-        refuse_one_file(folder)
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -66,7 +66,6 @@ def known_planner(name: str) -> str:
 class MucoConfig(Config):
     """Settings of the MuCO optimiser (subsec:appendix_planner_muco)."""
 
-    formerly: ClassVar = {"gradient": "it goes with the step: muco.step=paper takes differences, newton does not"}
     track_distance_m: float = Field(
         28.0,
         gt=0,
@@ -157,7 +156,6 @@ class TrackAStarConfig(Config):
 class PlanConfig(Config):
     """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walker."""
 
-    formerly: ClassVar = {"visibility_min": "did you mean 'five_ray_mean_min'?"}
     planner: str = Field("foresight", description="which planner flies: foresight, muco or track_astar")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(

@@ -2,8 +2,7 @@
 
     Town*/trajectory_<unix seconds>/<variant>/
 
-Public readers look for `Town*/trajectory_*`. Trees of before cosfly wrote `Town*` have the map's plain name there; captions and
-inspections of such a tree fit the same tree under the newer name, and the other way round.
+Public readers look for `Town*/trajectory_*`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from pydantic import Field
 from cosfly.errors import InputError
 from cosfly.reading.files import is_below, real_path
 from cosfly.work.config import Config
-from cosfly.work.store import inside
 
 TOWN = "Town"  # what the name of a town's folder begins with
 
@@ -86,21 +84,6 @@ def tree_of_flight(folder: Path) -> Path:
     real, root = real_path(folder), real_path(tree)
     is_beside = not is_below(real, root) and is_below(real, os.path.dirname(root))
     return Path(real) if is_beside else tree
-
-
-def stand(root: Path, folder: str) -> Path:
-    """Find a flight's folder by its name relative to a tree, whichever of its two names the town has there.
-
-    Returns:
-        the folder under the given name where it stands under neither.
-    Raises:
-        InputError: the name leads out of the tree, or a link there out of the tree's parent folder.
-    """
-    found = inside(root, folder, beside=True)
-    *above, town, trajectory, variant = ("", "", "", *Path(folder).parts)
-    others = (town_folder(town), town.removeprefix(f"{TOWN}_"))
-    places = [found, *(inside(root, str(Path(*above, other, trajectory, variant)), beside=True) for other in others)]
-    return next((place for place in places if place.exists()), found)
 
 
 # --- ids --------------------------------------------------------------------------------------------------------------

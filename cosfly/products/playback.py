@@ -232,7 +232,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
     reader = FieldReader(path, strict)
     _, town, trajectory, variant = astuple(place_of(folder))
-    reader.header(raw, (variant, trajectory))
+    reader.header(raw, variant)
     points = reader.points(raw)
     time_s, poses = reader.times(points), reader.poses(points)
     targets = [object_of(p, "target") for p in points]

@@ -44,11 +44,10 @@ class FieldReader:
         if got != expected:
             self.issue(where, repr(got), repr(expected))
 
-    def header(self, raw: dict, names: tuple[str, str]) -> None:
+    def header(self, raw: dict, variant: str) -> None:
         self.equal("schema", raw.get("schema"), SCHEMA)
         self.equal("schema_version", raw.get("schema_version"), SCHEMA_VERSION)
-        if raw.get("trace_dir") not in names:  # the second is what cosfly wrote at first
-            self.issue("trace_dir", raw.get("trace_dir"), f"{names[0]!r}, the folder's name")
+        self.equal("trace_dir", raw.get("trace_dir"), variant)
 
     def points(self, raw: dict) -> list[dict]:
         points = raw.get("points", None if self.strict else raw.get("waypoints"))

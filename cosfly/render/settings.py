@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -16,10 +16,6 @@ from cosfly.work.config import MayDiffer
 
 class RenderConfig(WeatherConfig):
     """Camera, tracks, weather and files of the frames."""
-
-    formerly: ClassVar[dict[str, str]] = {
-        "png_compression": "it went with zlib: pictures are packed by an encoder of cosfly's own, which has no levels; take the line out",
-    }
 
     backend: Literal["gl", "pyrender"] = Field(
         "gl",

@@ -14,7 +14,7 @@ The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -45,9 +45,6 @@ class MergeGaps(Config):
 class SimplifyConfig(Config):
     """The four passes of Step 2."""
 
-    formerly: ClassVar = {
-        "ground_z_m": "leave it out: the header of the map, ground_z_m in boxes_3d.json, says how high its ground lies"
-    }
     merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
     merge_by: Literal["gap", "center"] = Field(
         "gap",

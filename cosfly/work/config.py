@@ -6,7 +6,7 @@ import copy
 import importlib.resources
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -28,12 +28,8 @@ MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
 class Config(BaseModel):
-    """Base of every stage's settings: frozen, and an unknown key is an error.
+    """Base of every stage's settings: frozen, and an unknown key is an error."""
 
-    `formerly`: setting of an earlier version -> the hint that its users get.
-    """
-
-    formerly: ClassVar[dict[str, str]] = {}
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
@@ -153,8 +149,6 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
     if detail["type"] == "extra_forbidden":
         *parents, last = detail["loc"]
         group = _group(model, parents)
-        if last in getattr(group, "formerly", {}):
-            return f"{field}: unknown setting ({group.formerly[last]})"
         known = list(getattr(group, "model_fields", {}))
         elsewhere = [name for name in _names(model) if f".{name}".endswith(f".{last}")]
         if 0 < len(elsewhere) <= MOST_ELSEWHERE:

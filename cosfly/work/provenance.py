@@ -30,7 +30,6 @@ STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0
 RECORDS = (("manifest.json", MANIFEST_SCHEMA), ("stage.json", STAGE_SCHEMA))
 FLIGHT = "trajectory.json"
 ROLES = {"maps": "boxes", "map": "simplified"}  # a product that stages call by two names
-CONVERSION, CONVERTED = "convert-tree", "data"  # the stage that makes another form of the same tree, and its input
 NUM_NAMED = 5  # files that an error names
 
 
@@ -101,11 +100,6 @@ def fingerprint(path: Path) -> str:
     for file in files_named(path, FLIGHT):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
     return digest.hexdigest()
-
-
-def fingerprints(path: Path) -> set[str]:
-    """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
-    return _lineage(path, fingerprint(path))
 
 
 def has_grown_from(path: Path, digest: str) -> bool:
@@ -270,8 +264,7 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Map
         peer = peers.get(role, name)
         if peer == name:
             continue
-        lineage = _lineage(inputs[peer], found[peer].sha256)
-        if not any(record.sha256 in lineage for _, record in records):
+        if not any(record.sha256 == found[peer].sha256 for _, record in records):
             wanted, record = records[0]
             raise VerifyError(
                 f"it was made of another input {wanted!r} than the one given with it", where=path,
@@ -325,13 +318,6 @@ def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
     for path in products:
         visit(path)
     return ordered
-
-
-def _lineage(path: Path, digest: str) -> set[str]:
-    """Give the fingerprints under which an input may be on record: its own, and that of the tree it was converted from."""
-    begun = _record_of(path)
-    older = begun.inputs.get(CONVERTED) if begun is not None and begun.stage == CONVERSION else None
-    return {digest} if older is None else {digest, older.sha256}
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------

@@ -226,12 +226,12 @@ class StageFolder:
             log.debug("%s: reads %s: %s", stage, name, path)
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
-        if (out / "manifest.json").exists() and (complete := cls._complete(out, record, config, resume, grows)):
+        if (out / "manifest.json").exists() and (complete := cls._complete(out, record, resume, grows)):
             return complete
         lock = hold_folder(out, nothing=("stage.json",))
         try:
             refuse_links(out)
-            record = _taken_up(out, record, config, resume, grows, begins_anew)
+            record = _taken_up(out, record, resume, grows, begins_anew)
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
             write_model(out / "stage.json", record, schema=STAGE_SCHEMA, version=VERSION)
@@ -242,12 +242,10 @@ class StageFolder:
         return cls(out, stage, False, lock)
 
     @classmethod
-    def _complete(
-        cls, out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str]
-    ) -> StageFolder | None:
+    def _complete(cls, out: Path, record: StageRecord, resume: Resume, grows: Collection[str]) -> StageFolder | None:
         """Give a folder that is complete as `record` says, which takes no lock; None where there is something to do."""
         manifest = read_manifest(out)
-        if _may_continue(out, record, config, resume, grows) or manifest.counts.failed:
+        if _may_continue(out, record, resume, grows) or manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
         remove_left_lock(out)
@@ -323,9 +321,7 @@ class StageFolder:
         )
 
 
-def _taken_up(
-    out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str], begins_anew: bool
-) -> StageRecord:
+def _taken_up(out: Path, record: StageRecord, resume: Resume, grows: Collection[str], begins_anew: bool) -> StageRecord:
     """Make what stands in a folder ready to be gone on with; gives the record with what has grown noted."""
     if not (out / "stage.json").exists():
         # A kill may have come while the record was being written.
@@ -342,7 +338,7 @@ def _taken_up(
             if name != "stage.json":
                 (out / name).unlink(missing_ok=True)
         return record
-    grown = _may_continue(out, record, config, resume, grows)
+    grown = _may_continue(out, record, resume, grows)
     before = list(found.grown_from)
     if grown:
         log.info("%s: goes on with more: %s", out, "; ".join(grown))
@@ -356,10 +352,9 @@ def _taken_up(
     return record.model_copy(update={"grown_from": before})
 
 
-def _may_continue(out: Path, record: StageRecord, config: Config, resume: Resume, grows: Collection[str]) -> list[str]:
-    """See whether the work that stands in a folder may be continued as `record` says; gives what has only grown. What is not on record, since a version of before had no such setting, is no difference while it has its default."""
+def _may_continue(out: Path, record: StageRecord, resume: Resume, grows: Collection[str]) -> list[str]:
+    """See whether the work that stands in a folder may be continued as `record` says; gives what has only grown."""
     found = read_stage_record(out)
-    found = found.model_copy(update={"config": _filled(found.config, config)})
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
     grown = _grown(found, record, grows)
@@ -399,22 +394,6 @@ def _grown(found: StageRecord, wanted: StageRecord, grows: Collection[str]) -> d
         if old.sha256 != new.sha256 and has_grown_from(Path(new.path), old.sha256):
             grown[f"input {name}"] = f"the input {name} has grown"
     return dict(sorted(grown.items()))
-
-
-def _filled(found: dict[str, Any], config: Config) -> dict[str, Any]:
-    """Give settings on record with those that they lack and `config` has as by default, group by group."""
-    filled, recorded = dict(found), config.recorded()
-    for name, field in type(config).model_fields.items():
-        value = getattr(config, name)
-        if isinstance(value, Config) and isinstance(found.get(name), dict):
-            filled[name] = _filled(found[name], value)
-        elif (
-            name in recorded
-            and name not in found
-            and value == field.get_default(call_default_factory=True, validated_data={})
-        ):
-            filled[name] = recorded[name]
-    return filled
 
 
 def _differences(found: StageRecord, wanted: StageRecord) -> list[tuple[str, str]]:

@@ -15,11 +15,12 @@ from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.flights import find_flights, track_of
 from cosfly.products.frames import frame_name
-from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id, stand
+from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.splits import Course, walks_of
 from cosfly.reading.files import check_stays_below
 from cosfly.work.provenance import was_made_of
+from cosfly.work.store import inside
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +155,7 @@ class Flights:
             for name in names:
                 if name != Path(name).name or name in ("", ".", ".."):
                     raise InputError("not a folder name", where=f"{source.captions}: {caption.sample_id}", got=name)
-            self._found[key] = self._read(source, stand(source.data, "/".join(names)))
+            self._found[key] = self._read(source, inside(source.data, "/".join(names), beside=True))
         return self._found[key]
 
     def _read(self, source: Source, folder: Path) -> CaptionedFlight:

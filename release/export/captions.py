@@ -19,9 +19,8 @@ from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
-from cosfly.products.places import stand
 from cosfly.reading.files import check_stays_below
-from cosfly.work.store import atomic_file, dump_json
+from cosfly.work.store import atomic_file, dump_json, inside
 from release.columns import LANGUAGES
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder
@@ -103,7 +102,7 @@ def _of_captions(path: Path, tree: Path | None, left_out: Counter[str]) -> Itera
             continue
         named = f"{caption.town}/{caption.trajectory}/{caption.variant}"
         if named not in places:  # the tree may have been converted since
-            places[named] = named if tree is None else stand(tree, named).relative_to(tree).as_posix()
+            places[named] = named if tree is None else inside(tree, named, beside=True).relative_to(tree).as_posix()
         images = [f"{places[named]}/{frame_name(index)}/{FILE_NAMES['rgb']}" for index in caption.window]
         if tree is not None and not all((tree / image).is_file() for image in images):
             left_out["missing_picture"] += 1

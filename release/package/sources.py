@@ -12,11 +12,12 @@ from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, stand, town_folder
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, town_folder
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
 from cosfly.reading.files import check_stays_below, read_text
 from cosfly.work.provenance import fingerprint, is_bound, was_made_of
+from cosfly.work.store import inside
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
@@ -171,7 +172,7 @@ def gather(
         for flight in inspection.flights:
             left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
             left_out = left_out or _not_chosen(choice, flight.folder)
-            folder = stand(source.data, flight.folder)
+            folder = inside(source.data, flight.folder, beside=True)
             sha256 = None if saw_older else flight.sha256
             five_ray = flight.metrics.get("five_ray_mean")
             found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256, five_ray))

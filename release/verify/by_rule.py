@@ -13,7 +13,6 @@ from cosfly.products.places import folder_name, town_folder
 from cosfly.products.splits import town_family
 from cosfly.reading.tables import row_groups
 from cosfly.space.flight_metrics import accel_rms, jerk_rms
-from cosfly.work.provenance import CONVERSION, CONVERTED
 from release.columns import PLACE
 from release.record import ReleasedFlight, ReleaseRecord, SourceRecord
 from release.rules import NAME_OF, SPLIT_RULE, split_groups
@@ -108,14 +107,12 @@ def _sources_of(record: ReleaseRecord, flight: str) -> list[SourceRecord]:
 
 
 def _check_inputs(record: ReleaseRecord, findings: Findings) -> None:
-    """Captions and inspection were made of the released tree, or of the one that it was converted from."""
+    """Captions and inspection were made of the released tree."""
     for source in record.provenance.sources:
-        trees = {source.tree_sha256}
-        trees |= {stage.inputs[CONVERTED] for stage in source.stages if stage.stage == CONVERSION and CONVERTED in stage.inputs}  # fmt: skip
         last = {stage.stage: stage for stage in source.stages}  # the one whose product was given
         for name in ("caption", "inspect"):
             got = last[name].inputs.get("data") if name in last else None
-            if got is not None and got not in trees:
+            if got is not None and got != source.tree_sha256:
                 findings.error("provenance", f"release.json: provenance: {source.run}: {name}: inputs.data", got, f"{source.tree_sha256}, the tree's")  # fmt: skip
 
 
