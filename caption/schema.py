@@ -184,20 +184,25 @@ class EvidenceConfig(Config):
     drop: bool = Field(False, description="drop a sample whose text contradicts a measured value")
 
 
-class JudgeConfig(Config):
-    """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+class AskedConfig(Config):
+    """How a model beside the teacher is asked."""
 
-    url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
-    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
-    max_tokens: int = Field(512, ge=64, description="longest judgement, tokens")
+    max_tokens: int = Field(512, ge=64, description="longest answer, tokens")
     concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
     timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
     max_reply_mb: MayDiffer[float] = Field(
         4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
     )
-    json_schema: bool = Field(True, description="ask the server to enforce the judgement's JSON schema")
+    json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
+
+
+class JudgeConfig(AskedConfig):
+    """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+
+    url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
+    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
 
     @model_validator(mode="after")
     def _is_url(self) -> Self:
@@ -210,26 +215,16 @@ class JudgeConfig(Config):
         return super().recorded() | {"url": None if self.url is None else "endpoint"}
 
 
-class ReaderConfig(Config):
+class ReaderConfig(AskedConfig):
     """Language models that read somebody else's prose into claims, twice (caption/teachers/reader.py)."""
 
     urls: tuple[str, ...] = Field(
-        (),
-        max_length=2,
-        description="OpenAI-compatible endpoints of one reader, asked in two orders, or of two; empty: none",
+        (), max_length=2, description="endpoints of one reader, asked in two orders, or of two readers; empty: none"
     )
     models: tuple[str, ...] = Field(
         (), max_length=2, description="their model names; empty takes each endpoint's only one"
     )
     max_tokens: int = Field(4096, ge=64, description="longest reading, tokens")
-    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
-    timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
-    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    max_reply_mb: MayDiffer[float] = Field(
-        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
-    )
-    json_schema: bool = Field(True, description="ask the server to enforce the JSON schema of claims")
-    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
     @model_validator(mode="after")
     def _are_urls(self) -> Self:

@@ -12,10 +12,13 @@ from measure_prose import answers_of, loses, misquotes, misreads, perfect_readin
 from teacher_server import TeacherServer
 from typer.testing import CliRunner
 
+from caption.run.forecast import make_forecast
 from caption.run.released import state_lies
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, EvidenceConfig, ReaderConfig, WindowConfig
+from caption.teachers.asked import AskedModel
+from caption.teachers.doctor import READ_CAPTIONS, examine_endpoint
 from caption.teachers.reader import Reader, ReaderCheck, measure_reader, prompt_digest, read_reading
 from caption.truth.facts import measure_facts
 from caption.truth.gold import GoldCaption, read_gold
@@ -51,7 +54,7 @@ class FakeEngine:
 @cache
 def measured(fault=None, *, alike: bool = False) -> ReaderCheck:
     engine = FakeEngine(fault, alike=alike)
-    reader = Reader([KeptAnswers(engine, None)], ReaderConfig(urls=("http://x",)), 0)
+    reader = Reader([AskedModel(KeptAnswers(engine, None), ReaderConfig(), 0)])
     return asyncio.run(measure_reader(reader, gold()))
 
 
@@ -134,10 +137,13 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
     server.text = reading_of
     with server:
         cfg = CaptionConfig.model_validate({"teacher": f"file:{path}", "reader": {"urls": [server.url]}})
+        plan = make_forecast(cfg, tree, tmp_path / "out")
+        assert plan.calls.expected == 4 * plan.num_windows  # two readings in each language, and no teacher
+        assert plan.prompt_tokens.expected > 0
         found = list(read_captions(run(cfg, tree, tmp_path / "out")))
         assert len(server.bodies) == 4 * len(lines)
         run(cfg, tree, tmp_path / "out")
-        assert len(server.bodies) == 4 * len(lines)  # nothing is asked twice
+        assert len(server.bodies) == 4 * len(lines)  # nothing is asked twice, nor what the plan asked
     assert [c.checks.sentences["en"][0] for c in found] == [
         "contradicted" if n % 2 else "proved" for n in range(len(found))
     ]
@@ -165,3 +171,16 @@ def test_the_command_measures_an_endpoint():
     assert result.exit_code == 0, result.output
     assert "flagged" in result.output
     assert "unreadable" in result.output
+
+
+def test_the_doctor_tells_a_reader_from_a_model_that_reads_nothing():
+    answer = answers_of(perfect_readings([caption for caption in read_gold() if caption.claims][:READ_CAPTIONS]), None)
+    for reads, state in ((True, "ok"), (False, "unusable")):
+        server = TeacherServer()
+        server.text = lambda body, reads=reads: (
+            answer(body) if reads and body["messages"][0]["role"] == "system" else "ready"
+        )
+        with server:
+            findings = {f.name: f for f in examine_endpoint(server.url, CaptionConfig(), as_reader=True)}
+        assert findings["reads prose"].state == state, findings
+        assert "image input" not in findings

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caption.run.asking import ANSWERS
+from caption.run.asking import ANSWERS, READINGS
 from caption.run.flights import Allotted, allot, named_flights
 from caption.run.own_files import own_files
 from caption.run.progress import duration
@@ -22,14 +22,15 @@ from caption.run.stage import open_stage
 from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
 from caption.teachers.prompts import make_question
+from caption.teachers.reader import Reader, open_reader
 from caption.teachers.students import as_taught
-from caption.teachers.teacher import AskingTeacher, first_budget
+from caption.teachers.teacher import AskingTeacher, Teacher, first_budget, open_teacher
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.errors import ConfigError, InputError, TeacherError
-from cosfly.products.captions import Caption
+from cosfly.products.captions import Caption, Usage
 from cosfly.products.places import flight_of
 from cosfly.work.stage_folder import Resume
 
@@ -89,10 +90,11 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     """Estimate a run by asking about a few windows.
 
     Raises:
-        ConfigError: the teacher is not an endpoint. InputError: no window. TeacherError: no trial window got an answer.
+        ConfigError: no endpoint is asked. InputError: no window. TeacherError: no trial window got an answer.
     """
-    if cfg.teacher_kind != "endpoint":
-        raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
+    if cfg.teacher_kind != "endpoint" and not cfg.reader.urls:
+        expected = "--teacher URL or --reader URL"
+        raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected=expected)
     with own_files(cfg):
         return _forecast(as_taught(cfg), data, out, seed, resume)
 
@@ -119,15 +121,16 @@ def _scaled(
     cfg: CaptionConfig,
 ) -> Forecast:
     """Scale what the trial windows took to all windows."""
-    prompt = estimate([caption.usage.prompt_tokens for caption in captions]).scaled(num_windows)
-    completion = estimate([caption.usage.completion_tokens for caption in captions]).scaled(num_windows)
+    usages = [caption.usage + (caption.reader.usage if caption.reader else Usage()) for caption in captions]
+    prompt = estimate([usage.prompt_tokens for usage in usages]).scaled(num_windows)
+    completion = estimate([usage.completion_tokens for usage in usages]).scaled(num_windows)
     # Every ask but the mirror's carries the pictures; a mirror is at least one ask of an answered window.
     asks_with_pictures = [caption.attempts - (caption.zh is not None) for caption in captions]
     pictures = None if image_tokens is None else estimate(asks_with_pictures).scaled(image_tokens * num_windows)
     which = ("low", "expected", "high")
     cost = Estimate(*(cfg.budget.cost(getattr(prompt, name), getattr(completion, name)) for name in which))
     per_window = estimate(seconds).scaled(num_windows)
-    in_flight = cfg.endpoint.concurrency
+    in_flight = (cfg.endpoint if cfg.teacher_kind == "endpoint" else cfg.reader).concurrency
     # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's windows.
     time_s = Estimate(
         per_window.low / in_flight, per_window.expected / in_flight, per_window.high / min(len(captions), in_flight)
@@ -137,7 +140,7 @@ def _scaled(
         num_finished=num_finished,
         num_trials=len(captions),
         num_accepted_trials=sum(caption.status == "accepted" for caption in captions),
-        calls=estimate([caption.attempts for caption in captions]).scaled(num_windows),
+        calls=estimate([_num_calls(caption, cfg) for caption in captions]).scaled(num_windows),
         prompt_tokens=prompt,
         image_tokens=pictures,
         completion_tokens=completion,
@@ -145,6 +148,11 @@ def _scaled(
         seconds=time_s,
         concurrency=in_flight,
     )
+
+
+def _num_calls(caption: Caption, cfg: CaptionConfig) -> int:
+    readings = [] if caption.reader is None else caption.reader.num_claims.values()
+    return (caption.attempts if cfg.teacher_kind == "endpoint" else 0) + sum(map(len, readings))
 
 
 def estimate(values: Sequence[float]) -> Estimate:
@@ -179,20 +187,27 @@ async def _rehearse(
     cfg: CaptionConfig, out: Path, seed: int, windows: list[Window]
 ) -> tuple[list[Caption], list[float], int | None]:
     """Give the trial captions, the seconds of each, and the tokens of all pictures of one question."""
-    with AnswerBook(out / ANSWERS) as book:
-        async with AskingTeacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            image_tokens = await _image_tokens(windows[0], teacher, cfg)
-            results = await asyncio.gather(*(_answered(window, teacher, cfg) for window in windows))
+    with AnswerBook(out / ANSWERS) as answers, AnswerBook(out / READINGS) as readings:
+        budget = first_budget(cfg, answers.totals, readings.totals)
+        async with (
+            open_teacher(cfg, answers, seed, budget) as teacher,
+            open_reader(cfg.reader, seed, readings, budget) as reader,
+        ):
+            image_tokens = None
+            if isinstance(teacher, AskingTeacher):
+                image_tokens = await _image_tokens(windows[0], teacher, cfg)
+            results = await asyncio.gather(*(_answered(window, teacher, cfg, reader) for window in windows))
         captions = [result for result in results if isinstance(result, Caption)]
-        seconds = [book.latency_s(flight_of(caption.sample_id), caption.sample_id) for caption in captions]
+        ids = [caption.sample_id for caption in captions]
+        seconds = [sum(book.latency_s(flight_of(name), name) for book in (answers, readings)) for name in ids]
     if not captions:
-        raise TeacherError("no trial window got an answer", where=teacher.engine.where, got=str(results[0]))
+        raise TeacherError("no trial window got an answer", where=cfg.teacher, got=str(results[0]))
     return captions, seconds, image_tokens
 
 
-async def _answered(window: Window, teacher: AskingTeacher, cfg: CaptionConfig) -> Caption | str:
+async def _answered(window: Window, teacher: Teacher, cfg: CaptionConfig, reader: Reader | None) -> Caption | str:
     try:
-        return await caption_window(window, teacher, cfg)
+        return await caption_window(window, teacher, cfg, reader=reader)
     except (NoAnswer, BudgetSpent) as error:
         return str(error)
 

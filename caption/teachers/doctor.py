@@ -12,14 +12,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import httpx
 import numpy as np
 
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
-from caption.teachers.probes import Probe, read_probe
+from caption.teachers.asked import AskedModel
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
     Correction,
@@ -28,11 +28,16 @@ from caption.teachers.prompts import (
     text_of,
     way_prompt,
 )
+from caption.teachers.reader import Reader, measure_reader
 from caption.teachers.trials import NO_ANSWER, best_way, try_ways
+from caption.truth.gold import read_gold
 from caption.writing.contract import WAYS, more_fields, way_of
+from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.client import ChatClient
-from cosfly.chat.protocol import request_body, response_format
-from cosfly.chat.refusals import MEANINGS
+from cosfly.chat.contract import Request
+from cosfly.chat.protocol import ERROR_INSTEAD, THOUGHT_FIELDS, final_text, read_body, request_body, response_format
+from cosfly.chat.refusals import MEANINGS, Refusal
+from cosfly.chat.wire import Response
 from cosfly.errors import TeacherError
 from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.answer_text import answer_schema, parse_answer
@@ -42,6 +47,7 @@ from cosfly.reading.documents import parse_json
 State = Literal["ok", "warning", "unusable"]
 
 TRIES = 3
+READ_CAPTIONS = 4
 MAX_COMPLAINT = 2000  # characters that a complaint hardly ever takes
 ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
 NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
@@ -56,18 +62,96 @@ class Finding:
     detail: str
 
 
-def examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing] = tuple(WAYS)) -> list[Finding]:
+def examine_endpoint(
+    url: str, cfg: CaptionConfig, ways: Sequence[Writing] = tuple(WAYS), *, as_reader: bool = False
+) -> list[Finding]:
     """Try an endpoint. It is usable if no finding is `unusable`.
 
     Args:
-        ways: of writing that are tried.
+        ways: of writing that are tried. as_reader: none is, it reads prose of others and sees no picture.
     """
-    return asyncio.run(_Examination(url, cfg, ways).run())
+    return asyncio.run(_Examination(url, cfg, ways, as_reader).run())
+
+
+# --- what one request gave --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What one request gave, read without trust, since any field may be of another kind than it should be. `value` is the decoded body of a 200, else None and `detail` tells why; refusal: what the server meant."""
+
+    value: dict[str, Any] | None
+    detail: str
+    seconds: float
+    refusal: Refusal | None = None
+
+    @property
+    def _choice(self) -> dict:
+        choices = (self.value or {}).get("choices")
+        first = choices[0] if isinstance(choices, list) and choices else {}
+        return first if isinstance(first, dict) else {}
+
+    @property
+    def message(self) -> dict:
+        message = self._choice.get("message")
+        return message if isinstance(message, dict) else {}
+
+    @property
+    def text(self) -> str:
+        return final_text(self.message) or ""
+
+    @property
+    def finish_reason(self) -> str | None:
+        reason = self._choice.get("finish_reason")
+        return reason if isinstance(reason, str) else None
+
+    @property
+    def prompt_tokens(self) -> int | None:
+        return self._count("prompt_tokens")
+
+    @property
+    def completion_tokens(self) -> int | None:
+        return self._count("completion_tokens")
+
+    @property
+    def thoughts(self) -> str:
+        """What it says before its answer, where a server tells that apart."""
+        thoughts = (self.message.get(name) for name in THOUGHT_FIELDS)
+        return next((text for text in thoughts if isinstance(text, str) and text), "")
+
+    @property
+    def is_too_long(self) -> bool:
+        return self.refusal is not None and self.refusal.kind == "too_long"
+
+    def _count(self, name: str) -> int | None:
+        usage = (self.value or {}).get("usage")
+        count = usage.get(name) if isinstance(usage, dict) else None
+        return count if type(count) is int else None
+
+
+def read_probe(response: Response, request: Request, client: ChatClient, seconds: float) -> Probe:
+    """Read a response; `seconds`: what it took."""
+    found = client.read(response, request, is_structured=False)
+    if isinstance(found, Refusal):
+        fix = "" if found.kind == "unknown" else f"; {found.meaning.fix}"
+        return Probe(None, found.said + fix, seconds, found)
+    if response.is_cut or (isinstance(found, str) and found.startswith(ERROR_INSTEAD)):
+        return Probe(None, str(found), seconds)
+    try:
+        value = read_body(response.body)
+    except ValueError:
+        return Probe(None, "the body is not JSON", seconds)
+    if not isinstance(value, dict):
+        return Probe(None, "the body is not a JSON object", seconds)
+    return Probe(value, "", seconds)
+
+
+# --- the examination ---------------------------------------------------------------------------------------------------
 
 
 class _Examination:
-    def __init__(self, url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> None:
-        self.cfg, self.ways = cfg, ways
+    def __init__(self, url: str, cfg: CaptionConfig, ways: Sequence[Writing], as_reader: bool) -> None:
+        self.cfg, self.ways, self.as_reader = cfg, ways, as_reader
         self.takes_schema = cfg.endpoint.json_schema
         self.client = ChatClient(url, cfg.endpoint)
         self.findings: list[Finding] = []
@@ -86,7 +170,9 @@ class _Examination:
             if await self._text():
                 await self._cut()
                 await self._schema()
-                if await self._image() and await self._many_images() and await self._largest_prompt():
+                if self.as_reader:
+                    await self._reading()
+                elif await self._image() and await self._many_images() and await self._largest_prompt():
                     await self._writing()
         finally:
             await self.client.close()
@@ -277,6 +363,18 @@ class _Examination:
             self._add("writing", "ok", f"{chosen}, as set")
         else:
             self._add("writing", "warning", f"set to {chosen}; use --set caption.writing={best}")
+
+    async def _reading(self) -> None:
+        """Find whether it reads true captions into claims."""
+        gold = [caption.model_copy(update={"errors": ()}) for caption in read_gold() if caption.claims][:READ_CAPTIONS]
+        check = await measure_reader(Reader([AskedModel(KeptAnswers(self.client, None), self.cfg.reader, 0)]), gold)
+        is_good = not check.num_unreadable and not check.num_flagged and check.num_claims >= check.num_sentences
+        self._add(
+            "reads prose",
+            "ok" if is_good else "warning" if check.num_claims else "unusable",
+            f"{check.num_claims / check.num_sentences:.1f} claims a sentence in both readings, {check.num_flagged} of {check.num_true} true captions "
+            f"flagged, {check.num_unreadable} of {check.num_requests} answers without claims; measure it: cosfly caption reader-check",
+        )
 
     async def _written(self, messages: list[dict], schema: dict) -> tuple[str, bool] | None:
         limit = self.cfg.endpoint.max_tokens

@@ -16,15 +16,14 @@ from typing import get_args
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
+from caption.teachers.asked import AskedModel, figures_table, open_models
 from caption.teachers.prompt_files import read_prompt
 from caption.truth.gold import GoldCaption, read_gold
-from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import Budget
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Request, Troubles, started
+from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord
-from cosfly.products.places import flight_of
 from cosfly.reading.objects import find_object
 from cosfly.work.store import dump_json
 
@@ -82,8 +81,8 @@ def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, s
 class Judge:
     """Asks an endpoint about conflicts. Made by `open_judge`."""
 
-    def __init__(self, kept: KeptAnswers, cfg: JudgeConfig, seed: int) -> None:
-        self.kept, self.cfg, self.seed = kept, cfg, seed
+    def __init__(self, model: AskedModel) -> None:
+        self.model = model
 
     async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
         """Judge a case; the verdict is `unjudged` where none could be read or the judge did not answer.
@@ -91,15 +90,13 @@ class Judge:
         Raises:
             BudgetSpent: one more request might pass a limit.
         """
-        sampling = {"temperature": 0.0, "seed": self.seed, "max_tokens": self.cfg.max_tokens, **self.cfg.extra_body}
-        request = Request(judge_messages(case, order), [], judge_schema(order), sampling)
         try:
-            reply = await self.kept.ask(request, flight_of(case.sample_id), case.sample_id, "judge")
+            reply = await self.model.ask(judge_messages(case, order), judge_schema(order), case.sample_id, "judge")
         except NoAnswer as error:  # not kept: a later run may ask again
             verdict, reason = UNJUDGED, f"no answer: {error}"
         else:
             verdict, reason = parse_judgement(reply.text, reply.finish_reason)
-        return JudgeRecord(verdict=verdict, reason=reason, model=self.kept.engine.model)
+        return JudgeRecord(verdict=verdict, reason=reason, model=self.model.name)
 
 
 @asynccontextmanager
@@ -110,20 +107,12 @@ async def open_judge(
     budget: Budget | None = None,
     troubles: Troubles | None = None,
 ) -> AsyncIterator[Judge | None]:
-    """Connect to the judge that the settings name; None where they name none.
-
-    Args:
-        book: keeps the judgements; None: they are not kept. budget: None sets no limit. troubles: notes tries that fail.
-    Raises:
-        TeacherError: the endpoint cannot be used.
-    """
+    """Connect to the judge that the settings name; None where they name none. Arguments and errors as of `open_models`."""
     if cfg.url is None:
         yield None
         return
-    settings = cfg.model_dump(include=EndpointConfig.model_fields.keys() - {"max_tokens", "extra_body"})
-    client = ChatClient(cfg.url, EndpointConfig(**settings), troubles)
-    async with started(client):
-        yield Judge(KeptAnswers(client, book, budget), cfg, seed)
+    async with open_models(cfg, [(cfg.url, cfg.model)], seed, book, budget, troubles) as [model]:
+        yield Judge(model)
 
 
 # --- how good a judge is ----------------------------------------------------------------------------------------------
@@ -213,7 +202,7 @@ async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed
             num_agreed += verdicts.count(right)
             num_moved += len(set(verdicts)) > 1
             num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
-        model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
+        model = f"{judge.model.name} at {judge.model.kept.engine.where}"
     num_asks = len(gold) * len(orders)
     num_unjudged = sum(count for (_, verdict), count in confusion.items() if verdict == UNJUDGED)
     first_share = num_first / max(1, num_asks - num_unjudged)
@@ -222,9 +211,7 @@ async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed
 
 def judge_check_table(check: JudgeCheck) -> Table:
     """Give the figures as a table for the terminal."""
-    table = Table(title=f"Judge {check.model}", title_justify="left")
-    for column in ("figure", "value", "meaning"):
-        table.add_column(column)
+    table = figures_table(f"Judge {check.model}")
     asks = f"of {check.num_asks} asks ({check.num_cases} cases, three orders of the options)"
     table.add_row("agreement", f"{100 * check.agreement:.1f} %", f"with the gold judgement, {asks}; chance is 33.3 %")
     share = f"{100 * check.first_share:.1f} %"

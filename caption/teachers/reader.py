@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Iterable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from math import sqrt
 
 from rich.table import Table
 
 from caption.schema import EvidenceConfig, ReaderConfig
+from caption.teachers.asked import AskedModel, figures_table, open_models, share_text
 from caption.teachers.prompt_files import read_prompt
 from caption.truth.claims import claim_name, goes_against, judge_claim, references_of
 from caption.truth.facts import Facts
@@ -27,14 +27,12 @@ from caption.truth.sizes import numeral_of, same_size
 from caption.truth.stated import read_stated
 from caption.writing.claims import CLAIM_SCHEMA, MAX_CLAIMS, read_claims
 from caption.writing.contract import Draft, Refused, way_of
-from cosfly.chat.answers import AnswerBook, KeptAnswers
+from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import Budget, BudgetConfig
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Request, Troubles, started
+from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Claim, Coc, Language, ReaderRecord, Usage, Writing
-from cosfly.products.places import flight_of
 from cosfly.products.sentences import sentences_of
 from cosfly.reading.objects import find_object
 from cosfly.work.store import sha256_bytes
@@ -203,12 +201,12 @@ class Read:
 class Reader:
     """Asks one or two endpoints what texts state. Made by `open_reader`."""
 
-    def __init__(self, kept: Sequence[KeptAnswers], cfg: ReaderConfig, seed: int) -> None:
-        self.kept, self.cfg, self.seed = kept, cfg, seed
+    def __init__(self, models: Sequence[AskedModel]) -> None:
+        self.models = models
 
     @property
-    def models(self) -> list[str]:
-        return [kept.engine.model for kept in self.kept]
+    def names(self) -> list[str]:
+        return [model.name for model in self.models]
 
     async def read(self, coc: Coc, facts: Facts, language: Language, sample_id: str) -> Read:
         """Read a text twice. What cannot be read, or is refused, states nothing.
@@ -228,13 +226,11 @@ class Reader:
     async def _reading(
         self, number: int, coc: Coc, facts: Facts, language: Language, sample_id: str
     ) -> tuple[list[Claim] | None, Usage]:
-        sampling = {"temperature": 0.0, "seed": self.seed, "max_tokens": self.cfg.max_tokens, **self.cfg.extra_body}
-        request = Request(reader_messages(coc, facts, number), [], SCHEMA, sampling)
-        kept = self.kept[number % len(self.kept)]
+        model, messages = self.models[number % len(self.models)], reader_messages(coc, facts, number)
         try:
-            reply = await kept.ask(request, flight_of(sample_id), sample_id, f"read_{language}/{number}")
+            reply = await model.ask(messages, SCHEMA, sample_id, f"read_{language}/{number}")
         except NoAnswer as error:
-            if kept.book is not None and not error.is_final:
+            if model.kept.book is not None and not error.is_final:
                 raise  # of a run: the window is asked about again
             return None, Usage()
         return read_reading(reply.text, reply.finish_reason, coc, language), reply.usage or Usage()
@@ -244,7 +240,7 @@ class Reader:
         found = await asyncio.gather(*(self.read(coc, facts, language, sample_id) for language, coc in texts.items()))
         reads = dict(zip(texts, found, strict=True))
         return ReaderRecord(
-            models=self.models,
+            models=self.names,
             prompt=prompt_digest(),
             claims={language: read.claims for language, read in reads.items()},
             num_claims={language: read.num_claims for language, read in reads.items()},
@@ -260,23 +256,13 @@ async def open_reader(
     budget: Budget | None = None,
     troubles: Troubles | None = None,
 ) -> AsyncIterator[Reader | None]:
-    """Connect to the reader that the settings name; None where they name none. Arguments as of `open_judge`.
-
-    Raises:
-        TeacherError: an endpoint cannot be used.
-    """
+    """Connect to the reader that the settings name; None where they name none. Arguments and errors as of `open_models`."""
     if not cfg.urls:
         yield None
         return
-    settings = cfg.model_dump(include=EndpointConfig.model_fields.keys() - {"model", "max_tokens", "extra_body"})
-    async with AsyncExitStack() as stack:
-        kept = []
-        for number, url in enumerate(cfg.urls):
-            model = cfg.models[number] if number < len(cfg.models) else None
-            client = ChatClient(url, EndpointConfig(**settings, model=model), troubles)
-            await stack.enter_async_context(started(client))
-            kept.append(KeptAnswers(client, book, budget))
-        yield Reader(kept, cfg, seed)
+    where = [(url, cfg.models[i] if i < len(cfg.models) else None) for i, url in enumerate(cfg.urls)]
+    async with open_models(cfg, where, seed, book, budget, troubles) as models:
+        yield Reader(models)
 
 
 # --- how good a reader is ---------------------------------------------------------------------------------------------
@@ -314,7 +300,7 @@ async def check_reader(cfg: ReaderConfig, gold: Sequence[GoldCaption], seed: int
 
 async def measure_reader(reader: Reader, gold: Sequence[GoldCaption]) -> ReaderCheck:
     """Have every caption read as it stands, and with each error that can be planted in its text."""
-    check = ReaderCheck(reader.models)
+    check = ReaderCheck(reader.names)
     texts = [(caption, caption.coc, True) for caption in gold]
     texts += [(caption, error.in_text(caption.coc), False) for caption in gold for error in caption.errors]
     asked = [reader.read(coc, gold.facts, gold.language, f"gold_{gold.id}_frame_00000") for gold, coc, _ in texts]
@@ -326,42 +312,28 @@ async def measure_reader(reader: Reader, gold: Sequence[GoldCaption]) -> ReaderC
 
 def _count(check: ReaderCheck, judged: list[Judged], read: Read, is_true: bool) -> None:
     states = [one.state for one in judged]
-    is_flagged, is_proved = "contradicted" in states, set(states) == {"proved"}
+    is_flagged = "contradicted" in states
     check.num_requests += READINGS
     check.usage += read.usage
     check.num_unreadable += read.num_claims.count(None)
     if is_true:
-        check.num_true, check.num_flagged = check.num_true + 1, check.num_flagged + is_flagged
-        check.num_sentences, check.num_proved = (
-            check.num_sentences + len(states),
-            check.num_proved + states.count("proved"),
-        )
+        check.num_true += 1
+        check.num_flagged += is_flagged
+        check.num_sentences += len(states)
+        check.num_proved += states.count("proved")
         check.num_claims += len(read.claims)
     else:
-        check.num_false, check.num_caught = check.num_false + 1, check.num_caught + is_flagged
-        check.num_false_proved += is_proved
-
-
-def interval(count: int, total: int) -> tuple[float, float]:
-    """Give the 95 % interval of a share (Wilson 1927)."""
-    if not total:
-        return 0.0, 1.0
-    z, share = 1.96, count / total
-    middle, scale = share + z * z / (2 * total), 1 + z * z / total
-    half = z * sqrt(share * (1 - share) / total + z * z / (4 * total * total))
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
+        check.num_false += 1
+        check.num_caught += is_flagged
+        check.num_false_proved += set(states) == {"proved"}
 
 
 def reader_check_table(check: ReaderCheck, prices: BudgetConfig = BudgetConfig()) -> Table:
     """Give the figures as a table for the terminal."""
-    table = Table(title=f"Reader {', '.join(check.models)}", title_justify="left")
-    for column in ("figure", "value", "meaning"):
-        table.add_column(column)
+    table = figures_table(f"Reader {', '.join(check.models)}")
 
     def share(name: str, count: int, total: int, meaning: str) -> None:
-        low, high = interval(count, total)
-        value = f"{100 * count / max(1, total):.1f} % [{100 * low:.1f} to {100 * high:.1f}]"
-        table.add_row(name, value, f"{meaning}; {count} of {total}")
+        table.add_row(name, share_text(count, total), f"{meaning}; {count} of {total}")
 
     share("flagged", check.num_flagged, check.num_true, "true captions with a sentence called contradicted")
     share(

@@ -77,12 +77,13 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         raise ConfigError("not a stage that can be measured", where="--stage", got=stage, expected=", ".join(STAGES))
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the folder is not empty", where=out, fix="choose another --out")
-    if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url is not None):
+    asked = cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url or cfg.caption.reader.urls
+    if stage == "caption" and asked:
         raise ConfigError(
             "captions that a server writes are no work of workers",
             where="caption.teacher",
             got=cfg.caption.teacher,
-            expected="an embedded teacher, and no judge",
+            expected="an embedded teacher, no judge and no reader",
             fix="--set caption.teacher=rules",
         )
     bench = Bench(

@@ -79,6 +79,9 @@ def caption(
     is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg, [cfg.writing])
+    if check and not (target / "readings").exists():
+        for url in cfg.reader.urls:
+            _examine_endpoint(url, cfg, (), as_reader=True)
     if plan_only:
         return _tell_forecast(job, tree, target)
     job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.manner), target)
@@ -95,22 +98,27 @@ def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
 @app.command("doctor")
 @takes()
 def caption_doctor(
-    job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")], model: Model = None
+    job: Job,
+    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")],
+    model: Model = None,
+    as_reader: Annotated[
+        bool, Option("--as-reader", help="Try how it reads prose of others, for --reader; it needs no pictures.")
+    ] = False,
 ) -> None:
     """Try what an endpoint can do: images, schema, thinking, context, ways of writing. Exit 1 if it cannot caption."""
     from caption.writing.contract import WAYS
 
-    _examine_endpoint(url, job.cfg.caption, tuple(WAYS))
+    _examine_endpoint(url, job.cfg.caption, tuple(WAYS), as_reader=as_reader)
 
 
-def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing]) -> None:
+def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing], *, as_reader: bool = False) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
     from caption.run.own_files import own_files
     from caption.teachers.doctor import examine_endpoint
     from cosfly.work.console import console
 
     with own_files(cfg):
-        findings = examine_endpoint(url, cfg, ways)
+        findings = examine_endpoint(url, cfg, ways, as_reader=as_reader)
     options.tell_checks(findings, console, "What the endpoint can do")
 
 
