@@ -33,11 +33,9 @@ from cosfly.work.store import atomic_file, write_bytes, write_model
 
 RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
 PAGE = "README.md"
-OLDER = "{split}.jsonl"  # what a split was before 3.0
 # Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and the writer hold
 # all, grows by the groups.
 ROWS_AT_ONCE = 1000
-PREPARE = "run cosfly distill prepare"
 
 
 class Sample(BaseModel):
@@ -120,14 +118,11 @@ def read_training_set(dataset: Path) -> TrainingSet:
     """Read a training set's record.
 
     Raises:
-        InputError: it is missing, of an earlier version, or malformed.
+        InputError: it is missing, of another version, or malformed.
     """
     path = dataset / RECORD
     if not path.exists():
-        older = next((split for split in SPLITS if (dataset / OLDER.format(split=split)).exists()), None)
-        what = "no training set" if older is None else "a training set of another version"
-        got = f"no {RECORD}" if older is None else OLDER.format(split=older)
-        raise InputError(what, where=dataset, got=got, expected=f"{RECORD} of version {VERSION}", fix=PREPARE)
+        raise InputError("no training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare")
     return read_model(path, TrainingSet, schema=RECORD_SCHEMA, version=VERSION, what="training set", tree=dataset)
 
 

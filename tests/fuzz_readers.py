@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from fuzz import Reader
 from safetensors.numpy import save_file
 from specimens_distill import make_captions
@@ -100,7 +99,6 @@ from distill.prepare.stage import PrepareConfig
 from distill.schema import RECORD, open_split
 from distill.student import checkpoint
 from distill.student import model as student
-from distill.student.features import read_features
 from distill.training.stage import taught_by
 from distill.windows import Windows
 from release.export import stage as export
@@ -363,7 +361,7 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
 
 
 def _student_files(root: Path) -> None:
-    """Write a model of two layers with an adapter of one, and the features of a picture."""
+    """Write a model of two layers with an adapter of one."""
     base, adapter, rng = root / "base", root / "adapter", np.random.default_rng(0)
     for folder in (base, adapter):
         folder.mkdir()
@@ -376,9 +374,6 @@ def _student_files(root: Path) -> None:
     update = {f"{merge.PREFIX}layers.1.lora_{part}.weight": values for part, values in halves.items()}
     save_file(update, adapter / "adapter_model.safetensors", {"format": "pt"})
     write_json(adapter / "adapter_config.json", {"peft_type": "LORA", "r": 2, "lora_alpha": 4, "bias": "none"})
-    array = root / "features/ab/abcd.npy"
-    array.parent.mkdir(parents=True)
-    np.save(array, rng.standard_normal((3, 8)).astype(np.float32))
 
 
 def _merged(root: Path, scratch: Path) -> None:
@@ -718,7 +713,6 @@ READERS: dict[str, Reader] = {
         ("adapter/adapter_config.json", "adapter/adapter_model.safetensors", "base/config.json",
          "base/model-00001-of-00001.safetensors", "base/model.safetensors.index.json"), _merged, share=0.5, hashes=True,
     ),
-    "features": Reader(("features/ab/abcd.npy",), lambda root, _: read_features(root / "features", "abcd", torch.float32)),
     "student's teaching": _one(f"model/{TAUGHT}", lambda path: read_taught(path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),

@@ -85,12 +85,6 @@ def test_a_prompt_without_a_place_for_the_pictures_is_refused(tree, tmp_path):
         prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
-def test_a_training_set_of_an_earlier_version_is_refused(tmp_path):
-    (tmp_path / "train.jsonl").write_text('{"schema_version": "2.0"}\n')
-    with pytest.raises(InputError, match=r"training set of another version.*train\.jsonl.*distill prepare"):
-        open_split(tmp_path, "train")
-
-
 def test_which_captions_teach_and_how_much():
     repaired = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
     checks = {"sentences": {"en": ["proved", "contradicted"], "zh": ["proved"]}}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 import subprocess
 import sys
@@ -225,24 +224,23 @@ def test_whole_weights_need_no_merge(base, tmp_path):
         merge.run(MergeConfig(), base, tmp_path, tmp_path / "out")
 
 
-def test_a_full_disk_leaves_nothing_half(base, adapter, tmp_path):
+def test_a_full_disk_is_one_line_and_leaves_nothing_half(base, adapter, tmp_path):
     """By a real limit on the size of files, in a process of its own."""
     program = (
-        "import resource, signal, sys\nfrom pathlib import Path\nfrom cosfly.errors import StorageError\n"
-        "from distill.inference import merge\n"
+        "import resource, signal, sys\nfrom cosfly.cli import main\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, resource.RLIM_INFINITY))\n"
-        "try:\n    merge.run(merge.MergeConfig(), *map(Path, sys.argv[1:]))\n"
-        "except StorageError as error:\n    print('StorageError', error)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, resource.RLIM_INFINITY))\nmain()\n"
     )
     assert (base / "model.safetensors").stat().st_size > 500_000
-    arguments = [sys.executable, "-c", program, str(base), str(adapter), str(tmp_path / "out")]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.startswith("StorageError"), done.stderr
-    assert "finished work is kept" in done.stdout
-    assert not (tmp_path / "out" / "model").exists()
-    assert not [*tmp_path.rglob("*.partial"), *tmp_path.rglob("*.safetensors")]
-    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
+    merging = ["merge", "--model", str(base), "--adapter", str(adapter), "--out", str(tmp_path / "out")]
+    for words in (merging, ["tiny-student", "--out", str(tmp_path / "tiny")]):
+        command = [sys.executable, "-c", program, "distill", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 1
+        assert done.stderr.splitlines()[-1].startswith("error: "), done.stderr
+        assert "File too large; free some space" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not [*tmp_path.rglob("*.partial"), *tmp_path.rglob("*.safetensors")]
     merge.run(MergeConfig(), base, adapter, tmp_path / "out")
     assert (tmp_path / "out" / "model" / "model.safetensors").exists()
 

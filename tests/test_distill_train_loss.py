@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +21,7 @@ from distill.student.features import (  # noqa: E402
     PictureData,
     PictureReader,
     VisionFeatures,
-    content_key,
     pictures_of,
-    tower_key,
 )
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
@@ -165,10 +162,9 @@ def fed(features: VisionFeatures, reader: PictureReader, pictures: Sequence) -> 
     return wanted
 
 
-def test_features_are_the_towers_and_made_once(place, tmp_path):
+def test_features_are_the_towers_and_made_once(place):
     own, sample = load(place), samples_of(place)[0]
-    features = VisionFeatures(own, folder=tmp_path, memory_bytes=10**9)
-    reader = PictureReader(own, trees_of(place), features.folder, own.dtype)
+    features, reader = VisionFeatures(own, memory_bytes=10**9), PictureReader(own, trees_of(place), own.dtype)
     pictures = pictures_of(sample)
     assert len(fed(features, reader, [*pictures, *pictures])) == 5
     found = features.of(pictures)
@@ -180,79 +176,35 @@ def test_features_are_the_towers_and_made_once(place, tmp_path):
     assert sum(map(features.bytes_of, pictures)) == found.numel() * found.element_size()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_what_memory_has_no_room_for_stands_on_disk_bit_by_bit(place, tmp_path, dtype):
-    own = replace(load(place), dtype=dtype)
-    own.model.to(dtype)
-    pictures = pictures_of(samples_of(place)[0])
-    one = VisionFeatures(own).bytes_of(pictures[0])
-    first = VisionFeatures(own, folder=tmp_path, memory_bytes=2 * one, disk_bytes=2 * one)
-    reader = PictureReader(own, trees_of(place), first.folder, own.dtype)
-    fed(first, reader, pictures)
-    found = first.of(pictures)
-    first.end_step()
-    assert len(list(tmp_path.rglob("*.npy"))) == 2  # two in memory, two on disk, one nowhere
-    assert not list(tmp_path.rglob("*.partial"))
-    assert len(fed(first, reader, pictures)) == 3
-    assert (first.num_encoded, first.num_from_disk) == (6, 2)
-    assert torch.equal(first.of(pictures), found)
-    damaged = next(tmp_path.rglob("*.npy"))
-    damaged.write_bytes(damaged.read_bytes()[:-3])
-    second = VisionFeatures(own, folder=tmp_path)
-    fed(second, PictureReader(own, trees_of(place), second.folder, own.dtype), pictures)
-    assert (second.num_encoded, second.num_from_disk) == (4, 1)
-    assert torch.equal(second.of(pictures), found)
+def test_what_memory_has_no_room_for_is_looked_at_again(place):
+    own, pictures = load(place), pictures_of(samples_of(place)[0])
+    features = VisionFeatures(own, memory_bytes=2 * VisionFeatures(own).bytes_of(pictures[0]))
+    reader = PictureReader(own, trees_of(place), own.dtype)
+    fed(features, reader, pictures)
+    found = features.of(pictures)
+    features.end_step()
+    assert len(fed(features, reader, pictures)) == 3
+    assert features.num_encoded == 8
+    assert torch.equal(features.of(pictures), found)
 
 
-def test_pictures_go_from_process_to_process_as_two_tensors(place):
-    """However many they are: each tensor on its way holds a file open. What is found on disk comes with what is not."""
-    generator = torch.Generator().manual_seed(0)
-    loaded = []
-    for number in range(40):
-        picture, values = (
-            Picture("run", str(number), "rgb", (64, 64), 100.0),
-            torch.randn(number % 5, 6, generator=generator),
-        )
-        kind = {"features": values[:, :3]} if number % 3 == 0 else {"patches": values}
-        loaded.append(PictureData(picture, f"key{number}", **kind))
-    for chosen in (loaded, loaded[1:3], loaded[:1], []):
+def test_pictures_go_from_process_to_process_as_one_tensor():
+    """However many they are: each tensor on its way holds a file open."""
+    pictures = [Picture("run", str(number), "rgb", (64, 64), 100.0) for number in range(40)]
+    loaded = [PictureData(picture, torch.rand(number % 5, 6)) for number, picture in enumerate(pictures)]
+    for chosen in (loaded, loaded[:1], []):
         packed = PictureBatch.of(chosen)
         assert not any(isinstance(value, torch.Tensor) for facts in packed.pictures for value in facts)
         for item, wanted in zip(packed.loaded(), chosen, strict=True):
-            assert (item.picture, item.key) == (wanted.picture, wanted.key)
-            assert (item.features is None) == (wanted.features is None)
-            assert torch.equal(
-                item.patches if item.features is None else item.features,
-                wanted.patches if wanted.features is None else wanted.features,
-            )
-
-
-def test_keys_tell_content_size_tower_and_processor_apart(place, tmp_path):
-    trees, picture = trees_of(place), pictures_of(samples_of(place)[0])[0]
-    shutil.copytree(place / "tree", tmp_path / "copy")
-    key = content_key(picture, trees)
-    assert content_key(picture, {picture.run: tmp_path / "copy"}) == key
-    assert content_key(picture._replace(size_px=(32, 18)), trees) != key
-    (tmp_path / "copy" / picture.frame / "rgb.png").write_bytes(b"another picture")
-    assert content_key(picture, {picture.run: tmp_path / "copy"}) != key
-    own = load(place)
-    before = tower_key(own)
-    assert tower_key(load(place)) == before
-    assert tower_key(replace(own, dtype=torch.bfloat16)) != before
-    own.image_processor.image_std = [0.4] * 3
-    assert tower_key(own) != before
-    again = load(place)
-    with torch.no_grad():
-        next(again.tower.parameters()).add_(1e-3)
-    assert tower_key(again) != before
+            assert item.picture == wanted.picture
+            assert torch.equal(item.patches, wanted.patches)
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"feature_cache": False, "batch_size": 3},
-        # Three pictures in memory, three on disk.
-        {"feature_memory_gb": 2e-5, "feature_disk_gb": 2e-5, "logit_chunk": 9, "gradient_checkpointing": True},
+        {"feature_memory_gb": 0, "batch_size": 3},
+        {"feature_memory_gb": 2e-5, "logit_chunk": 9, "gradient_checkpointing": True},  # three pictures have room
         pytest.param({"data_workers": 2}, marks=pytest.mark.slow),
     ],
     ids=lambda changes: "_".join(changes),
@@ -261,7 +213,6 @@ def test_what_changes_how_and_not_what_gives_the_same_losses(place, plain, tmp_p
     settings = {**FOUR, **changes}
     train.run(TrainConfig(**settings), place / "set", [place / "tree"], place / "student", tmp_path / "out")
     assert losses_of(tmp_path / "out") == pytest.approx(plain, rel=1e-5)
-    assert not (tmp_path / "out" / "features").exists()
 
 
 @pytest.fixture(scope="module")

@@ -71,20 +71,19 @@ class LocalAnswers:
         max_tokens: int,
         constrain: Constrain | None,
         feature_bytes: int,
-        is_recorded: bool = True,
     ) -> None:
         """
         Args:
             model: its name, for the journal. max_tokens: of an answer. constrain: makes what holds the answers of a batch to their form.
-            feature_bytes: most memory for what the vision tower made of the pictures of a shelf. is_recorded: as `decode` says.
+            feature_bytes: most memory for what the vision tower made of the pictures of a shelf.
         """
         self.student, self.book, self.model = student, book, model
         self.batch_size, self.max_tokens, self.constrain = batch_size, max_tokens, constrain
         self.most_rows = batch_size  # fewer once the memory was full
-        self._feature_bytes, self._is_recorded = feature_bytes, is_recorded
+        self._feature_bytes = feature_bytes
         self._flights = OpenFlights(book)
         processor = Processor(student.tokenizer, student.image_processor)
-        self._reader = PictureReader(processor, trees, None, student.dtype)
+        self._reader = PictureReader(processor, trees, student.dtype)
         self._threads = ThreadPoolExecutor(READING_THREADS, "pictures")
 
     def __enter__(self) -> LocalAnswers:
@@ -222,7 +221,6 @@ class LocalAnswers:
             max_tokens=self.max_tokens,
             constraint=self.constrain([sample.language for sample in samples]) if self.constrain else None,
             features=shelf.features.of([picture for sample in samples for picture in pictures_of(sample)]),
-            is_recorded=self._is_recorded,
         )
 
     async def _keep(

@@ -165,10 +165,6 @@ class InferConfig(Config):
     feature_memory_gb: MayDiffer[float] = Field(
         16.0, ge=0, description="memory for what the vision tower makes of pictures that several samples share, GB"
     )
-    record_steps: MayDiffer[bool] = Field(
-        True,
-        description="on an accelerator, transformers' steps are recorded as a CUDA graph and played again; false: each is computed plainly",
-    )
     endpoint: StudentEndpointConfig = Field(
         StudentEndpointConfig(),
         description="how the engines endpoint and vllm are asked; max_tokens is max_new_tokens, json_schema is constrained",
@@ -239,7 +235,6 @@ def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
         max_tokens=cfg.max_new_tokens,
         constrain=AnswerSchemas(student) if cfg.constrained else None,
         feature_bytes=int(cfg.feature_memory_gb * 1e9),
-        is_recorded=cfg.record_steps,
     )
 
 

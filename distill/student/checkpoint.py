@@ -5,11 +5,13 @@ Tensors stand in safetensors, the rest in JSON: nothing that a file could run.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -67,18 +69,24 @@ def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Pr
         write_checksums(partial, {str(path.relative_to(partial)): sha256_file(path) for path in files})
 
 
-def save_tensors(path: Path, tensors: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
-    """Write tensors by name; what the system says of the disk is an OSError, as elsewhere."""
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file
-
+@contextlib.contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Let what the system says of the disk while a library writes be an OSError, as elsewhere."""
     try:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
-    except SafetensorError as error:  # the library hides the system's number in its words
+        yield
+    except Exception as error:  # of safetensors, and of tokenizers without a class: the number stands in their words
         found = re.search(r"os error (\d+)", str(error))
         if found is None:
             raise
         raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
+
+
+def save_tensors(path: Path, tensors: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors by name."""
+    from safetensors.torch import save_file
+
+    with disk_errors(path):
+        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
@@ -221,7 +229,8 @@ def write_adapter_folder(student: Student, folder: Path, base_name: str) -> None
         base_name: what its base is called. peft writes where it stands on this machine, which is nobody else's business, also into a
             card that says nothing but that.
     """
-    student.model.save_pretrained(folder)
+    with disk_errors(folder):
+        student.model.save_pretrained(folder)
     (folder / "README.md").unlink(missing_ok=True)
     path = folder / "adapter_config.json"
     write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
@@ -236,9 +245,10 @@ def write_model_folder(student: Student, folder: Path, base: Path) -> None:
     for path in sorted(base.iterdir()):
         if path.is_file() and path.suffix in (".json", ".jinja", ".txt") and "safetensors" not in path.name:
             shutil.copyfile(path, folder / path.name)
-    student.model.to(student.dtype).save_pretrained(folder)
-    student.tokenizer.save_pretrained(folder)
-    student.image_processor.save_pretrained(folder)
+    with disk_errors(folder):
+        student.model.to(student.dtype).save_pretrained(folder)
+        student.tokenizer.save_pretrained(folder)
+        student.image_processor.save_pretrained(folder)
 
 
 def base_digests(model: Path) -> dict[str, str]:

@@ -18,6 +18,7 @@ from cosfly.products.captions import FIELDS
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
 from cosfly.work.store import atomic_folder
+from distill.student.checkpoint import disk_errors
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
 
 TINY, RANDOM = "tiny", "random"  # what `--student` may say beside folders and names of repositories
@@ -116,7 +117,7 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
         # hence the loss by about 0.29 nats in the smallest; twice the length lets a student be sure of an answer.
         with torch.no_grad():
             model.model.language_model.embed_tokens.weight.mul_(2.0)
-    with atomic_folder(folder) as partial:
+    with atomic_folder(folder) as partial, disk_errors(partial):
         model.save_pretrained(partial)
         tokenizer.save_pretrained(partial)
         image_processor.save_pretrained(partial)

@@ -145,39 +145,24 @@ class Order:
 
 @dataclass(frozen=True)
 class PictureBatch:
-    """Pictures that were read, their patches in one tensor and their features in another: a tensor on its way from one process to
-    another holds a file open, and a step may have hundreds of pictures.
+    """Pictures that were read, their patches in one tensor: a tensor on its way from one process to another holds a file open, and a
+    step may have hundreds of pictures. pictures: each with how many rows are its own."""
 
-    pictures: each with its key, whether features were found, and how many rows are its own.
-    """
-
-    pictures: list[tuple[Picture, str, bool, int]]
+    pictures: list[tuple[Picture, int]]
     patches: Any
-    features: Any
 
     @classmethod
     def of(cls, loaded: Sequence[PictureData]) -> PictureBatch:
         import torch
 
-        has_features = [item.features is not None for item in loaded]
-        arrays = [item.features if found else item.patches for item, found in zip(loaded, has_features, strict=True)]
-        joined = []
-        for kind in (False, True):
-            own = [array for array, found in zip(arrays, has_features, strict=True) if found is kind]
-            joined.append(torch.cat(own) if own else None)
-        facts = zip(loaded, has_features, arrays, strict=True)
-        return cls([(item.picture, item.key, found, len(array)) for item, found, array in facts], *joined)
+        patches = torch.cat([item.patches for item in loaded]) if loaded else None
+        return cls([(item.picture, len(item.patches)) for item in loaded], patches)
 
     def loaded(self) -> list[PictureData]:
-        found, begin = [], {False: 0, True: 0}
-        for picture, key, has_features, count in self.pictures:
-            rows = slice(begin[has_features], begin[has_features] + count)
-            begin[has_features] += count
-            if has_features:  # of its own, since it may be kept when the others are let go
-                found.append(PictureData(picture, key, features=self.features[rows].clone()))
-            else:
-                found.append(PictureData(picture, key, patches=self.patches[rows]))
-        return found
+        if not self.pictures:
+            return []
+        parts = self.patches.split([count for _, count in self.pictures])
+        return [PictureData(picture, part) for (picture, _), part in zip(self.pictures, parts, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import importlib.util
 import logging
 import os
 import resource
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -183,7 +182,7 @@ def findings(
         *_about_decisions(census, validation),
         _about_chat(student, sample),
         *_about_memory(cfg, student, census, features),
-        *_about_features(cfg, census, validation, features),
+        _about_features(census, validation, features),
         *_about_kernels(student),
     ]
 
@@ -248,36 +247,17 @@ def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: 
     return [Finding("memory", f"about {memory} with batch_size {cfg.batch_size}", level)]
 
 
-def _about_features(cfg: TrainConfig, census: Census, validation: Census, features: VisionFeatures) -> list[Finding]:
+def _about_features(census: Census, validation: Census, features: VisionFeatures) -> Finding:
     pictures = dict.fromkeys([*census.pictures, *validation.pictures])
     if not pictures:
-        return [Finding("pictures", "none: the student sees texts only")]
-    total = sum(features.bytes_of(picture) for picture in pictures)
+        return Finding("pictures", "none: the student sees texts only")
     if not features.is_frozen:
-        return [Finding("pictures", f"{len(pictures)}; the vision tower learns and looks at each whenever it is shown")]
-    if not cfg.feature_cache:
-        return [
-            Finding("pictures", f"{len(pictures)}; each is looked at in every step that shows it (feature_cache=false)")
-        ]
-    in_memory = min(total, features.memory_bytes)
-    on_disk = min(total - in_memory, features.disk_bytes)
-    told = f"{len(pictures)}, features {total / GB:.3f} GB: {in_memory / GB:.3f} in memory, {on_disk / GB:.3f} on disk"
-    found = []
-    if (rest := total - in_memory - on_disk) > 0:
-        found.append(
-            Finding("pictures", f"{told}; {rest / GB:.3f} GB have no room and are looked at each time", "warning")
-        )
-    else:
-        found.append(Finding("pictures", told))
-    if features.folder is not None and on_disk > (free := shutil.disk_usage(_existing(features.folder)).free):
-        found.append(
-            Finding("pictures", f"the disk has {free / GB:.1f} GB for {on_disk / GB:.1f} GB of features", "error")
-        )
-    return found
-
-
-def _existing(folder: Path) -> Path:
-    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        return Finding("pictures", f"{len(pictures)}; the vision tower learns and looks at each whenever it is shown")
+    total = sum(features.bytes_of(picture) for picture in pictures)
+    told = f"{len(pictures)}, features {total / GB:.3f} GB"
+    if (rest := total - features.memory_bytes) > 0:
+        return Finding("pictures", f"{told}; {rest / GB:.3f} GB have no room and are looked at each time", "warning")
+    return Finding("pictures", told)
 
 
 def _about_kernels(student: Student) -> list[Finding]:

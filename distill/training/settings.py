@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -99,13 +98,10 @@ class TrainConfig(Config):
         ge=1,
         description="answer tokens whose logits exist at a time: each takes 4 bytes times the vocabulary, three times",
     )
-    feature_cache: MayDiffer[bool] = Field(True, description="keep what the frozen vision tower makes of pictures")
-    feature_memory_gb: MayDiffer[float] = Field(16.0, ge=0, description="features kept in memory, GB a process")
-    feature_disk_gb: MayDiffer[float] = Field(
-        100.0, ge=0, description="features kept on disk that memory has no room for, GB over all processes"
-    )
-    feature_folder: MayDiffer[Path | None] = Field(
-        None, description="where features stay for further runs; none: in the output folder until the training is done"
+    feature_memory_gb: MayDiffer[float] = Field(
+        16.0,
+        ge=0,
+        description="memory for what the frozen vision tower makes of pictures, GB a process; 0: nothing is kept",
     )
     data_workers: MayDiffer[int] = Field(
         -1, ge=-1, description="processes that read pictures, for each that trains; -1: one a core, at most 16; 0: none"

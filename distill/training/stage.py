@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import re
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import atomic_folder, write_json
 from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
-from distill.student.features import PictureReader, VisionFeatures, folder_bytes
+from distill.student.features import PictureReader, VisionFeatures
 from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
 from distill.training.fit import LOG, Lesson, fit, seeded
@@ -54,7 +53,7 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
 
 log = logging.getLogger(__name__)
 
-ADAPTER, MODEL, STUDENT, PREFLIGHT, FEATURES = "adapter", "model", "student", "preflight.json", "features"
+ADAPTER, MODEL, STUDENT, PREFLIGHT = "adapter", "model", "student", "preflight.json"
 UNREADABLE = "unreadable_picture"
 TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is trained on, at most
 
@@ -196,26 +195,14 @@ def _lesson(
     asked = take_census(validation, chosen, processor, trees, **counting, label=f"{STAGE}: counting tokens of val")
     if not len(census):
         raise _nothing_to_learn(out, census)
-    features = _features(cfg, student, out, ranks)
-    reader = PictureReader(processor, trees, features.folder, student.dtype)
+    memory_bytes = int(cfg.feature_memory_gb * GB)
+    features = VisionFeatures(student, memory_bytes=memory_bytes, is_frozen=not cfg.train_vision)
+    reader = PictureReader(processor, trees, student.dtype)
     lesson = Lesson(student, samples, census, validation, asked, Supply(features, reader, workers), cfg, ranks, seed)
     found = findings(cfg, student, census, asked, features, samples[int(census.indices[0])], lesson.steps)
     ranks.first_does(lambda: tell(found, out / PREFLIGHT))
     most = int(student.image_processor.size["longest_edge"])
     return lesson, taught.model_copy(update={"max_pixels": most})
-
-
-def _features(cfg: TrainConfig, student: Student, out: Path, ranks: Ranks) -> VisionFeatures:
-    if not cfg.feature_cache or cfg.train_vision:
-        return VisionFeatures(student, is_frozen=not cfg.train_vision)
-    folder = cfg.feature_folder or out / FEATURES
-    room = max(0.0, cfg.feature_disk_gb * GB - folder_bytes(folder)) / ranks.size
-    return VisionFeatures(
-        student,
-        folder=folder,
-        memory_bytes=int(cfg.feature_memory_gb * GB),
-        disk_bytes=int(room),
-    )
 
 
 def _nothing_to_learn(out: Path, census: Census) -> Exception:
@@ -236,8 +223,6 @@ def _write_product(
         else:
             write_model_folder(student, partial, base)
         write_taught(partial, taught)
-    if cfg.feature_folder is None:
-        shutil.rmtree(stage.path / FEATURES, ignore_errors=True)
     num_unreadable = len(progress.unreadable)
     dropped = census.skipped + Counter({UNREADABLE: num_unreadable})
     stage.finish(

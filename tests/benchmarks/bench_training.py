@@ -124,7 +124,7 @@ def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[Encode
 def noise_of(picture: Picture, dtype: Any) -> PictureData:
     width_px, height_px = picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
-    return PictureData(picture, picture.frame, patches=torch.from_numpy(values).to(dtype))
+    return PictureData(picture, torch.from_numpy(values).to(dtype))
 
 
 def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any:
