@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +25,9 @@ from shapely.geometry import Polygon
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
-from cosfly.maps.row_values import TYPES, WrongRow, read_values, size_of, span_of, wrong_in
-from cosfly.maps.units import check_units
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
+from cosfly.products.columns import LARGEST
+from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.reading.files import read_text
 from cosfly.reading.geojson import read_features
 from cosfly.work.config import Config
@@ -55,6 +56,9 @@ NAMES: dict[str, tuple[str, ...]] = {
 FIELDS = {name: field for field, names in NAMES.items() for name in names}
 FAR_M = 10_000.0  # a map whose middle is farther from the origin is moved there
 DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near to each other are longitude and latitude
+TYPES = [kind for kind in KINDS if kind != "NONE"]
+SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
+WIDEST_M, TALL_M = 20_000.0, 400.0  # no map is wider, the usual building is lower: else the file is in centimetres
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
 
@@ -107,6 +111,10 @@ class BoxesConfig(Config):
             fix = "--set maps.boxes.path=..."
             raise ConfigError("no file is given", where="maps.boxes.path", expected="a path", fix=fix)
         return {"boxes": self.path}
+
+
+class WrongRow(Exception):
+    """What is wrong with one row, in words."""
 
 
 class _Row(NamedTuple):
@@ -186,8 +194,16 @@ def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
 
 def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
     """Give the map with what the settings say of it, near the origin, if its size can be."""
-    check_units(box_map, path)
     low, high = box_map.bounds()
+    heights_m = 2 * box_map.half_extents[box_map.kinds == KINDS["Buildings"], 2]
+    usual_m = float(np.median(heights_m)) if len(heights_m) else 0.0
+    if (high - low)[:2].max() > WIDEST_M or usual_m > TALL_M:
+        raise InputError(
+            "the map is too wide, or its buildings too high: are these centimetres?", where=path,
+            got=f"{' x '.join(f'{size:.6g}' for size in high - low)} m, buildings of usually {usual_m:.6g} m",
+            expected=f"at most {WIDEST_M / 1000:g} km, and less than {TALL_M:g} m",
+            fix="write all of the file in metres; maps.boxes.metres_per_unit=0.01 divides positions and sizes of a table by 100",
+        )  # fmt: skip
     given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=cfg.tool or box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**given, "source": source})
@@ -234,7 +250,7 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 continue
             cells = ((field, cell.strip()) for field, cell in zip(fields, line, strict=True) if field)
             values = {field: cell for field, cell in cells if cell}
-            if problems and not (wrong := wrong_in(lost | values, cfg.types)):
+            if problems and not (wrong := _wrong_in(lost | values, cfg.types)):
                 continue  # what a lost column leaves out is told once
             yield _Row(f"line {lines.line_num}", values, wrong=wrong if problems else "")
     except csv.Error as error:
@@ -313,18 +329,18 @@ def _ids(given: list[Any], path: Path) -> np.ndarray:
 def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
     if row.wrong:
         raise WrongRow(row.wrong)
-    kind, numbers = read_values(row.values, cfg.types)
+    kind, numbers = _read_values(row.values, cfg.types)
     if "yaw_deg" in numbers and "yaw_rad" in numbers:
         raise WrongRow("yaw twice, in degrees and in radians")
     yaw_deg = numbers.pop("yaw_deg", math.degrees(numbers.pop("yaw_rad", 0.0)))
     metres = {name: value * cfg.metres_per_unit for name, value in numbers.items()}
-    low_m, high_m = span_of(metres, kind, cfg.ground_z_m)
+    low_m, high_m = _span_of(metres, kind, cfg.ground_z_m)
     turn = -1.0 if cfg.left_handed else 1.0
     if row.outline is None:
         missing = [name for name in ("x", "y") if name not in metres]
         if missing:
             raise WrongRow(f"no {' and no '.join(missing)}")
-        size = (size_of(metres, "length"), size_of(metres, "width"))
+        size = (_size_of(metres, "length"), _size_of(metres, "width"))
         boxes.add(kind, (metres["x"], turn * metres["y"]), size, low_m, high_m, turn * yaw_deg)
         return
     outline = shapely.transform(row.outline, lambda places: places * [cfg.metres_per_unit, turn * cfg.metres_per_unit])
@@ -333,3 +349,93 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
         raise WrongRow(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
     for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):
         boxes.add(kind, rectangle.center, rectangle.size, low_m, high_m, rectangle.yaw_deg)
+
+
+def _wrong_in(values: Mapping[str, Any], types: Mapping[str, str]) -> str:
+    """Say what is wrong with the type and the numbers of a row; "" where nothing is."""
+    try:
+        _read_values(values, types)
+    except WrongRow as error:
+        return str(error)
+    return ""
+
+
+def _read_values(values: Mapping[str, Any], types: Mapping[str, str]) -> tuple[str, dict[str, float]]:
+    """Give the type and the numbers of a row, by field, in the file's units.
+
+    Args:
+        values: by field, as the file has them. types: names of the file -> types of cosfly.
+    Raises:
+        WrongRow: says all that is wrong with them.
+    """
+    wrong, kind, numbers = list[str](), "", dict[str, float]()
+    try:
+        kind = _kind(values, types)
+    except WrongRow as error:
+        wrong.append(str(error))
+    for name, value in values.items():
+        if name not in ("type", "id", "name"):
+            try:
+                numbers[name] = _number(name, value)
+            except WrongRow as error:
+                wrong.append(str(error))
+    if wrong:
+        raise WrongRow(", ".join(wrong))
+    return kind, numbers
+
+
+def _kind(values: Mapping[str, Any], types: Mapping[str, str]) -> str:
+    name = str(values.get("type", ""))
+    kind = types.get(name, name)
+    if kind not in TYPES:
+        alike = {known.lower(): known for known in [*KINDS, *types]}
+        close = get_close_matches(name.lower(), alike, n=1)
+        raise WrongRow(
+            f"unknown type {name[:40]!r}" + (f" (did you mean {alike[close[0]]!r}?)" if close else "")
+            if name
+            else "no type"
+        )
+    return kind
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not abs(number) <= LARGEST:
+        point = "; write a decimal point, no comma" if "," in str(value) else ""
+        raise WrongRow(f"{name} is not a finite number: {str(value)[:40]!r}{point}")
+    return number
+
+
+def _size_of(metres: Mapping[str, float], name: str) -> float:
+    """Give a full size, m, which may be told as its half; raises WrongRow."""
+    half = metres.get(f"half_{name}")
+    if (name in metres) == (half is not None):
+        raise WrongRow(f"{name} twice, whole and half" if half is not None else f"neither {name} nor half_{name}")
+    size = metres[name] if half is None else 2 * half
+    if not size > 0:
+        raise WrongRow(f"{name} is not more than 0: {size:g} m")
+    return size
+
+
+def _span_of(metres: Mapping[str, float], kind: str, ground_m: float) -> tuple[float, float]:
+    """Give the lowest and highest point, m: of low and high, of the middle and a height, or of a height over the ground; raises WrongRow."""
+    has_height = "height" in metres or "half_height" in metres
+    if "high" in metres:
+        if has_height or "z" in metres:
+            raise WrongRow("its heights are told twice: high beside height or z")
+        low, high = metres.get("low", ground_m), metres["high"]
+    elif not has_height and KINDS[kind] in GROUND_KINDS:
+        top = metres.get("z", metres.get("low", ground_m))
+        low, high = top - SLAB_M, top
+    else:
+        height = _size_of(metres, "height")
+        if "z" in metres and "low" in metres:
+            raise WrongRow("its heights are told twice: low beside z")
+        low = metres["z"] - height / 2 if "z" in metres else metres.get("low", ground_m)
+        high = low + height
+    if not high > low:
+        raise WrongRow(f"its top, {high:g} m, is not above its foot, {low:g} m")
+    return low, high
