@@ -16,7 +16,7 @@ from cosfly.look.topview import TopView, draw_map, draw_text
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
-from cosfly.maps.cityjson_file import read_model, rule_of
+from cosfly.maps.cityjson_file import rule_of
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
 from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
 from cosfly.maps.stage import MapsConfig, load_map, run
@@ -89,19 +89,6 @@ def test_surfaces_of_a_town_do_not_share_a_plane():
     for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
         tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
         assert abs(tops[0].max() - tops[1].max()) > 0.015
-
-
-def test_nothing_parks_in_a_house():
-    town = load_map(MapsConfig())
-    houses = united([footprint(m, row) for m in [boxes_of(town, "Buildings")] for row in range(len(m))])
-    vehicles = boxes_of(town, "Car", "Truck")
-    assert len(vehicles) > 50
-    assert not any(footprint(vehicles, row).intersects(houses) for row in range(len(vehicles)))
-
-
-def test_a_town_without_room_for_blocks_is_a_config_error():
-    with pytest.raises(ConfigError, match="raise size_m or lower num_blocks"):
-        build(MapsConfig, {"synthetic": {"size_m": 150}}, "x")
 
 
 @pytest.mark.parametrize(("size_m", "num_blocks"), [(110.0, 1), (420.0, 5)])
@@ -257,16 +244,6 @@ def test_malformed_worlds_name_the_node_and_the_field(tmp_path: Path, bad: dict,
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"nodes": []}', '{"nodes": 3}', '{"nodes": [3]}', '{"nodes": [NaN]}']
-)
-def test_what_is_no_world_is_an_input_error(tmp_path: Path, text: str):
-    cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0))
-    (tmp_path / "world.json").write_text(text)
-    with pytest.raises(InputError, match=r"world\.json"):
-        simworld(cfg)
-
-
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
     with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
@@ -363,16 +340,6 @@ def test_covers_cut_what_is_too_long():
     rectangles = cover(box(0, 0, 300, 4), min_fill=0.8, min_size_m=2.0, max_size_m=60.0)
     assert max(max(r.size) for r in rectangles) <= 60
     assert sum(np.prod(r.size) for r in rectangles) == pytest.approx(1200)
-
-
-def test_covers_reject_bad_settings():
-    with pytest.raises(ValueError, match="min_fill"):
-        cover(box(0, 0, 1, 1), min_fill=0.0, min_size_m=1.0)
-
-
-def test_boxes_without_a_size_are_refused():
-    with pytest.raises(ValueError, match="empty box"):
-        BoxList().add("Roads", (0, 0), (1, 0), 0, 1)
 
 
 # --- cityjson ---------------------------------------------------------------------------------------------------------
@@ -511,16 +478,6 @@ def test_malformed_city_models_name_the_object_and_the_field(tmp_path: Path, pat
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"{", b"[]", b"\x1f\x8b\x08broken", b'{"type": NaN}', gzip.compress(b"{}" * 999, mtime=0)[:20]]
-)
-def test_damaged_files_are_input_errors(tmp_path: Path, data: bytes):
-    path = tmp_path / "city.json.gz"
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=r"city\.json\.gz"):
-        read_model(path)
-
-
 def test_rules_go_by_type_and_attribute():
     assert rule_of("Road", {"function": "voetpad op trap"}).kind == "Sidewalks"
     assert rule_of("Road", {"function": "rijbaan lokale weg"}).kind == "Roads"
@@ -595,12 +552,6 @@ def test_stage_notices_a_changed_world(tmp_path: Path):
     run(cfg, tmp_path / "out")
     write_world(tmp_path, node("BP_Building_01_C", 100, 0))
     with pytest.raises(ResumeError, match="input world"):
-        run(cfg, tmp_path / "out")
-
-
-def test_stage_names_a_missing_file(tmp_path: Path):
-    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "nowhere.json"))
-    with pytest.raises(InputError, match=r"nowhere\.json"):
         run(cfg, tmp_path / "out")
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.errors import ConfigError, InputError
+from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Course, and_back, braked, company_of
 from cosfly.pedestrians.paces import PACES, speeds_at, take_pace
@@ -331,11 +331,3 @@ def test_a_map_without_roads_says_how_many_cars_are_missing(tmp_path, caplog):
 
 def replace_settings(cfg: PedestriansConfig, **changes) -> PedestriansConfig:
     return build(PedestriansConfig, {**cfg.model_dump(), **changes}, "test")
-
-
-@pytest.mark.parametrize(
-    "bad", [{"others": -1}, {"traffic": 501}, {"others_reach_m": 0}], ids=["negative", "many", "reach"]
-)
-def test_bad_numbers_are_config_errors(bad):
-    with pytest.raises(ConfigError, match=next(iter(bad))):
-        build(PedestriansConfig, bad, "test")

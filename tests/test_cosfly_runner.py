@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import pytest
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.work.chance import draw_by_share, draws_for, rng_for
 from cosfly.work.config import Config
-from cosfly.work.journal import Journal
 from cosfly.work.runner import Item, Outcome, run_items
 from cosfly.work.stage_folder import StageFolder
 from cosfly.work.store import dump_json
@@ -122,42 +120,6 @@ def test_rng_depends_on_all_three_and_zero_is_a_seed():
     assert len(draws) == 4
     assert rng_for(0, "a", "x").random() == rng_for(0, "a", "x").random()
     assert len({draws_for(*key) for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}) == 4
-
-
-def make_slow_worker():
-    def work(item: Item) -> Outcome:
-        time.sleep(0.05)
-        return Outcome({"value": item.payload})
-
-    return work
-
-
-def test_kill_and_resume(tmp_path):
-    """kill -9 in the middle: the second run does the rest, and the outcome is that of an undisturbed run."""
-    program = textwrap.dedent(
-        f"""
-        import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
-        from pathlib import Path
-        from test_cosfly_runner import _stage, make_slow_worker
-        from cosfly.work.runner import Item, run_items
-        run_items(_stage(Path({str(tmp_path / "s")!r})), [Item(str(k), k) for k in range(40)], make_slow_worker)
-        """
-    )
-    child = subprocess.Popen([sys.executable, "-c", program])
-    journal = Journal(tmp_path / "s/items.jsonl")
-    deadline_s = time.monotonic() + 60
-    while sum(1 for _ in journal.read()) < 5:
-        assert child.poll() is None
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-    child.kill()
-    child.wait()
-    done = {r["id"] for r in journal.read()}
-    assert 5 <= len(done) < 40
-    items = [Item(str(k), k) for k in range(40)]
-    finished = run_items(_stage(tmp_path / "s"), items, make_slow_worker)
-    assert [r.result["value"] for r in finished.kept] == list(range(40))
-    assert sum(1 for _ in journal.read()) == 40  # nothing was done twice
 
 
 STUCK = """

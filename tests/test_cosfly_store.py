@@ -12,7 +12,7 @@ from pydantic import Field
 
 from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
 from cosfly.reading.documents import read_json
-from cosfly.work import stage_folder, store
+from cosfly.work import store
 from cosfly.work.config import Config, MayDiffer
 from cosfly.work.folder_lock import give_up
 from cosfly.work.journal import Journal
@@ -49,16 +49,6 @@ def test_nan_is_never_a_value(tmp_path):
     (tmp_path / "b.json").write_text('{"x": NaN}')
     with pytest.raises(InputError, match=r"b\.json.*NaN"):
         read_json(tmp_path / "b.json")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000])
-def test_malformed_json_is_one_line(tmp_path, text):
-    path = tmp_path / "x.json"
-    path.write_text(text)
-    with pytest.raises(InputError) as caught:
-        read_json(path, what="map")
-    assert "x.json" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_names_stay_inside(tmp_path):
@@ -232,17 +222,6 @@ def test_a_missing_input_is_not_taken_for_a_full_disk(tmp_path):
         (tmp_path / "input").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [('{"a": [1, {"b": NaN}]}', "x.json: a[1].b:"), ("[1, -Infinity]", "x.json: [1]:"), ("[NaN, ", "x.json: the")],
-)
-def test_a_number_that_is_not_finite_is_placed(tmp_path, text, place):
-    (tmp_path / "x.json").write_text(text)
-    with pytest.raises(InputError) as caught:
-        read_json(tmp_path / "x.json")
-    assert place in str(caught.value)
-
-
 @pytest.mark.parametrize("name", ["thesis.txt", ".thesis.txt.1.partial"])
 def test_foreign_files_are_not_touched(tmp_path, name):
     (tmp_path / name).write_text("x")
@@ -257,22 +236,6 @@ def test_a_missing_product_of_a_complete_stage_is_found(tmp_path):
     (stage.path / "product.json").unlink()
     with pytest.raises(VerifyError, match=r"product\.json"):
         _open(tmp_path / "out")
-
-
-def test_partials_of_a_kill_are_swept(tmp_path):
-    stage = _open(tmp_path / "out")
-    (stage.path / ".x.json.1.partial").write_text("half")
-    (stage.path / ".flight.1.partial").mkdir()
-    _open(tmp_path / "out")
-    assert sorted(p.name for p in stage.path.iterdir()) == [".lock", "stage.json"]
-
-
-def test_a_kill_in_the_middle_of_the_first_record_leaves_a_folder_to_go_on_with(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / ".stage.json.1.partial").write_text('{"schema": "cos')
-    stage = _open(out)
-    assert sorted(p.name for p in stage.path.iterdir()) == [".lock", "stage.json"]
 
 
 def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_another):
@@ -306,43 +269,6 @@ def test_a_lock_that_a_kill_left_in_a_finished_folder_goes(tmp_path):
     (out / ".lock").write_text("{}")
     assert _open(out).is_complete
     assert not (out / ".lock").exists()
-
-
-@pytest.mark.parametrize("left", [".preflight.json.1.partial", "answers"])
-def test_two_kills_before_anything_is_finished_leave_a_folder_to_go_on_with(tmp_path, monkeypatch, left):
-    """The first while a file was begun, or a folder made for some; the second before the record stood again."""
-    stage = _open(tmp_path / "out")
-    (stage.path / left).mkdir()
-    give_up(tmp_path)
-
-    def killed(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(stage_folder, "write_model", killed)
-        with pytest.raises(KeyboardInterrupt):
-            _open(tmp_path / "out")
-    assert not _open(tmp_path / "out").is_complete
-
-
-def test_a_kill_while_an_attempt_without_work_is_cleared_away_leaves_a_folder_to_go_on_with(tmp_path, monkeypatch):
-    stage = _open(tmp_path / "out")
-    stage.journal.append({"id": "a", "status": "failed", "code": "x", "message": "y"})
-    write_failures(stage.path / "failures.jsonl", [])
-    give_up(tmp_path)
-    unlink = Path.unlink
-
-    def unlink_one(path, **more):
-        if path.name == "items.jsonl":
-            unlink(path, **more)
-            raise KeyboardInterrupt
-        unlink(path, **more)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "unlink", unlink_one)
-        with pytest.raises(KeyboardInterrupt):
-            _open(tmp_path / "out")
-    assert not _open(tmp_path / "out").is_complete
 
 
 @pytest.mark.parametrize("is_killed", [False, True])

@@ -197,13 +197,17 @@ def holds(found: object, wanted: object) -> bool:
     return found == pytest.approx(wanted) if isinstance(wanted, float) else found == wanted
 
 
-@pytest.mark.parametrize("variant", ["ORI", "aug_001"])
 @pytest.mark.parametrize("name", QUIRKS)
-def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, name, variant):
+def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, name):
+    for variant in ("ORI", "aug_001"):
+        folder = tmp_path / "Town01/trajectory_1777083733" / variant
+        folder.mkdir(parents=True)
+        shutil.copy(foreign / folder.relative_to(tmp_path) / "trajectory.json", folder)
+        _check_quirk(folder, name)
+
+
+def _check_quirk(folder: Path, name: str) -> None:
     quirk = QUIRKS[name]
-    folder = tmp_path / "Town01/trajectory_1777083733" / variant
-    folder.mkdir(parents=True)
-    shutil.copy(foreign / folder.relative_to(tmp_path) / "trajectory.json", folder)
     change_file(folder, quirk.change)
     if quirk.is_strict:
         assert read_flight(folder).issues == ()
@@ -318,7 +322,8 @@ def test_without_twins_perturbed_labels_say_that_they_hold_noise(tmp_path):
     assert {caption.label_from for caption in found} == {"perturbed"}
 
 
-@pytest.mark.parametrize("name", [name for name in QUIRKS if "left out" not in name or "target" in name])
+# Of the others the columns of the flight are the same, which the test before shows.
+@pytest.mark.parametrize("name", ["no target anywhere", "targets left out", "waypoints and flat times", "unknown keys"])
 def test_a_quirk_never_ends_in_a_traceback_or_a_loss(tmp_path, name):
     tree = write_foreign_tree(tmp_path / "tree", num_points=11)
     for folder in find_flights(tree):

@@ -10,7 +10,6 @@ from cosfly.products.captions import Coc
 
 # A point after these ends no sentence, nor does one inside a number.
 _ABBREVIATIONS = ("approx", "ca", "vs", "deg", "i\\.e", "e\\.g", "resp", "max", "min", "avg", "horiz")
-_ABBREVIATED = tuple(word.replace("\\", "") for word in _ABBREVIATIONS)
 _POINT = r"(?<=\.)(?=\s|$)" + "".join(rf"(?<!\b(?i:{word})\.)" for word in _ABBREVIATIONS)
 # Begins with one class of characters, for which the engine looks by itself: twice as fast as with alternatives.
 _MARKS = ".。！？!?\n"
@@ -27,8 +26,6 @@ def sentences_of(coc: Coc) -> Iterator[tuple[str, str]]:
 @lru_cache(maxsize=256)  # an English text is cut again when its mirror is held against it
 def cut_sentences(text: str) -> tuple[str, ...]:
     """Cut a text at the ends of its sentences; together the pieces are the text."""
-    if (plain := _cut_plain(text)) is not None:
-        return plain
     pieces: list[str] = []
     start = 0
     for end in [*[match.end() for match in END.finditer(text)], len(text)]:
@@ -39,22 +36,3 @@ def cut_sentences(text: str) -> tuple[str, ...]:
             pieces[-1] += piece
         start = end
     return tuple(pieces)
-
-
-def _cut_plain(text: str) -> tuple[str, ...] | None:
-    """Cut a text all of whose sentences end in one way, a point and a space or a Chinese point; None for any other.
-
-    Most texts are such ones, and splitting them takes a quarter of the pattern's time.
-    """
-    marks = [mark for mark in _MARKS if mark in text]
-    if marks not in (["."], ["。"]) or not text.isprintable():  # of what is printable only the space is one
-        return None
-    end = "。" if marks == ["。"] else ". "
-    *pieces, last = text.split(end)
-    if last[:1] == " " or (end == ". " and not last):
-        return None
-    for piece in pieces:
-        if not piece or piece[0] == " " or (end == ". " and piece[-6:].lower().endswith(_ABBREVIATED)):
-            return None
-    cut = [piece + end for piece in pieces]
-    return (*cut, last) if last else tuple(cut)
