@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
-import signal
 import socket
-import subprocess
-import sys
-import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -410,41 +405,6 @@ def test_a_server_with_room_for_three_is_not_flooded(tmp_path):
 
 
 # --- the journal ------------------------------------------------------------------------------------------------------
-
-SCRIPT = """
-import json, sys
-from pathlib import Path
-from caption.schema import CaptionConfig
-from caption.run.stage import run
-run(CaptionConfig.model_validate(json.loads(sys.argv[3])), Path(sys.argv[1]), Path(sys.argv[2]))
-"""
-
-
-@pytest.mark.slow
-def test_nothing_answered_is_asked_twice_after_kill_9(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 20, with_augmented=False)
-    with TeacherServer() as undisturbed:
-        expected = run(settings(undisturbed.url), tree, tmp_path / "whole").read_bytes()
-    out, kills = tmp_path / "out", 2
-    with TeacherServer(delay_s=0.02) as server:
-        config = settings(server.url).model_dump_json()
-        for stop_at in (15, 35):
-            child = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tree), str(out), config])
-            deadline_s = time.monotonic() + 60
-            while len(server.bodies) < stop_at and child.poll() is None and time.monotonic() < deadline_s:
-                time.sleep(0.005)
-            os.kill(child.pid, signal.SIGKILL)
-            child.wait()
-        answered = {record["key"] for record in kept_answers(out)}
-        assert answered, "the kills must fall in the middle"
-        assert not (out / "manifest.json").exists()
-        found = run(settings(server.url), tree, out).read_bytes()
-    assert found == expected
-    in_flight = kills * ENDPOINT["concurrency"]
-    assert len(undisturbed.bodies) <= len(server.bodies) <= len(undisturbed.bodies) + in_flight
-    assert set(server.digests()) == set(undisturbed.digests())
-    keys = [record["key"] for record in kept_answers(out)]
-    assert len(keys) == len(set(keys))
 
 
 def test_a_damaged_journal_line_costs_one_request(tree, tmp_path):

@@ -1,9 +1,6 @@
 """The comparison of planners: the paper's own tables as known answers, the stage, its pictures and its command."""
 
 import json
-import signal
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -144,28 +141,6 @@ def test_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
     assert len(products) == 4 + len(PLANNERS)
     for name in products:
         assert (tmp_path / "two" / name).read_bytes() == (made / name).read_bytes(), name
-
-
-def test_a_killed_comparison_goes_on_where_it_was(inputs, made, tmp_path, monkeypatch):
-    code = (
-        "import os, pathlib, signal, sys\n"
-        "from cosfly.planners import compare\n"
-        "real = compare.plan_flight\n"
-        "def deadly(walk, *rest):\n"
-        "    if walk.path_id == 'b': os.kill(os.getpid(), signal.SIGKILL)\n"
-        "    return real(walk, *rest)\n"
-        "compare.plan_flight = deadly\n"
-        "compare.run(compare.CompareConfig(), *map(pathlib.Path, sys.argv[1:]))\n"
-    )
-    killed = subprocess.run([sys.executable, "-c", code, *map(str, inputs), str(tmp_path)], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    real, planned = compare.plan_flight, []
-    monkeypatch.setattr(compare, "plan_flight", lambda walk, *rest: planned.append(walk.path_id) or real(walk, *rest))
-    compare.run(CFG, *inputs, tmp_path)
-    assert "a" not in planned
-    assert planned.count("b") == len(PLANNERS)  # the failed walk is tried again too
-    for entry in json.loads((made / "manifest.json").read_text())["outputs"]:
-        assert (tmp_path / entry["path"]).read_bytes() == (made / entry["path"]).read_bytes(), entry["path"]
 
 
 def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeypatch):

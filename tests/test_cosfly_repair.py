@@ -91,17 +91,6 @@ def test_a_number_that_no_file_may_hold_makes_a_line_a_damaged_one(tmp_path):
     assert repair(tmp_path) == 1
 
 
-def test_what_an_older_version_kept_is_read(tmp_path):
-    """Without counts, with 0 for what a server does not count, and without the fields that came later."""
-    old = {name: ANSWER[name] for name in ("key", "sample_id", "purpose", "text")}
-    with Journal(tmp_path / "a_ORI.jsonl") as journal:
-        journal.append(old | {"usage": {}})
-        journal.append(old | {"key": "l", "usage": {"prompt_tokens": 0, "completion_tokens": 0}})
-    with AnswerBook(tmp_path) as book:
-        assert book.get("a_ORI", "k").reply.usage is None
-        assert book.get("a_ORI", "l").reply.usage.total == 0
-
-
 def test_an_answer_stands_in_the_journal_as_it_always_did(tmp_path):
     async def put() -> None:
         with AnswerBook(tmp_path) as book:

@@ -416,16 +416,6 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
         run(SimplifyConfig(trunk="full"), source, tmp_path / "out")
 
 
-def test_a_kill_before_the_manifest_is_made_good(tmp_path: Path):
-    source = tmp_path / "boxes_3d.json"
-    write_boxes(source, random_map(2, 50))
-    product = run(SimplifyConfig(), source, tmp_path / "out")
-    written = product.read_bytes()
-    (tmp_path / "out/manifest.json").unlink()
-    product.unlink()
-    assert run(SimplifyConfig(), source, tmp_path / "out").read_bytes() == written
-
-
 def test_a_map_below_the_ground_is_an_error(tmp_path: Path):
     source = tmp_path / "boxes_3d.json"
     write_boxes(source, box_map(("Static", (0, 0, -3), (1, 1, -1))))

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
-import signal
 import struct
-import subprocess
-import sys
-import time
 import zlib
 from dataclasses import replace
 from itertools import pairwise
@@ -398,51 +393,6 @@ def test_splits_of_nothing_are_refused():
 
 
 # --- kills, and a second run ------------------------------------------------------------------------------------------
-
-KILLED = """
-import sys
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-from test_release_build import split_cfg, source_of
-from release.package import config
-config.MB = 20_000  # many shards
-from release.package.stage import run
-run(split_cfg(), [source_of(Path({material!r}))], Path({out!r}), workers={workers})
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("has_failed_flight", [False, True])
-def test_ten_kills_leave_the_bytes_of_an_undisturbed_run(copy, tmp_path, monkeypatch, has_failed_flight):
-    from release.package import config
-
-    monkeypatch.setattr(config, "MB", 20_000)
-    whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
-    assert len(read_record(whole / "release.json").shards) > 6
-    picture = find_flights(copy / "tree")[9] / "frames_playback/frame_00005/rgb.png"
-    data = picture.read_bytes()
-    if has_failed_flight:
-        picture.write_bytes(data[:-30])
-    out = tmp_path / "killed"
-    tests = str(Path(__file__).parent)
-    script = KILLED.format(tests=tests, material=str(copy), out=str(out), workers=2)
-    started_s = time.monotonic()
-    subprocess.run(
-        [sys.executable, "-c", script.replace(repr(str(out)), repr(str(tmp_path / "timed")))],
-        capture_output=True,
-        check=False,
-    )
-    typical_s = time.monotonic() - started_s
-    rng = np.random.default_rng(7)
-    for share in np.sort(rng.uniform(0.3, 1.0, 10)):
-        process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL, start_new_session=True)
-        time.sleep(share * typical_s)
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        assert has_failed_flight <= (not (out / "dataset").exists())
-    picture.write_bytes(data)
-    assert all_bytes(run(split_cfg(), [source_of(copy)], out)) == all_bytes(whole)
 
 
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_path, monkeypatch):

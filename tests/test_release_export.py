@@ -5,12 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import multiprocessing
-import os
 import shutil
-import signal
 import tarfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,9 +33,9 @@ from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
-from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
+from release.export.contract import FORMATS, ExportConfig, Unit
 from release.export.lerobot import merged, moves, runs_of, summarize, tiff_of_depth
-from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
@@ -386,35 +382,6 @@ def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_
     assert about.coordinates["handedness"] in readme
 
 
-def _export_in_process(format: str, dataset: str, out: str) -> None:
-    export(config(format), Path(dataset), Path(out))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("format", FORMATS)
-def test_killed_at_any_moment_it_goes_on_and_gives_the_same_bytes(format, dataset, tmp_path):
-    whole = all_bytes(export(config(format), dataset, tmp_path / "whole"))
-    context = multiprocessing.get_context("spawn")
-    out = tmp_path / "out"
-    for delay_s in (0.0, 0.05, 0.15, 0.4, 0.8):
-        process = context.Process(target=_export_in_process, args=(format, str(dataset), str(out)))
-        process.start()
-        while process.is_alive() and not (out / "stage.json").exists():
-            time.sleep(0.005)
-        time.sleep(delay_s)
-        if process.is_alive():
-            os.kill(process.pid, signal.SIGKILL)
-        process.join()
-    assert all_bytes(export(config(format), dataset, out)) == whole
-
-
-def test_a_kill_between_the_last_rename_and_the_manifest(dataset, tmp_path):
-    product = export(config("webdataset"), dataset, tmp_path / "out")
-    before = all_bytes(product)
-    (tmp_path / "out/manifest.json").unlink()
-    assert all_bytes(export(config("webdataset"), dataset, tmp_path / "out")) == before
-
-
 def test_a_folder_of_something_else_is_refused(dataset, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/notes.txt").write_text("mine")
@@ -428,20 +395,6 @@ def test_a_folder_of_something_else_is_refused(dataset, tmp_path):
 def plan(release, flights, cfg):
     """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
     return [Unit(flight.name, len(flight), flights=(flight,)) for flight in flights]
-
-
-def write(release, unit, folder, cfg):
-    files, (flight,) = Files(folder), unit.flights
-    poses = [row["pose"] for row in rows_of_flight(release, flight, ["pose"])]
-    lines = [",".join(repr(value) for value in pose.values()) for pose in poses]
-    files.put(f"{unit.name.replace('/', '__')}.csv", "\n".join(lines).encode())
-    return files.written(lines=len(lines))
-
-
-def finish(release, units, written, folder, cfg):
-    files = Files(folder)
-    files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
-    return Facts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
 
 
 def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):

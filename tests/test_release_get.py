@@ -7,13 +7,9 @@ import http.server
 import io
 import json
 import logging
-import multiprocessing
-import os
 import re
 import shutil
-import signal
 import threading
-import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +37,7 @@ from release.get import stage
 from release.get.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
 from release.get.stage import NOT_ASKED_FOR, Choice
 from release.get.stage import run as get
-from release.record import content_digest, read_record
+from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree
 
@@ -265,31 +261,6 @@ def test_the_digest_that_is_expected(dataset, tmp_path):
 # --- interrupted ------------------------------------------------------------------------------------------------------
 
 
-def _get_in_process(address: str, out: str) -> None:
-    get(choice(modalities=["rgb", "instance"]), address, Path(out))
-
-
-def test_killed_it_goes_on_and_gives_the_same_bytes(dataset, tmp_path):
-    def slowly(handler, path, data):
-        time.sleep(0.03)
-
-    expected = all_bytes(get(choice(modalities=["rgb", "instance"]), str(dataset), tmp_path / "whole"))
-    context = multiprocessing.get_context("spawn")
-    with served(dataset, fault=slowly) as (server, address):
-        for least in (3, 8, 14):
-            process = context.Process(target=_get_in_process, args=(address, str(tmp_path / "out")))
-            process.start()
-            begun = len(server.asked)
-            while process.is_alive() and len(server.asked) < begun + least:
-                time.sleep(0.01)
-            if process.is_alive():
-                os.kill(process.pid, signal.SIGKILL)
-            process.join()
-        found = get(choice(modalities=["rgb", "instance"]), address, tmp_path / "out")
-    data = {name: content for name, content in all_bytes(found).items() if name.startswith("data/")}
-    assert data == {name: content for name, content in expected.items() if name.startswith("data/")}
-
-
 def test_a_finished_shard_is_not_fetched_again(dataset, tmp_path):
     last = read_record(dataset / "release.json").shards[-1].path
     lost = [last]
@@ -475,15 +446,6 @@ def retold(change):
     return changed
 
 
-def digest_again(record: dict) -> None:
-    record["content_digest"] = content_digest((s["split"], s["sha256"]) for s in record["shards"])
-    numbers: dict[str, int] = {}
-    for shard in record["shards"]:
-        number = numbers[shard["split"]] = numbers.get(shard["split"], -1) + 1
-        count = sum(other["split"] == shard["split"] for other in record["shards"])
-        shard["path"] = f"data/{shard['split']}-{record['content_digest'][:12]}-{number:05d}-of-{count:05d}.parquet"
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -624,13 +586,6 @@ def test_finished_shards_that_are_gone_are_told_of(dataset, tmp_path):
     (tmp_path / "out/manifest.json").unlink()  # as after a kill, and somebody tidied up
     with pytest.raises(CosflyError, match="finished before is missing"):
         get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
-
-
-def test_a_kill_before_the_parts_were_gone_leaves_none(dataset, tmp_path):
-    get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
-    (tmp_path / "out/parts").mkdir()
-    get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
-    assert not (tmp_path / "out/parts").exists()
 
 
 def test_what_cannot_be_opened(tmp_path):
