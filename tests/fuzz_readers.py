@@ -59,7 +59,6 @@ from cosfly.products.captions import Coc, read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection
-from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import write_meshes
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
@@ -67,7 +66,7 @@ from cosfly.products.playback import read_flight
 from cosfly.products.png import parse_png
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
-from cosfly.products.town import read_town_map, write_town_map
+from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids, read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json

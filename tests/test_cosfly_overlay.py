@@ -18,8 +18,8 @@ from cosfly.look.gallery import four_panels
 from cosfly.look.overlay import TARGET_COLOR, Overlay, _lines
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_instance, read_meta, read_rgb
-from cosfly.products.instance_ids import read_instance_ids
 from cosfly.products.playback import read_flight
+from cosfly.products.town import read_instance_ids
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig

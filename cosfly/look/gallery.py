@@ -16,9 +16,9 @@ from cosfly.look.topview import add_caption, draw_text
 from cosfly.products.boxes import BoxMap
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import DEBUG_FILE, read_instance, read_meta, read_rgb, rgb_bytes
-from cosfly.products.instance_ids import read_instance_ids
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, read_flight
+from cosfly.products.town import read_instance_ids
 from cosfly.reading.arrays import read_picture
 from cosfly.work.store import inside, write_bytes
 

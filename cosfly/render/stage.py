@@ -17,11 +17,10 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.look.overlay import Overlay
 from cosfly.products.boxes import BoxMap, check_ground, read_boxes
 from cosfly.products.frames import Look
-from cosfly.products.instance_ids import IDS_FILE, IDS_SCHEMA, IDS_VERSION
 from cosfly.products.others import Company, read_others
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.shift_draws import PERTURBED, rng_of_shifts
-from cosfly.products.town import write_town_map
+from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord

@@ -147,12 +147,6 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
 
-def is_running_child(pid: int) -> bool:
-    """Tell whether a process runs, is not stopped, and is a child of this one: after its end another may get its number."""
-    fields = _stat(pid)
-    return bool(fields) and int(fields[1]) == os.getpid() and fields[0] not in (b"Z", b"X", b"T")
-
-
 def _stat(pid: int) -> list[bytes]:
     """Read what /proc tells of a process, from its state on; empty where there is nothing."""
     try:

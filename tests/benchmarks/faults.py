@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.work.chance import rng_for
-from cosfly.work.stage_events import is_running_child, read_events
+from cosfly.work.stage_events import read_events
 from cosfly.work.worker_pool import WORDS
 
 SIGNALS = {"kill": signal.SIGKILL, "stall": signal.SIGSTOP}
@@ -30,6 +30,15 @@ class Faults:
     number: int
     seconds: float
     seed: int
+
+
+def is_running_child(pid: int) -> bool:
+    """Tell whether a process runs, is not stopped, and is a child of this one: after its end another may get its number."""
+    try:
+        state, parent, *_ = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False
+    return int(parent) == os.getpid() and state not in "ZXT"
 
 
 @contextlib.contextmanager
