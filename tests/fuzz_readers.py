@@ -69,7 +69,7 @@ from cosfly.products.roi import read_roi
 from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids, read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
-from cosfly.reading.documents import read_json
+from cosfly.reading.documents import read_json, read_model
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render.settings import RenderConfig
@@ -100,6 +100,7 @@ from distill.student import checkpoint
 from distill.student import model as student
 from distill.training.stage import taught_by
 from distill.windows import Windows
+from release import sign
 from release.export import stage as export
 from release.export.captions import export as export_captions
 from release.export.contract import ExportConfig
@@ -158,6 +159,10 @@ TEXTS = {
     "url.txt": "https://[::1]:8000/v1/chat/completions",
     "header.txt": "120",
     "reply.json": json.dumps(REPLY),
+    "signature.json": json.dumps({
+        "schema": sign.SCHEMA, "schema_version": sign.VERSION, "algorithm": "ed25519", "signed_file": "checksums.sha256",
+        "public_key": f"{'A' * 43}=", "signature": f"{'A' * 86}==",
+    }),
 }  # fmt: skip
 
 
@@ -720,6 +725,7 @@ READERS: dict[str, Reader] = {
     "depth study": Reader(PICTURES[:2], lambda root, scratch: study_depth(root / TREE / "ORI" / FRAME, scratch / "study"), share=0.2),
     "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
     "release record": _one("release/dataset/release.json", read_record),
+    "signature": _one("signature.json", lambda path: read_model(path, sign.Signature, schema=sign.SCHEMA, version=sign.VERSION, what="signature")),
     "release, verify": Reader(
         ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", "croissant.json", CHECKSUMS, "README.md"))),
         lambda root, _: _verified(root), share=0.4, hashes=True),
