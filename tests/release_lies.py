@@ -531,22 +531,6 @@ def smaller_picture(rows):
     row["image"]["bytes"] = png(cv2.resize(pixels_of(row, "image"), (row["width_px"] // 2, row["height_px"] // 2)))
 
 
-def black_picture(rows):
-    row = clean(rows)[2]
-    row["image"]["bytes"] = png(np.zeros((row["height_px"], row["width_px"], 3), np.uint8))
-
-
-def mirrored_picture(rows):
-    row = clean(rows)[2]
-    row["image"]["bytes"] = png(np.ascontiguousarray(pixels_of(row, "image")[:, ::-1]))
-
-
-def colours_swapped_red_and_blue(rows):
-    """In one frame: the brightness of everything stays nearly what it was."""
-    row = clean(rows)[2]
-    row["image"]["bytes"] = png(np.ascontiguousarray(pixels_of(row, "image")[..., ::-1]))
-
-
 def one_picture_in_two_rows(rows):
     own = clean(rows)
     own[9]["image"] = copy.deepcopy(own[2]["image"])
@@ -617,23 +601,6 @@ def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
     return dict(zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, edges), strict=True))
 
 
-def picture_shifted(rows):
-    pixels = pixels_of(middle(rows), "image")
-    set_colours(middle(rows), np.roll(pixels, 2, axis=1))
-
-
-def person_painted_out_of_the_colours(rows):
-    """Each row of the person is filled between what stands beside it."""
-    row = seen(rows)[len(seen(rows)) // 2]
-    pixels, (_, ids) = pixels_of(row, "image"), ids_in(row)
-    for y, places in enumerate(np.flatnonzero(line) for line in ids == 65535):
-        if len(places):
-            left, right = max(places[0] - 1, 0), min(places[-1] + 1, row["width_px"] - 1)
-            share = np.linspace(0.0, 1.0, right - left + 1)[:, None]
-            pixels[y, left : right + 1] = pixels[y, left] * (1.0 - share) + pixels[y, right] * share
-    set_colours(row, pixels)
-
-
 def noise_in_one_depth(rows):
     depth = depth_of(middle(rows))
     noise = np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
@@ -642,20 +609,6 @@ def noise_in_one_depth(rows):
 
 def visibility_a_little_lower(rows):
     next(row for row in clean(rows) if row["visibility"] > 0.5)["visibility"] -= 0.05
-
-
-def grey_picture(rows):
-    pixels = pixels_of(middle(rows), "image")
-    set_colours(middle(rows), np.repeat(pixels.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8))
-
-
-def blurred_picture(rows):
-    import cv2
-
-    pixels = pixels_of(middle(rows), "image")
-    height, width = pixels.shape[:2]
-    small = cv2.resize(pixels, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
-    set_colours(middle(rows), cv2.resize(small, (width, height)))
 
 
 def picture_that_one_sees_through(rows):
@@ -769,29 +722,34 @@ def question_that_looks_ahead(rows):
         row["system_en"] += " The frames that follow are shown too."
 
 
-def flight_through_a_lossy_coding(rows):
-    import cv2
-
-    for row in clean(rows):
-        packed = cv2.imencode(".jpg", pixels_of(row, "image")[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
-        set_colours(row, cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
-
-
 def depth_in_centimetres_called_lossless(rows):
     for row in clean(rows):
         depth = depth_of(row)
         set_depth(row, np.round(depth, 2).astype(np.float32))
 
 
-def red_and_blue_of_a_flight_exchanged(rows):
-    for row in perturbed(rows):
-        set_colours(row, pixels_of(row, "image")[..., ::-1])
-
-
 def ids_in(row: Row) -> tuple[np.ndarray, np.ndarray]:
     """The mask of a row, and of each pixel the id."""
     pixels = pixels_of(row, "instance")
     return pixels, pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
+
+
+def change_depth(rows: list[Row], share: float, off_m: float = 0.0) -> None:
+    for row in rows:
+        depth = depth_of(row)
+        set_depth(row, np.where(depth < 999, np.minimum(depth * share + off_m, 998.0), depth).astype(np.float32))
+
+
+def depth_scaled_by_a_fiftieth(rows):
+    change_depth(rows, 1.02)
+
+
+def depth_set_off(rows):
+    change_depth(rows, 1.0, 0.3)
+
+
+def depth_of_a_flight_scaled(rows):
+    change_depth(clean(rows), 1.02)
 
 
 def thing_farther_in_one_frame(rows):
@@ -840,13 +798,10 @@ LIES: dict[str, tuple[Lie, bool]] = {
             world_turned, colours_of_neighbours_exchanged, colours_of_two_flights_exchanged, depth_of_neighbours_exchanged,
             instances_of_neighbours_exchanged, instances_exchanged_with_their_boxes, depth_doubled, depth_doubled_but_at_the_person,
             depth_not_a_number, distance_along_the_ray, depth_in_centimetres, empty_instances, person_painted_over,
-            person_without_an_instance_of_a_person, jpeg_under_a_png_name, smaller_picture, black_picture, mirrored_picture,
-            colours_swapped_red_and_blue, one_picture_in_two_rows, other_visibility, grey_picture, blurred_picture,
-            picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
+            person_without_an_instance_of_a_person, jpeg_under_a_png_name, smaller_picture, one_picture_in_two_rows, other_visibility, picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
             frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
-            second_person_far_away, ids_of_things_exchanged, flight_through_a_lossy_coding, depth_in_centimetres_called_lossless, red_and_blue_of_a_flight_exchanged,
-            picture_shifted, noise_in_one_depth, person_painted_out_of_the_colours, visibility_a_little_lower,
-            thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
+            second_person_far_away, ids_of_things_exchanged, depth_in_centimetres_called_lossless, noise_in_one_depth, visibility_a_little_lower,
+            depth_scaled_by_a_fiftieth, depth_set_off, depth_of_a_flight_scaled, thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
         )),
     )
     for lie in lies

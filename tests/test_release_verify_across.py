@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 
 import numpy as np
@@ -10,19 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from release.columns import POSE
 from release.verify import across
 from release.verify.across import COMPARED, NO_SECOND, RowFiles, Summary, check_across
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
-from release.verify.scene import NOTHING_SHOWN
 
 
 def flight(number: int, num_rows: int, **told) -> Summary:
     values = {
         "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train", "walk": str(number), "pair": None,
         "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [], "frames_digest": "",
-        "way_digest": "", "kinds": [], "look": [], "strays": False, "sky": "[]", "kept_places_m": [],
+        "way_digest": "", "kinds": [], "grounds_m": [],
     }  # fmt: skip
     return Summary(**(values | told))
 
@@ -137,52 +133,11 @@ def test_a_thing_is_of_one_kind_in_all_flights_of_a_runs_town(tmp_path):
     assert told_of([flight(1, 1, kinds=[building]), elsewhere], tmp_path) == []
 
 
-LOOK = [5.0, 4.0, 1.8, -12.3, 140.0]  # colourful, sharp, red, blue, brightness
-
-
 @pytest.mark.parametrize(
-    ("told", "is_found"),
-    [
-        ({}, False),
-        ({"look": [5.0, 4.0, -12.3, 1.8, 140.0]}, True),
-        ({"look": [5.0, 4.0, 1.5, -11.0, 140.0]}, False),
-        ({"look": [5.0, 4.0, 1.8, -12.3, 136.0]}, True),
-        ({"look": [5.0, 4.0, 1.8, -12.3, 138.0]}, False),
-        ({"look": [4.2, 4.0, 1.8, -12.3, 140.0]}, True),
-        ({"look": [5.0, 4.8, 1.8, -12.3, 140.0]}, True),
-        ({"look": [5.0, 4.3, 1.8, -12.3, 140.0]}, False),
-    ],
+    ("off_m", "num_frames", "is_found"), [(0.0, 9, False), (0.01, 9, False), (-0.4, 9, True), (-0.4, 4, False)]
 )
-@pytest.mark.parametrize(
-    "excuse", [{}, {"sky": '["night"]'}, {"frames_digest": "of others"}, {"is_foreign": True}, {"strays": True}]
-)
-def test_twins_look_the_same_under_one_sky(tmp_path, told, is_found, excuse):
-    one, other = flight(1, 40, look=LOOK), flight(1, 40, rows_file="2.rows", track="perturbed", look=LOOK)
-    one.pair, other.name = "run/Town01/trajectory_1/aug_001", "run/Town01/trajectory_1/aug_001"
-    other = Summary(**(vars(other) | {"pair": one.name} | told | excuse))
-    assert told_of([one, other], tmp_path) == ["scene_colour"] * (is_found and not excuse)
-
-
-@pytest.mark.parametrize(
-    ("offset", "strays"),
-    [
-        ({}, False),
-        ({"x_m": 3.0, "y_m": -3.0, "z_m": 3.0, "yaw_deg": -5.0}, False),  # the defaults, in a cube
-        ({"x_m": 6.0}, True),
-        ({"pitch_deg": -20.0}, True),
-        ({"x_m": math.inf}, True),
-        (None, False),
-    ],
-)
-def test_a_flight_that_sees_other_places_than_its_twin_strays(tmp_path, offset, strays):
-    offsets = [dict.fromkeys(POSE, 0.0), None if offset is None else dict.fromkeys(POSE, 0.0) | offset]
-    rows = [{"frame_index": k, "time_s": 0.5 * k, "drone_offset": one} for k, one in enumerate(offsets)]
-    told = across.summary_of(FlightRows("run/Town01/a/aug_001", rows), NOTHING_SHOWN, RowFiles(tmp_path), "1.rows")
-    assert told.strays == strays
-
-
-def test_a_few_frames_tell_little_of_brightness(tmp_path):
-    one, other = flight(1, 36, look=LOOK), flight(1, 36, rows_file="2.rows", track="perturbed")
-    one.pair, other.name = "run/Town01/trajectory_1/aug_001", "run/Town01/trajectory_1/aug_001"
-    other = Summary(**(vars(other) | {"pair": one.name, "look": [5.0, 5.0, 1.8, -12.3, 136.0]}))
-    assert told_of([one, other], tmp_path) == []
+def test_twins_stand_on_one_ground(tmp_path, off_m, num_frames, is_found):
+    one = flight(1, 1, pair="run/Town01/trajectory_1/aug_001", grounds_m=[(k, -0.06) for k in range(20)])
+    other = flight(2, 1, name=one.pair, track="perturbed", walk="1", pair=one.name)
+    other.grounds_m = [(2 * k, -0.06 + off_m) for k in range(num_frames)]
+    assert told_of([one, other], tmp_path) == ["ground"] * is_found

@@ -34,7 +34,7 @@ class Jumps:
         """Take the next frame, which has depth."""
         flight = self.flight
         pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
-        view = View(picture.depth, picture.instance, None, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+        view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
         if self._before is not None and i - self._before[0] <= NEAR_FRAMES:
             k, before = self._before
             intrinsics = [flight.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes
 from release.verify.findings import Findings
 from release.verify.motion import clean_positions
-from release.verify.places import Kept, check_places, packed
 from release.verify.rows import FlightRows
 from release.verify.scene import Shown
 
@@ -33,13 +31,7 @@ CELL_M = 0.35  # people in one cell are nearer than the 0.5 m within which fligh
 LEAST_SECONDS, LEAST_PLACES, WALK_SHARE = 8, 16, 0.7
 PLACE_M = 0.01  # two people on one pavement step on the same centimetre by chance, not again and again
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
-# Grey levels between twins, of red and blue and of brightness (honest 0.7 and 0.7), and how many times as colourful and as sharp the pictures of one may
-# be (honest 1.05); frames of a flight, for a mean to say something: of 36 honest ones twins were 1.3 grey levels and 1.08 times off.
-HUE_MOST, SHADE_MOST, TIMES_MOST, LEAST_FRAMES = 6.0, 3.0, 1.15, 40
-# How far a perturbed flight may be moved and turned for its pictures to be of one place with the clean one's: as far as the perturbation's
-# defaults go, in a ball or a cube. Honest twins of 6 m and 20 degrees were 5.7 grey levels and 1.24 times off.
-MOVED_MOST_M, TURNED_MOST_DEG = 5.2, 5.01
-SKY = ("weather", "time_of_day", "weather_params", "look")
+GROUND_MOST_M, LEAST_GROUNDS = 0.05, 5  # between twins: rounding of depth as float16; frames, for a median
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
 ROWS_AT_ONCE = 40_000
 NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
@@ -54,9 +46,8 @@ FLIGHT = np.dtype([("flight", "i8"), ("row", "i8")])
 @dataclass
 class Summary:
     """What is kept of a flight to compare it with others. rows_file: of its rows. frames_digest: of the indices of its frames, the first three
-    of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none. kinds, look: as Shown has
-    them; strays: it is moved or turned farther from its plan than MOVED_MOST_M and TURNED_MOST_DEG; sky: what its first row says of weather
-    and light; kept_places_m: where the person is in the frames that are kept (`places.py`)."""
+    of which are first_frames; way_digest: of its poses, "" where these do not move; walk: None where the format has none. kinds, grounds_m: as
+    Shown has them."""
 
     name: str
     rows_file: str
@@ -71,10 +62,7 @@ class Summary:
     frames_digest: str
     way_digest: str
     kinds: list[int]
-    look: list[float]
-    strays: bool
-    sky: str
-    kept_places_m: list[list[float]]
+    grounds_m: list[tuple[int, float]]
 
     def dumped(self) -> dict[str, Any]:
         return dict(vars(self))
@@ -99,22 +87,14 @@ def summary_of(flight: FlightRows, shown: Shown, rows: RowFiles, rows_file: str)
     if shown.keys:
         found["image"][: len(shown.keys)], found["depth"][: len(shown.keys)] = np.array(shown.keys, np.uint64).T
     rows.write(rows_file, found)
-    rows.write_kept(rows_file, [frame for _, frame in shown.kept])
     way = np.round(pose, 4) + 0.0
     return Summary(
         name=flight.name, rows_file=rows_file, split=first.get("split"), walk=str(first["walk"]) if "walk" in first else None, pair=first.get("pair"),
         track=first.get("track"), town=str(first.get("town")), is_foreign=flight.is_foreign, num_rows=len(flight),
         first_frames=flight.index[:3].tolist(), frames_digest=frames_digest(flight.index),
         way_digest=hashlib.sha256(way.tobytes()).hexdigest() if (way != way[0]).any() else "",
-        kinds=shown.kinds, look=shown.look, strays=_strays(flight), sky=json.dumps([flight.rows[0].get(name) for name in SKY]),
-        kept_places_m=[flight.target_m[i, :2].tolist() for i, _ in shown.kept],
+        kinds=shown.kinds, grounds_m=shown.grounds_m,
     )  # fmt: skip
-
-
-def _strays(flight: FlightRows) -> bool:
-    is_moved = np.linalg.norm(flight.drone_offset[:, :3], axis=1) > MOVED_MOST_M
-    is_turned = np.abs(flight.drone_offset[:, 3:]) > TURNED_MOST_DEG
-    return bool(is_moved.any() or is_turned.any())
 
 
 def frames_digest(indices: np.ndarray) -> str:
@@ -137,12 +117,6 @@ class RowFiles:
 
     def read(self, name: str) -> np.ndarray:
         return np.frombuffer(read_bytes(self.folder / name, tree=self.folder), COMPARED)
-
-    def write_kept(self, name: str, frames: list[Kept]) -> None:
-        write_bytes(self.folder / f"{name}.kept", packed(frames))
-
-    def read_kept(self, name: str) -> bytes:
-        return read_bytes(self.folder / f"{name}.kept", tree=self.folder)
 
     def groups(self, flights: list[Summary], column: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the rows that have one value of a column, two or more, in the order of flights and rows; zero and NO_SECOND are no values.
@@ -184,8 +158,7 @@ def check_across(flights: list[Summary], rows: RowFiles, *, by_town: bool, both:
     _check_pairs({flight.name: flight for flight in flights}, both, findings)
     _check_copies(flights, findings)
     _check_kinds(flights, findings)
-    check_places(flights, rows, findings)
-    _check_looks({flight.name: flight for flight in flights}, findings)
+    _check_grounds({flight.name: flight for flight in flights}, findings)
     for column in ("image", "depth"):
         _check_pictures(flights, rows, column, findings)
 
@@ -322,26 +295,17 @@ def _check_kinds(flights: list[Summary], findings: Findings) -> None:
                 findings.error("instance_kind", flight.name, f"instance {own} of kind {kind}", f"kind {known}, as in {other}")  # fmt: skip
 
 
-def _check_looks(flights: Mapping[str, Summary], findings: Findings) -> None:
-    """Twins see one place under one sky, in about the same colours, as bright and as sharp."""
+def _check_grounds(flights: Mapping[str, Summary], findings: Findings) -> None:
+    """In frames in which the person of both twins stands at one place the ground there is equally high in both."""
     for flight in flights.values():
         twin = flights.get(flight.pair or "")
-        if twin is None or flight.track == "clean" or flight.strays or not (flight.look and twin.look) or (flight.sky, flight.frames_digest) != (twin.sky, twin.frames_digest):  # fmt: skip
+        if twin is None or flight.track == "clean":
             continue
-        where = f"{flight.name} and {twin.name}"
-        red, blue, shade = np.abs(np.subtract(flight.look, twin.look))[2:].tolist()
-        if max(red, blue) > HUE_MOST and not flight.is_foreign:
-            got = f"red and blue {max(red, blue):.1f} grey levels off, on the mean of all frames"
-            findings.error("scene_colour", where, got, f"at most {HUE_MOST:g} between twins")
-        if flight.num_rows < LEAST_FRAMES or flight.is_foreign:
-            continue
-        if shade > SHADE_MOST:
-            got = f"one {shade:.1f} grey levels brighter than the other, on the mean of all frames"
-            findings.error("scene_colour", where, got, f"at most {SHADE_MOST:g} between twins")
-        for name, own, others in zip(("colourful", "sharp"), flight.look[:2], twin.look[:2], strict=True):
-            if max(own, others) > TIMES_MOST * min(own, others):
-                got = f"one {max(own, others) / max(min(own, others), 1e-9):.2f} times as {name} as the other, on the mean of all frames"
-                findings.error("scene_colour", where, got, f"at most {TIMES_MOST:g} times between twins")
+        others = dict(twin.grounds_m)
+        off_m = [height - others[index] for index, height in flight.grounds_m if index in others]
+        if len(off_m) >= LEAST_GROUNDS and abs(median := float(np.median(off_m))) > GROUND_MOST_M:
+            got = f"ground at the person's feet that is {abs(median):.2f} m {'higher' if median > 0 else 'lower'}"
+            findings.error("ground", f"{flight.name} and {twin.name}", got, f"the same within {GROUND_MOST_M:g} m")
 
 
 def _check_pictures(flights: list[Summary], rows: RowFiles, column: str, findings: Findings) -> None:

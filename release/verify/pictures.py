@@ -8,46 +8,39 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values, grid_rows
+from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import Png, parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.space.reprojection import View, median_of
+from cosfly.space.reprojection import FLAT, View, median_of
 from release.columns import PICTURES
 from release.depth import depth_of
 from release.record import DepthCoding
 from release.verify.findings import Findings
-from release.verify.person import outline_step
-from release.verify.pixels import Survey, bend_of, depths_of_person, edges_of, rays_to_person, survey
+from release.verify.pixels import Survey, depths_of_person, rays_to_person, survey
 from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
-BLANK_STD = 2.0  # grey levels: a picture of one colour has 0, fog over a street more than 5
 MOST_RAYS, LEAST_RAYS = 900, 30  # through the box of a person: the score is a share of them
 # Of the visibility. Where a ray goes through each pixel of the box it is the renderer's own number: honest 0.000, of depth as float16 0.002.
 # Of fewer rays, three deviations of a share of so many; honest 0.021.
 SCORE, SCORE_OF_FEWER = 0.02, 0.06
-# How much more colours may change beside the mask's edges than at them, and how sure that must be: honest 1.05 in 11,286 frames, 0.3 deviations.
-RIVAL_MOST, RIVAL_DEVIATIONS = 1.15, 4.0
-# Of surfaces that are planes; honest 0.0001 of float16. Noise of 0.3 % makes 0.0047, of 1 % 0.016.
-BEND_MOST = 0.002
 STEP_PIXELS = 20_000  # of a frame
 PERSON, MOST_KIND = KINDS["Pedestrians"], max(KINDS.values())
 PERSON_HALF_M = np.array(PERSON_HALF_EXTENTS_M)
 NOTHING = np.empty((0, 0), np.float32)
 NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
-# Depth, instance, colours at the grid's rows, `outline_step`.
-Decoded = tuple[np.ndarray, np.ndarray, np.ndarray | None, float]
+Decoded = tuple[np.ndarray, np.ndarray]  # depth, instance
+BESIDE_M, BESIDE_PX, LEAST_GROUND = 0.6, 60, 12  # from the feet; columns and rows that are looked at; pixels of ground
 
 
 def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, findings: Findings) -> Decoded | None:  # fmt: skip
     """Unpack the pictures of a row; None, with findings, where one is not a whole picture of the row's size."""
     width, height = (int(n) for n in flight.size_px[i])
     found: dict[FrameFile, np.ndarray] = {}
-    colours: Png | None = None
     for file, data in files.items():
         where = flight.where(i, PICTURES[file].name)
         try:
@@ -67,8 +60,8 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
                     raise InputError("not a colour picture", got=f"{png.channels} channels")
                 _check_cargo(flight, png, where, findings)
                 if file == "rgb":
-                    colours, found[file] = png, png.rows(grid_rows(png.height_px))
-                    if png.channels == 4 and (found[file][..., 3] != 255).any():
+                    found[file] = png.lines
+                    if png.channels == 4 and (png.pixels()[..., 3] != 255).any():
                         findings.error("blank", where, "pixels that one sees through", "a picture that hides what is behind it")  # fmt: skip
                 else:
                     found[file] = np.ascontiguousarray(png.pixels()[..., :3])
@@ -80,10 +73,7 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
             found.pop(file)
     if len(found) < len(files):
         return None
-    instance, step = found.get("instance", NO_IDS), np.nan
-    if colours is not None and instance.size and not flight.is_foreign:
-        step = outline_step(colours, instance, flight.mask_box[i])
-    return found.get("depth", NOTHING), instance, found.get("rgb"), step
+    return found.get("depth", NOTHING), found.get("instance", NO_IDS)
 
 
 def _check_cargo(flight: FlightRows, png: Png, where: str, findings: Findings) -> None:
@@ -95,32 +85,22 @@ def _check_cargo(flight: FlightRows, png: Png, where: str, findings: Findings) -
 
 
 def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
-    depth, instance, colours, _ = decoded
+    depth, instance = decoded
     rotation = flight.rotations[i] @ BODY_FROM_CAMERA
-    return View(depth, instance, colours, np.ascontiguousarray(rotation), flight.pose[i, :3].copy())
+    return View(depth, instance, np.ascontiguousarray(rotation), flight.pose[i, :3].copy())
 
 
-def check_picture(flight: FlightRows, i: int, decoded: Decoded, deviation: float, findings: Findings) -> bool:
-    """Check depth, mask and colours of a row with each other and with the row; False where the depth is no depth.
-
-    Args:
-        deviation: of the colours, grey levels; NaN where there are none.
-    """
-    depth, instance, colours, _ = decoded
+def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findings) -> bool:
+    """Check depth and mask of a row with each other and with the row; False where the depth is no depth."""
+    depth, instance = decoded
     found = survey(depth, instance)
-    if deviation < BLANK_STD:
-        findings.error("blank", flight.where(i, "image"), f"standard deviation {deviation:.2f}", "a picture")
     good = not depth.size or _check_depth(flight, i, found.low_m, found.high_m, findings)
     if instance.size:
         _check_instance(flight, i, instance, found, bool(depth.size), findings)
         if depth.size and good:
             _check_person_depth(flight, i, instance, depth, findings)
-    if depth.size and instance.size and good and not flight.is_foreign:
-        _check_visibility(flight, i, instance, depth, findings)
-        if (bend := bend_of(depth, instance)) > BEND_MOST:
-            findings.error("depth", flight.where(i, "depth"), f"surfaces that bend by {bend:.2%} from pixel to pixel", f"at most {BEND_MOST:.1%}: planes, without noise")  # fmt: skip
-    if colours is not None and instance.size and not flight.is_foreign:
-        _check_edges(flight, i, colours, instance, findings)
+            if not flight.is_foreign:
+                _check_visibility(flight, i, instance, depth, findings)
     return good
 
 
@@ -204,13 +184,34 @@ def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: n
         findings.error("visibility", flight.where(i, "visibility"), f"{score:.2f}", f"{share:.2f}, of the depth image")
 
 
-def _check_edges(flight: FlightRows, i: int, colours: np.ndarray, instance: np.ndarray, findings: Findings) -> None:
-    """Colours change where the mask does, and not as much two pixels beside it."""
-    edges = edges_of(colours, instance)
-    if edges is not None and edges.rival > RIVAL_MOST and edges.deviations > RIVAL_DEVIATIONS:
-        right, down = edges.shift_px
-        got = f"colours that change {edges.rival:.1f} times as much {right} px right and {down} px below the mask's edges as at them"
-        findings.error("edges", flight.where(i, "image"), got, f"at most {RIVAL_MOST:g} times: colours and mask of one picture")  # fmt: skip
+def ground_beside(flight: FlightRows, i: int, depth: np.ndarray, instance: np.ndarray) -> float:
+    """Give how far the ground that is drawn round the person's feet lies above them, m; NaN where too little of it is seen.
+
+    Of a kerb the half that is nearer counts: a person walks on either.
+
+    Args:
+        depth: (h, w) float32 m, along the optical axis; instance: (h, w, 3) uint8.
+    """
+    feet = flight.target_m[i] - [0.0, 0.0, PERSON_HALF_EXTENTS_M[2]]
+    rotation, (fx, fy, cx, cy) = flight.rotations[i] @ BODY_FROM_CAMERA, flight.intrinsics[i]
+    x, y, z = rotation.T @ (feet - flight.pose[i, :3])
+    if not (np.isfinite(z) and z > 0.0):
+        return np.nan
+    (height, width), u, v = depth.shape, fx * x / z + cx, fy * y / z + cy
+    reach_px = min(BESIDE_PX, int(np.ceil(fx * BESIDE_M / z)) + 1)
+    x0, x1 = np.clip([u - reach_px, u + reach_px + 1], 0, width).astype(int)
+    y0, y1 = np.clip([v - reach_px, v + reach_px + 1], 0, height).astype(int)
+    part, seen = np.s_[y0:y1, x0:x1], depth[y0:y1, x0:x1].astype(np.float64)
+    columns, rows = np.meshgrid((np.arange(x0, x1) + 0.5 - cx) / fx, (np.arange(y0, y1) + 0.5 - cy) / fy)
+    points = np.stack([columns, rows, np.ones_like(seen)], axis=-1) * seen[..., None]
+    is_slab = FLAT[instance[part][..., 0]] & (instance[part][..., 1:] != 0).any(
+        axis=-1
+    )  # the plane below everything has no id
+    heights_m = (points @ rotation[2] + flight.pose[i, 2] - feet[2])[is_slab]
+    if len(heights_m) < LEAST_GROUND:
+        return np.nan
+    low, high = np.percentile(heights_m, [25, 75])
+    return float(np.clip(0.0, low, high))
 
 
 def least_step(depth: np.ndarray) -> float:

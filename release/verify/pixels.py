@@ -1,4 +1,4 @@
-"""What each picture of a release is measured by, compiled: every pixel of mask and depth, some rows of the colours, rays to the person."""
+"""What each picture of a release is measured by, compiled: every pixel of mask and depth, rays to the person."""
 
 from __future__ import annotations
 
@@ -6,24 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.products.frames import GRID_ROWS, SKY_DEPTH_M, grid_rows
+from cosfly.products.frames import GRID_ROWS, SKY_DEPTH_M
 from cosfly.products.kinds import KINDS
-from cosfly.space.reprojection import COLUMNS, median_of
+from cosfly.space.reprojection import COLUMNS
 from cosfly.work.compiled import njit
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
 SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
 NUM_IDS = 65536
 PERSON, SKY = KINDS["Pedestrians"], KINDS["Sky"]
-BLOCK_PX = 8  # of JPEG, WebP and videos
-MOVED_PX = 4  # how far to each side edges of the mask are laid over the colours
-LEAST_EDGES, MOST_STEP = (
-    30,
-    120,
-)  # edges, for their mean to say something; grey levels of three channels, of which more count no more
-EIGHT_PIXELS = 24  # bytes of a mask's row that are looked at at once
-BEND_EVERY, LEAST_BENDS = 4, 200  # pixels of a row; points, for their median to say something
-LOOK_EVERY = 3  # of the rows that are unpacked, and of the columns
 NEAR_M = 0.3  # where rays begin: the renderers' near plane
 SURFACE_SLACK_M = 0.05  # how far before a person's box what is drawn may lie and not hide it
 # Numbers of a float's bits are ordered as floats above 0 are, and compared several at once, as no bits are not a number.
@@ -64,77 +55,6 @@ def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
         limits = [np.nan, np.nan]
     num_odd_sky, num_person, num_odd_person, most_kind = counts[2:].tolist()
     return Survey(limits[0], limits[1], num_odd_sky, num_person, num_odd_person, most_kind, box)
-
-
-def look_of(colours: np.ndarray) -> np.ndarray:
-    """Tell how a picture looks, (8,) grey levels.
-
-    How colourful and how sharp it is: how far channels lie from their mean, and pixels from the next. How far pixels lie from the next over
-    edges of blocks of 8 px, which lossy codings pack apart, and elsewhere. Red and blue less green. Mean and deviation of all its numbers.
-
-    Args:
-        colours: (k, w, 3 or 4) uint8, some of its rows.
-    """
-    hue, grey, (red, green, blue), (total, squares) = _look(colours)
-    height, width = colours.shape[:2]
-    num_rows, num_numbers = -(-height // LOOK_EVERY), height * width * 3
-    steps = grey / (3.0 * num_rows)
-    edges = steps[BLOCK_PX - 1 :: BLOCK_PX]
-    inside = (steps.sum() - edges.sum()) / max(len(steps) - len(edges), 1)
-    num_pixels, num_hues = num_rows * width, num_rows * -(-width // LOOK_EVERY) * 3
-    brightness = total / num_numbers
-    spread = np.sqrt(max(squares / num_numbers - brightness**2, 0.0))
-    over = edges.mean() if len(edges) else np.nan
-    tint = (red - green) / num_pixels, (blue - green) / num_pixels
-    sharp = steps.mean() if len(steps) else np.nan
-    return np.array([hue / (3.0 * num_hues), sharp, over, inside, *tint, brightness, spread])
-
-
-class Edges(NamedTuple):
-    """How much colours change where the mask does. num: edges of the mask in the rows of the colours; rival: change at edges that were moved by
-    two pixels and more, where it is greatest, to that at the edges themselves; deviations: how sure the difference of both is; shift_px: of
-    the rival, to the right and down."""
-
-    num: int
-    rival: float
-    deviations: float
-    shift_px: tuple[int, int]
-
-
-def edges_of(colours: np.ndarray, instance: np.ndarray) -> Edges | None:
-    """Lay the edges of a mask over the colours, as they are and moved by up to 4 px to the sides and 2 px up or down.
-
-    Args:
-        colours: (k, w, 3 or 4) uint8, the first k of the grid's rows; instance: (h, w, 3) uint8.
-    Returns:
-        None where there are fewer than LEAST_EDGES of them.
-    """
-    rows = grid_rows(len(instance))[: len(colours)]
-    sums, squares, counts = _edge_steps(colours, instance, rows)
-    here = counts[1]
-    if here < LEAST_EDGES:
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        means = sums / counts[:, None]
-        errors = (squares / counts[:, None] - means**2) / counts[:, None]
-    own, error = means[1, MOVED_PX], errors[1, MOVED_PX]
-    means[1, MOVED_PX - 1 : MOVED_PX + 2] = 0.0  # a pixel on an edge may be of both sides
-    means[counts < LEAST_EDGES] = 0.0
-    up, side = np.unravel_index(int(means.argmax()), means.shape)
-    deviation = float(np.sqrt(max(error + errors[up, side], 1e-12)))
-    shift_px = int(side) - MOVED_PX, 2 * (1 - int(up))
-    return Edges(int(here), float(means[up, side] / max(own, 1e-9)), float((means[up, side] - own) / deviation), shift_px)  # fmt: skip
-
-
-def bend_of(depth: np.ndarray, instance: np.ndarray) -> float:
-    """Tell how far surfaces are from planes: of points whose neighbours to the left and right are of the same thing, the median of how far one over
-    depth, which is linear on a plane, is from the mean of both, as a share of it twice. NaN: fewer than LEAST_BENDS points.
-
-    Args:
-        depth: (h, w) float32; instance: (h, w, 3) uint8.
-    """
-    bends = _bends(depth, instance, grid_rows(len(depth)))
-    return median_of(bends) if len(bends) >= LEAST_BENDS else np.nan
 
 
 def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
@@ -183,111 +103,6 @@ def _survey(bits, mask, kinds_alone):  # type: ignore[no-untyped-def]
                     box[0], box[1] = min(box[0], x), min(box[1], y)
                     box[2], box[3] = max(box[2], x + 1), max(box[3], y + 1)
     return np.array([low, high, num_odd_sky, num_person, num_odd_person, np.int64(most_kind)]), box
-
-
-@njit(cache=True, nogil=True)
-def _look(colours):  # type: ignore[no-untyped-def]
-    """Of some rows sums of three times the hue, of three times the step from each column to the next (w - 1,), and of the channels (3,); of
-    all rows those of all numbers and of their squares (2,)."""
-    height, width = colours.shape[:2]
-    hue, channels, numbers = np.int64(0), np.zeros(3, np.int64), np.zeros(2, np.int64)
-    steps, grey = np.zeros(max(width - 1, 0), np.int64), np.zeros(width, np.int64)
-    for y in range(height):
-        for x in range(width):
-            red, green, blue = np.int64(colours[y, x, 0]), np.int64(colours[y, x, 1]), np.int64(colours[y, x, 2])
-            numbers[0] += red + green + blue
-            numbers[1] += red * red + green * green + blue * blue
-            if y % LOOK_EVERY == 0:
-                channels[0] += red
-                channels[1] += green
-                channels[2] += blue
-                grey[x] = red + green + blue
-                if x % LOOK_EVERY == 0:
-                    hue += abs(3 * red - grey[x]) + abs(3 * green - grey[x]) + abs(3 * blue - grey[x])
-        if y % LOOK_EVERY == 0:
-            for x in range(width - 1):
-                steps[x] += abs(grey[x + 1] - grey[x])
-    return hue, steps, channels, numbers
-
-
-@njit(cache=True, nogil=True)
-def _bends(depth, instance, rows):  # type: ignore[no-untyped-def]
-    """Of each BEND_EVERYth pixel of some rows what `bend_of` says, (k,)."""
-    width = depth.shape[1]
-    found, num = np.empty(len(rows) * (width // BEND_EVERY + 1)), 0
-    for row in rows:
-        for x in range(1, width - 1, BEND_EVERY):
-            is_one = True
-            for c in range(3):
-                own = instance[row, x, c]
-                is_one &= instance[row, x - 1, c] == own and instance[row, x + 1, c] == own
-            left, here, right = float(depth[row, x - 1]), float(depth[row, x]), float(depth[row, x + 1])
-            if is_one and min(left, here, right) > 0.0 and here < SKY_DEPTH_M:
-                found[num] = abs(here / left - 2.0 + here / right)
-                num += 1
-    return found[:num]
-
-
-@njit(cache=True, nogil=True)
-def _edge_steps(colours, instance, rows):  # type: ignore[no-untyped-def]
-    """Steps of colours beside edges of the mask 2 rows above, in and 2 rows below each row: sums and sums of squares (3, 2 * MOVED_PX + 1) by how
-    far to the right of the edge they are, and numbers of edges (3,)."""
-    height, width = instance.shape[:2]
-    sums, squares = np.zeros((3, 2 * MOVED_PX + 1)), np.zeros((3, 2 * MOVED_PX + 1))
-    counts, steps = np.zeros(3, np.int64), np.zeros(max(width - 1, 0))
-    num_bytes = 3 * max(width - 1, 0)
-    changes = np.zeros(-(-num_bytes // EIGHT_PIXELS) * EIGHT_PIXELS, np.uint8)
-    words = changes.view(np.uint64)
-    for j in range(len(rows)):
-        for x in range(width - 1):
-            step = np.int64(0)
-            for c in range(3):
-                step += abs(np.int64(colours[j, x + 1, c]) - np.int64(colours[j, x, c]))
-            steps[x] = min(step, MOST_STEP)
-        for k in range(3):
-            row = rows[j] + 2 * (k - 1)
-            if row < 0 or row >= height:
-                continue
-            mask = instance[row].reshape(3 * width)
-            for b in range(num_bytes):
-                changes[b] = mask[b] ^ mask[b + 3]
-            for w in range(0, len(words), 3):
-                if words[w] | words[w + 1] | words[w + 2] == 0:
-                    continue
-                for x in range(max(w // 3 * 8, MOVED_PX), min(w // 3 * 8 + 8, width - 1 - MOVED_PX)):
-                    if changes[3 * x] | changes[3 * x + 1] | changes[3 * x + 2] == 0:
-                        continue
-                    counts[k] += 1
-                    for side in range(2 * MOVED_PX + 1):
-                        step_there = steps[x + side - MOVED_PX]
-                        sums[k, side] += step_there
-                        squares[k, side] += step_there * step_there
-    return sums, squares, counts
-
-
-@njit(cache=True, nogil=True)
-def outline_of(colours, instance, rows, begin, end):  # type: ignore[no-untyped-def]
-    """Look along some rows for the person's outline.
-
-    Args:
-        colours: (k, w, 3 or 4) uint8, those rows; instance: (h, w, 3) uint8; rows: (k,) int64; begin, end: columns between which is looked.
-    Returns:
-        the sum of the steps of colours from pixel to pixel there, grey levels of three channels, and how many they are.
-    """
-    total, num = np.int64(0), np.int64(0)
-    for j in range(len(rows)):
-        mask = instance[rows[j]]
-        for x in range(begin, end - 1):
-            is_here = mask[x, 1] == PERSON_ID & 255 and mask[x, 2] == PERSON_ID >> 8
-            is_next = mask[x + 1, 1] == PERSON_ID & 255 and mask[x + 1, 2] == PERSON_ID >> 8
-            if is_here == is_next:
-                continue
-            step = np.int64(0)
-            for c in range(3):
-                step += abs(np.int64(colours[j, x + 1, c]) - np.int64(colours[j, x, c]))
-            total += step if step < MOST_STEP else MOST_STEP
-            num += 1
-    return total, num
 
 
 @njit(cache=True, nogil=True)

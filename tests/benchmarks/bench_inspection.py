@@ -28,7 +28,7 @@ from cosfly.inspection.pixels import NUM_IDS, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, grid_rows, read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import FILE_NAMES, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.space.reprojection import View, compare_views
@@ -66,8 +66,7 @@ def ours(flight: Flight, i: int, before: View | None, parts: Parts) -> View:
 
 def _compare(flight: Flight, i: int, picture: Any, before: View | None) -> View:
     pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
-    rows = picture.colours[grid_rows(picture.colours.shape[0])]
-    view = View(picture.depth, picture.instance, rows, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+    view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
     if before is not None:
         matrix = flight.camera.intrinsic
         compare_views(before, view, np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]))
