@@ -150,7 +150,9 @@ def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iter
     owners, accessors, num_numbers = list[tuple[int, dict]](), document.get("accessors", []), 0
     for k, node in enumerate(nodes):
         for piece in pieces[node["mesh"]] if "mesh" in node else ():
-            num_numbers += 1 + sum(accessors[n]["count"] for n in _used(piece))  # trimesh makes a copy for each node
+            num_numbers += 1 + sum(
+                _size(accessors[n], "count") for n in _used(piece)
+            )  # trimesh makes a copy for each node
             _check_count(num_numbers // MOST_NUMBERS, path)
             below = flat_nodes[k]["children"] = list(flat_nodes[k].get("children", ()))
             below.append(len(flat_nodes))
@@ -158,7 +160,7 @@ def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iter
             owners.append((k, piece))
     buffers = {str(k): _buffer(b, binary, path, tree) for k, b in enumerate(document.get("buffers", ()))}
     views = document.get("bufferViews", [])
-    if sum(view["byteLength"] for view in views) > 2 * sum(map(len, buffers.values())):
+    if sum(_size(view, "byteLength") for view in views) > 2 * sum(map(len, buffers.values())):
         raise _malformed(path, "bufferViews", "more numbers than bytes")
     flat = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "nodes": flat_nodes, "bufferViews": views,
@@ -193,6 +195,12 @@ def _drawn(piece: dict, path: Path) -> dict:
     return {key: piece[key] for key in ("mode", "indices") if key in piece} | {
         "attributes": attributes, "extensions": extensions,
     }  # fmt: skip
+
+
+def _size(record: dict, name: str) -> int:
+    if type(record[name]) is not int or record[name] < 0:  # one below 0 would make room for others in a sum
+        raise ValueError(f"{name} is {record[name]!r}"[:80])
+    return record[name]
 
 
 def _used(piece: dict) -> list[int]:
