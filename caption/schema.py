@@ -181,7 +181,10 @@ class EvidenceConfig(Config):
     tolerance_deg: float = Field(1.0, ge=0, description="degrees")
     tolerance_px: float = Field(3.0, ge=0, description="pixels")
     relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
-    drop: bool = Field(False, description="drop a sample whose text contradicts a measured value")
+    drop: bool | None = Field(
+        None,
+        description="drop a sample whose text contradicts a measured value; empty: where slots, claims or a reader say what it states",
+    )
 
 
 class AskedConfig(Config):
@@ -249,7 +252,7 @@ class RepairConfig(Config):
     strategy: Strategy = Field(
         "anchored",
         description="anchored: the true decision is given; hint: the rejected one is named; multi_sample: asked anew; "
-        "cascade: hint, then multi_sample, then anchored",
+        "cascade: hint, then multi_sample, then anchored, until an answer is the label",
     )
     max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
 

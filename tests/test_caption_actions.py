@@ -75,6 +75,14 @@ LABELS = [
     ({"left": -2.0}, "strafe_right"),
     ({"forward": -2.0}, "move_backward"),
     ({"forward": 2.0}, "move_forward"),  # closes in on a standing target
+    # A gap that the walker closes is not of the drone's doing, nor one that the walker opens.
+    ({"forward": 0.9, "target_step": (-0.6, 0)}, "track_straight"),
+    ({"forward": -3.0, "target_step": (0.2, 0)}, "move_backward"),
+    (
+        {"forward": 1.5, "turn_deg": 4.0, "target_step": (-0.6, 0)},
+        "move_forward",
+    ),  # 1.5 m of its own, 1.3 times 3 degrees
+    ({"forward": 1.2, "turn_deg": 4.0, "target_step": (-0.6, 0)}, "yaw_left_to_follow"),  # 4.2 m closer, 1.2 of its own
     ({}, "hover"),
     ({"forward": 3.0, "visible": 0}, "search_to_reacquire_target"),
     ({"left": 5.0, "turn_deg": -15.0, "target": (12.0, 2.5)}, "circle_left"),

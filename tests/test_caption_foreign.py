@@ -99,15 +99,15 @@ def test_another_file_does_not_go_on_where_one_stopped(tree, rules, tmp_path):
         captions_of([line(caption, decision="hover") for caption in rules], tree, tmp_path / "a")
 
 
-def test_a_contradiction_is_on_record_and_dropped_where_the_settings_say_so(tree, rules, tmp_path):
+def test_a_contradiction_is_on_record_and_drops_its_window_unless_the_settings_say_otherwise(tree, rules, tmp_path):
     wrong = {"sentence": "C1", "quantity": "altitude", "at": "t4", "value": 777.0, "unit": "m"}
     said = EN | {"critical_components": "The person can be made out from 777 m up.", "flight_decision": rules[0].label}
     lines = [line(rules[0], en=said, zh=None, claims=[wrong]), line(rules[1])]
-    found = captions_of(lines, tree, tmp_path / "a")
+    found = captions_of(lines, tree, tmp_path / "a", evidence={"drop": False})
     assert found[0].status == "accepted"
     assert found[0].checks.evidence == ["en false: altitude@t4 = 777 m"]
     assert (found[0].checks.sentences or {})["en"][0] == "contradicted"
-    dropped = captions_of(lines, tree, tmp_path / "b", evidence={"drop": True})
+    dropped = captions_of(lines, tree, tmp_path / "b")
     assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+from contextlib import nullcontext
 from functools import cache
 
 import pytest
 from measure_prose import answers_of, loses, misquotes, misreads, perfect_readings, turns
-from teacher_server import TeacherServer
+from teacher_server import TeacherServer, is_mirror
 from typer.testing import CliRunner
 
 from caption.run.forecast import make_forecast
@@ -22,9 +23,11 @@ from caption.teachers.doctor import READ_CAPTIONS, examine_endpoint
 from caption.teachers.reader import Reader, ReaderCheck, measure_reader, prompt_digest, read_reading
 from caption.truth.facts import measure_facts
 from caption.truth.gold import GoldCaption, read_gold
+from caption.truth.mirror import TEXTS
 from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.contract import Reply
 from cosfly.cli import app
+from cosfly.errors import NothingKept
 from cosfly.products.captions import Claim, Coc, Usage, read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -161,6 +164,37 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
         assert state_lies(shown_caption(row | {"evidence": "[]"}), facts, EvidenceConfig())[0].code == "evidence"
     assert lie_of_state == len(found)
     assert lie_of_claim >= len(found) // 2  # what was proved no longer is
+
+
+def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+
+    def text(body: dict, mends: bool) -> str:
+        words = json.dumps(body["messages"], ensure_ascii=False)
+        if "C1: " in words:
+            return reading_of(body)
+        if is_mirror(body):
+            english = json.loads(body["messages"][-1]["content"])
+            altitude = re.search(r"[\d.]+", english["critical_components"])[0]
+            texts = f"我们以 {altitude} m 的高度在道路上空飞行。", "此处没有任何理由反对这一机动动作。"
+            return json.dumps({**dict(zip(TEXTS, texts, strict=True)), "flight_decision": english["flight_decision"]})
+        fact = re.search(r"It contradicts the facts.*altitude: [^m]*?([\d.]+) m", words) if mends else None
+        altitude = fact[1] if fact else "99.0"
+        texts = f"We fly at {altitude} m over the road.", "There is nothing to say against this manoeuvre here."
+        answer = dict(zip(TEXTS, texts, strict=True))
+        return json.dumps(answer | {"therefore": "track_straight", "flight_decision": "track_straight"})
+
+    for mends in (True, False):
+        server = TeacherServer()
+        server.text = lambda body, mends=mends: text(body, mends)
+        with server, nullcontext() if mends else pytest.raises(NothingKept):
+            cfg = {"teacher": server.url, "writing": "prose", "reader": {"urls": [server.url]},
+                   "repair": {"hard_conflict": "keep"}, "window": {"require_images": False}}  # fmt: skip
+            run(CaptionConfig.model_validate(cfg), tree, tmp_path / str(mends))
+        found = list(read_captions(tmp_path / str(mends) / "captions.jsonl"))
+        assert {c.drop_reason for c in found} == {None if mends else "evidence"}, found[0].checks
+        assert all("evidence" in c.checks.refused for c in found)
+        assert all(c.checks.sentences["en"][0] == ("proved" if mends else "contradicted") for c in found)
 
 
 def test_the_command_measures_an_endpoint():

@@ -240,13 +240,15 @@ def test_a_hint_can_mend_a_conflict(tree, tmp_path):
     """A teacher that thinks again when told so: the rung says hint, and the text was not anchored."""
 
     def decide(body):
-        return "yaw_right_to_follow" if "Hint:" in body["messages"][0]["content"] else "hover"
+        return "search_to_reacquire_target" if "Hint:" in body["messages"][0]["content"] else "hover"
 
     with TeacherServer(decision=decide) as server:
         cfg = settings(server.url, repair={"strategy": "cascade"})
         path = run(cfg, tree, tmp_path / "out")
-    rungs = {caption.repair.rung for caption in read_captions(path) if caption.repair}
-    assert "hint" in rungs
+    repaired = [caption for caption in read_captions(path) if caption.repair]
+    assert {"hint", "anchored"} == {caption.repair.rung for caption in repaired}
+    # Nor does it stop at a decision that the flight merely does not contradict.
+    assert {caption.verdict for caption in repaired} == {"CONSISTENT"}
 
 
 def test_a_server_that_ignores_the_schema_exhausts_the_asks(tree, tmp_path):

@@ -155,7 +155,7 @@ def test_the_example_of_the_prompt_is_an_answer_that_is_taken():
 def test_the_schema_bounds_a_list_of_claims():
     claims = answer_schema("hover", more=more_fields(WAY))["properties"]["claims"]
     assert claims["maxItems"] == MAX_CLAIMS
-    assert set(claims["items"]["required"]) == set(Claim.model_fields)
+    assert set(claims["items"]["required"]) == set(Claim.model_fields) - {"quote"}  # a reader's
     assert list(answer_schema(more=more_fields(WAY))["properties"]) == [
         "critical_components", "reasoning_trace", "claims", "therefore", "flight_decision",
     ]  # fmt: skip

@@ -21,6 +21,7 @@ from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import check_translation
 from caption.truth.sentences import Judged
+from caption.writing.claims import MAX_COMPLAINTS, measured_series
 from caption.writing.contract import Draft, Refused, refuse_decision, way_of
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
@@ -37,6 +38,7 @@ from cosfly.products.captions import (
     Verdict,
 )
 from cosfly.reading.objects import CONTEXT_FULL
+from cosfly.work.store import dump_json
 
 
 class Prepared(NamedTuple):
@@ -209,6 +211,21 @@ class _Loop:
 
     async def run(self, question: Question) -> str | None:
         """Ask, verify, repair, mirror; gives the reason to drop the window, None to accept it."""
+        reason = await self._attempt(question)
+        if reason == "evidence" and self.cfg.correction_asks:  # once more, with what was measured
+            assert self.english is not None
+            self._refused.append(reason)
+            complaint = self._facts_against(question.facts)
+            mended = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
+            self.english = self.chinese = None
+            reason = await self._attempt(replace(question, correction=mended))
+        if self._recovered:
+            self.checks["recovered"] = sorted(self._recovered)
+        if self._refused:
+            self.checks["refused"] = self._refused
+        return reason
+
+    async def _attempt(self, question: Question) -> str | None:
         reason = await self.ask_freely(question)
         if reason is None:
             reason = await self._treat(question)
@@ -219,11 +236,13 @@ class _Loop:
         if reason is None or (self.terms.is_given and self.english is not None):
             found = await self._check_evidence(question)  # what was given is judged even where its window is dropped
             reason = reason or found
-        if self._recovered:
-            self.checks["recovered"] = sorted(self._recovered)
-        if self._refused:
-            self.checks["refused"] = self._refused
         return reason
+
+    def _facts_against(self, facts: Facts) -> str:
+        """Say what was measured of all that a text states and that is not so."""
+        problems = self.checks["evidence"]
+        named = [line for line in measured_series(facts) if any(line.partition(":")[0] in one for one in problems)]
+        return f"It contradicts the facts: {'; '.join(problems[:MAX_COMPLAINTS])}. Measured: {'; '.join(named)}."
 
     def drafts(self) -> dict[str, Any]:
         """Give what was written, as fields of the record."""
@@ -257,6 +276,7 @@ class _Loop:
     async def _answer(self, question: Question) -> Draft | Refused:
         """Ask, and while the answer is refused for what it says ask for a correction. A wrong structure has no complaint."""
         taken: Draft | None = None  # which its writer is asked to better
+        earlier = question.correction.number if question.correction else 0
         for number in range(self.cfg.correction_asks + 1):
             reply = await self.teacher.ask(question)
             answer = self._draft(reply, question)
@@ -270,7 +290,7 @@ class _Loop:
             else:
                 self._refused.append(answer.reason)
             complaint = answer.doubt if isinstance(answer, Draft) else answer.complaint
-            question = replace(question, correction=Correction(reply.text, complaint, number + 1))
+            question = replace(question, correction=Correction(reply.text, complaint, earlier + number + 1))
         return taken or answer
 
     def _draft(self, reply: Reply, question: Question) -> Draft | Refused:
@@ -355,7 +375,10 @@ class _Loop:
                 continue
             decision = answer.coc.flight_decision
             verdict = verdict_of(decision, self.motion, self.cfg.label, self.label)
-            if self.cfg.repair.treatment_of(verdict) == "keep" and decision != rejected:
+            is_enough = (
+                verdict == "CONSISTENT" or self.cfg.repair.strategy != "cascade"
+            )  # which has surer rungs to come
+            if self.cfg.repair.treatment_of(verdict) == "keep" and decision != rejected and is_enough:
                 self._accept(answer, asked)
                 self.repair.outcome, self.repair.rung = "repaired", rung
                 return None
@@ -408,7 +431,9 @@ class _Loop:
         writing, facts = self.terms.writing, question.facts
         if self.reader is not None and writing == "prose":
             texts = {language: draft.coc for language, draft in drafts.items()}
+            before = self.reading
             self.reading = await self.reader.record(texts, facts, question.window.sample_id)
+            self.reading.usage += before.usage if before else Usage()
         judged: dict[Language, list[Judged]] = {
             language: judge_text(draft, writing, self.reading, facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
@@ -423,7 +448,9 @@ class _Loop:
             for problem in sentence.problems
         ]
         self.checks["evidence"] = found or "ok"
-        return "evidence" if found and self.cfg.evidence.drop else None
+        drop = self.cfg.evidence.drop
+        is_stated = writing != "prose" or self.reading is not None  # by slots, claims or a reader
+        return "evidence" if found and (is_stated if drop is None else drop) else None
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1

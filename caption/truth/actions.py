@@ -32,6 +32,7 @@ class Motion:
     forward_m: float  # displacement in the body frame at the current frame
     left_m: float
     approach_m: float  # decrease of the horizontal distance to the target
+    closing_m: float  # what of it is the drone's own doing: the decrease, had the target stood still
     # The angle that the drone's bearing, seen from the target, turns clockwise: positive flies to the left.
     sweep_deg: float
     target_path_m: float
@@ -66,6 +67,7 @@ def measure(future: FutureMotion) -> Motion:
         forward_m=forward_m,
         left_m=moved_y * cos - moved_x * sin,
         approach_m=math.hypot(x0, y0) - math.hypot(x1, y1),
+        closing_m=math.hypot(x0, y0) - math.hypot(last[0] - first_target[0], last[1] - first_target[1]),
         sweep_deg=-math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)),
         target_path_m=math.hypot(last_target[0] - first_target[0], last_target[1] - first_target[1]),
         visible_now=visible[0],

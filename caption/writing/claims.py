@@ -69,11 +69,7 @@ class Claims:
     fields: Mapping[str, dict] = {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": CLAIM_SCHEMA}}
 
     def table(self, facts: Facts) -> str:
-        return "Table of facts:\n" + "\n".join(
-            f"{name}: {series} {quantity.unit}"
-            for name, quantity in QUANTITIES.items()
-            if (series := _series(quantity.read(facts), quantity.digits))
-        )
+        return "Table of facts:\n" + "\n".join(measured_series(facts))
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
@@ -98,6 +94,15 @@ class Claims:
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
         return judge_claims(draft.coc, draft.claims, facts, cfg, language)
+
+
+def measured_series(facts: Facts) -> list[str]:
+    """Give a line for each quantity that was measured: its values at the frames."""
+    return [
+        f"{name}: {series} {quantity.unit}"
+        for name, quantity in QUANTITIES.items()
+        if (series := _series(quantity.read(facts), quantity.digits))
+    ]
 
 
 def _series(values: Sequence[float | None], digits: int) -> str:

@@ -13,23 +13,12 @@ from functools import cache
 from typing import NamedTuple
 
 from caption.truth.glossary import words_beside
-from caption.truth.references import Reference
+from caption.truth.references import TURNING, Reference
 from cosfly.products.captions import Language
 
 _OF_DRONE = frozenset(
-    (
-        "speed",
-        "altitude",
-        "climb_rate",
-        "yaw",
-        "yaw_rate",
-        "heading",
-        "pitch",
-        "travelled",
-        "displacement",
-        "drone_motion",
-    )
-)
+    ("speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement", "drone_motion")
+)  # fmt: skip
 _OF_TARGET = frozenset(
     (
         "target_speed", "target_heading", "target_travelled", "target_motion", "visibility", "framing", "walking",
@@ -39,6 +28,7 @@ _OF_TARGET = frozenset(
 _SINCE_START = frozenset(("yaw", "travelled", "displacement", "target_travelled"))  # counted from the first frame
 _BREAK = re.compile(r"[,;:.!?()，；：。！？（）、—]|\b(?:and|but|while)\b|并且|且|而")
 _LINKS = ("of", "for", "by", "的")
+_AXES = {"heading": "yaw"}
 _SIDED = {"comparison": ("drone", "target"), "compared": ("target", "drone")}
 
 
@@ -99,11 +89,19 @@ def _fits(tokens: Sequence[Token], i: int, num_frames: int) -> bool:
     own = [one for one in tokens if one.clause == token.clause]
     slots = [one.reference for one in own if one.kind == "slot" and one.reference is not None]
     if token.kind == "slot":
-        return token.reference is None or (_has_owner(tokens, i) and _has_name(tokens, i))
+        if token.reference is None:
+            return True
+        return (
+            _has_owner(tokens, i)
+            and _has_name(tokens, i)
+            and _has_side_of(tokens, i)
+            and _is_end(tokens, i, num_frames)
+        )
     if token.kind == "quantity":
         return any(reference.quantity in token.names for reference in slots)
     if token.kind == "now":
-        return any(_frame(reference, num_frames) == num_frames - 1 for reference in slots) or not slots
+        values = [one.reference for one in (*tokens[i:], *reversed(tokens[:i])) if one.reference is not None]
+        return not values or _frame(values[0], num_frames) == num_frames - 1
     if token.kind == "frame":
         return any(
             _frame(reference, num_frames) == token.frame or _first(reference) == token.frame for reference in slots
@@ -121,7 +119,8 @@ def _fits(tokens: Sequence[Token], i: int, num_frames: int) -> bool:
             if one.kind == "slot" and one.reference is not None and not one.reference.aspect
         ]
         frames = [_frame(reference, num_frames) for reference in after if reference.quantity == after[0].quantity]
-        return frames == sorted(frames)
+        named = [one.frame for one in own if one.kind == "frame"]
+        return frames == sorted(frames) and named == sorted(named)
     return True
 
 
@@ -146,6 +145,8 @@ def _has_owner(tokens: Sequence[Token], i: int) -> bool:
     owners = [one.kind for one in inside if one.kind in ("drone", "target")]
     if not owners and not any(one.kind == "quantity" for one in inside):
         owners = [one.kind for one in before if one.kind in ("drone", "target")]
+        if reference.aspect in _SIDED and len(set(owners)) > 1:
+            return False
     behind = [one.kind for one in after if one.kind in ("drone", "target")]
     if reference.aspect in _SIDED:
         subject, other = _SIDED[reference.aspect]
@@ -171,7 +172,38 @@ def _has_name(tokens: Sequence[Token], i: int) -> bool:
         return True
     before = [one for one in tokens[:i] if one.clause == clause and one.kind == "quantity"]
     after = [one for one in tokens[i + 1 :] if one.clause == clause and one.kind == "quantity"]
+    if reference.aspect == "trend":  # a verb: its subject stands before it
+        before = before or [one for one in tokens[:i] if one.kind == "quantity"]
+        return bool(before) and reference.quantity in before[-1].names
     named = before[-1:] or after[:1]
     return (
         not named or reference.quantity in named[0].names or any(reference.quantity in one.names for one in after[:1])
     )
+
+
+def _values(tokens: Sequence[Token], i: int) -> list[Reference]:
+    """Give the values of the clause of a token, before it."""
+    return [one.reference for one in tokens[:i] if one.clause == tokens[i].clause and one.reference is not None]
+
+
+def _has_side_of(tokens: Sequence[Token], i: int) -> bool:
+    """Tell whether a side behind a value is the value's own."""
+    reference, before = tokens[i].reference, _values(tokens, i)
+    assert reference is not None
+    if reference.aspect != "side" or not before or before[-1].aspect not in ("", "change"):
+        return True
+    axes = {_AXES.get(one.quantity, one.quantity) for one in (reference, before[-1])}
+    return len(axes) == 1 or before[-1].quantity not in (*TURNING, "offset_x", "offset_y")
+
+
+def _is_end(tokens: Sequence[Token], i: int, num_frames: int) -> bool:
+    """Tell whether a value beside the trend of its quantity is where that ends, or behind "from" where it begins."""
+    token = tokens[i]
+    assert token.reference is not None
+    own = [one.reference for one in tokens if one.clause == token.clause and one.reference is not None]
+    trends = [one for one in own if one.aspect == "trend" and one.quantity == token.reference.quantity]
+    if token.reference.aspect or not trends:
+        return True
+    kinds = [one.kind for one in tokens[:i] if one.clause == token.clause and one.kind in ("from", "slot")]
+    end = _first(trends[0]) if kinds[-1:] == ["from"] else _frame(trends[0], num_frames)
+    return _frame(token.reference, num_frames) == end

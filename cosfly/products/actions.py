@@ -31,7 +31,7 @@ RESERVED = ("none",)  # tables call so what is not there
 
 # What of a motion is measured: see Motion in caption/truth/actions.py. ordered: 1 where the mission orders the action itself.
 MEASURES = (
-    "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m", "approach_m",
+    "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m", "approach_m", "closing_m",
     "sweep_deg", "target_path_m", "visible_now", "visible_share", "ordered",
 )  # fmt: skip
 # In front of a threshold that is a setting of `caption.label` (caption/schema.py); its settings are:
