@@ -50,7 +50,7 @@ from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
-from cosfly.planners.compare_tables import text_tables
+from cosfly.planners.compare import text_tables
 from cosfly.products import review
 from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
 from cosfly.products.answer_text import Parsed, parse_answer

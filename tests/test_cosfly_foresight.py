@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
+from cosfly.planners import foresight
 from cosfly.planners.contract import PlanConfig, load_planner
-from cosfly.planners.foresight import foresight, lattice, search, smooth
 from cosfly.planners.stage import make_scenario, plan_flight
 from cosfly.space import flight_metrics, kernels
 from cosfly.work.chance import rng_for
@@ -34,12 +34,12 @@ def straight_scenario(obstacles, length_m=30.0):
 @pytest.mark.parametrize("climbing", [False, True])
 def test_the_wished_places_are_in_the_lattice_and_cost_nothing(climbing):
     scenario, _ = scenario_of("corner")
-    made = lattice.make_lattice(scenario, climbing=climbing)
+    made = foresight.make_lattice(scenario, climbing=climbing)
     wished = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
-    ring = lattice.RINGS.index((0, 0))
+    ring = foresight.RINGS.index((0, 0))
     np.testing.assert_allclose(made.places_m[:, ring, 0], wished, atol=1e-9)
     assert (made.costs[:, ring, 0] == 0).all()
-    assert (np.delete(made.costs.reshape(len(wished), -1), ring * lattice.NUM_AZIMUTHS, axis=1) > 0).all()
+    assert (np.delete(made.costs.reshape(len(wished), -1), ring * foresight.NUM_AZIMUTHS, axis=1) > 0).all()
     assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
     away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
     assert made.radius_max_m == pytest.approx(away_m.max())
@@ -49,7 +49,7 @@ def test_places_keep_the_altitudes_also_on_a_slope():
     scenario, _ = scenario_of("corner")
     ground_m = np.linspace(0.0, 12.0, len(scenario.targets_m))
     scenario = replace(scenario, ground_m=ground_m, targets_m=scenario.targets_m + [[0, 0, z] for z in ground_m])
-    made = lattice.make_lattice(scenario, climbing=True)
+    made = foresight.make_lattice(scenario, climbing=True)
     for k, frame in enumerate(made.frames):
         low, high = made.places_m[k, ..., 2].min(), made.places_m[k, ..., 2].max()
         between = slice(max(frame - 3, 0), frame + 4)
@@ -59,7 +59,7 @@ def test_places_keep_the_altitudes_also_on_a_slope():
 
 def test_a_link_leads_both_ways_and_every_ring_can_be_reached():
     scenario, _ = scenario_of("corner")
-    links = lattice.make_lattice(scenario, climbing=True).links
+    links = foresight.make_lattice(scenario, climbing=True).links
     pairs = {(ring, other) for ring, row in enumerate(links) for other in row if other >= 0}
     assert pairs == {(b, a) for a, b in pairs}
     assert [row[0] for row in links] == list(range(len(links)))
@@ -76,13 +76,13 @@ def test_a_link_leads_both_ways_and_every_ring_can_be_reached():
 def test_the_survey_measures_what_the_kernels_measure(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles)
-    made = lattice.make_lattice(scenario, climbing=seed % 2 == 1)
+    made = foresight.make_lattice(scenario, climbing=seed % 2 == 1)
     places, targets = made.places_m.reshape(len(made.frames), -1, 3), scenario.targets_m[made.frames]
-    aloft = search.boxes_aloft(obstacles, scenario.targets_m, made)
+    aloft = foresight.boxes_aloft(obstacles, scenario.targets_m, made)
     gaps, hidden = np.zeros(places.shape[:2]), np.full(places.shape[:2], -1.0)
-    search._survey(places, targets, obstacles, aloft.rows, 3.0, search.REACH_M, gaps, hidden)
+    foresight._survey(places, targets, obstacles, aloft.rows, 3.0, foresight.REACH_M, gaps, hidden)
     flat = places.reshape(-1, 3)
-    expected, _ = kernels.signed_distances(obstacles, flat, search.REACH_M)
+    expected, _ = kernels.signed_distances(obstacles, flat, foresight.REACH_M)
     free = expected >= 3.0
     np.testing.assert_array_equal(gaps.ravel() >= 3.0, free)
     np.testing.assert_allclose(gaps.ravel()[free], expected[free], atol=1e-9)
@@ -116,7 +116,7 @@ def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, nu
 @pytest.mark.parametrize("seed", range(4))
 def test_no_sequence_of_places_is_cheaper(seed):
     rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
-    made = lattice.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
+    made = foresight.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
     places = np.ascontiguousarray(made.places_m[:, :4, ::-4][:, :, :num_azimuths].reshape(len(made.frames), -1, 3))
     own, links = rng.random(places.shape[:2]), made.links[:4, :].clip(max=4)
     links = np.where(links < 4, links, -1)
@@ -124,7 +124,7 @@ def test_no_sequence_of_places_is_cheaper(seed):
     gaps = kernels.signed_distances(obstacles, places.reshape(-1, 3), 12.0)[0].reshape(own.shape)
     longest_m = np.full(len(places), 18.0)
     settings = links, num_azimuths, 1, 0.02
-    chosen = search._cheapest(places, own, gaps, longest_m, obstacles, 3.0, *settings)
+    chosen = foresight._cheapest(places, own, gaps, longest_m, obstacles, 3.0, *settings)
     way, keys = places[np.arange(len(places)), chosen], np.arange(len(places))
     cost = own[keys, chosen].sum() + 0.02 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
     assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
@@ -132,9 +132,9 @@ def test_no_sequence_of_places_is_cheaper(seed):
 
 def test_where_no_way_is_fast_enough_there_is_none():
     scenario, obstacles = scenario_of("corner")
-    made = lattice.make_lattice(scenario, climbing=False)
+    made = foresight.make_lattice(scenario, climbing=False)
     slow = PlanConfig(speed_max_mps=0.05)
-    assert search.search_flight(scenario, made, obstacles, slow, 3.0) is None
+    assert foresight.search_flight(scenario, made, obstacles, slow, 3.0) is None
 
 
 # --- smoothing --------------------------------------------------------------------------------------------------------
@@ -144,10 +144,10 @@ def test_where_no_way_is_fast_enough_there_is_none():
 @pytest.mark.parametrize("dt_s", [0.5, 0.2])
 def test_the_band_is_that_of_the_squared_derivatives(num, dt_s):
     points = np.random.default_rng(num).normal(size=num)
-    band = smooth.smoothness_band(num, dt_s)
+    band = foresight.smoothness_band(num, dt_s)
     full = sum(np.diag(band[k, : num - k], -k) for k in range(min(4, num)))
     full = full + full.T - np.diag(np.diag(full))
-    weights = (smooth.VELOCITY_S2, smooth.ACCELERATION_S4, smooth.JERK_S6)
+    weights = (foresight.VELOCITY_S2, foresight.ACCELERATION_S4, foresight.JERK_S6)
     expected = sum(w * (np.diff(points, n=k + 1) ** 2).sum() / dt_s ** (2 * k + 2) for k, w in enumerate(weights))
     assert points @ full @ points == pytest.approx(expected)
 
@@ -155,21 +155,21 @@ def test_the_band_is_that_of_the_squared_derivatives(num, dt_s):
 def test_waypoints_are_unsafe_that_are_near_or_at_the_ends_of_a_bad_step():
     box = kernels.obstacle_index(town_of(((0, 0, 20), (2, 2, 20))))
     points = np.array([[-30, 9, 20], [-26, 9, 20], [-4, 0, 20], [4, 9, 20], [8, 9, 20], [8, -9, 20.0]])
-    found = smooth.unsafe(points, box, 3.0, 5.0)
+    found = foresight.unsafe(points, box, 3.0, 5.0)
     np.testing.assert_array_equal(found, [False, True, True, True, True, True])
-    np.testing.assert_array_equal(smooth.unsafe(points[3:5], box, 3.0, 5.0), [False, False])
+    np.testing.assert_array_equal(foresight.unsafe(points[3:5], box, 3.0, 5.0), [False, False])
     through = np.array([[-6.0, 0, 20], [6.0, 0, 20]])
-    np.testing.assert_array_equal(smooth.unsafe(through, box, 3.0, 50.0), [True, True])
+    np.testing.assert_array_equal(foresight.unsafe(through, box, 3.0, 50.0), [True, True])
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
-    raw = search.search_flight(scenario, lattice.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
-    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    raw = foresight.search_flight(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
+    points, facts = foresight.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smooth"]
-    assert not smooth.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
+    assert not foresight.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
     assert (points[:, 2] >= 20.0).all()
     seen, seen_raw = (kernels.visibility(obstacles, flight, scenario.targets_m).mean() for flight in (points, raw))
     assert seen >= seen_raw - 0.01
@@ -179,12 +179,12 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
 
 def test_a_raw_flight_that_cannot_be_smoothed_is_flown_as_it_is(monkeypatch):
     scenario, obstacles = scenario_of("tower_midway")
-    raw = search.search_flight(scenario, lattice.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
-    monkeypatch.setattr(smooth, "unsafe", lambda points, *rest: np.ones(len(points), dtype=bool))
-    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    raw = foresight.search_flight(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
+    monkeypatch.setattr(foresight, "unsafe", lambda points, *rest: np.ones(len(points), dtype=bool))
+    points, facts = foresight.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     np.testing.assert_array_equal(points, raw)
     assert not facts["smooth"]
-    assert facts["rounds"] == smooth.ROUNDS_MAX
+    assert facts["rounds"] == foresight.ROUNDS_MAX
 
 
 # --- whole flights ----------------------------------------------------------------------------------------------------

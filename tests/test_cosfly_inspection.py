@@ -20,9 +20,7 @@ from cosfly.geometry import box_iou, mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
-from cosfly.inspection.frames import choose_frames, pedestrian_region
-from cosfly.inspection.jumps import Jumps
-from cosfly.inspection.others import check_others, others_told
+from cosfly.inspection.frames import Jumps, check_others, choose_frames, others_told, pedestrian_region
 from cosfly.inspection.pixels import unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosfly.geometry import rotation_matrices, rotation_matrix
-from cosfly.planners.muco.window import window_rays
+from cosfly.planners.muco.loss import window_rays
 from cosfly.products.boxes import make_box_map
 from cosfly.products.kinds import KINDS
 from cosfly.space import kernels

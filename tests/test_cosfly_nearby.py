@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
 
 from cosfly.planners.contract import PlanConfig, Scenario
+from cosfly.planners.courses import follow
 from cosfly.planners.muco import loss, muco, nearby, step
-from cosfly.planners.wish import follow
 from cosfly.space import kernels
 
 

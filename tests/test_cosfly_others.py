@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Course, and_back, braked, company_of
-from cosfly.pedestrians.paces import PACES, speeds_at, take_pace
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
+from cosfly.pedestrians.walking import PACES, speeds_at, take_pace
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import BUILDS, Company, Other, distances_to_boxes_m, gaps_m, read_others, write_others

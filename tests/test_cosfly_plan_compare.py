@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import ConfigError, NoPathError, NothingKept, ResumeError
-from cosfly.planners import compare, compare_plots
-from cosfly.planners.compare import CompareConfig
-from cosfly.planners.compare_tables import text_tables
+from cosfly.planners import compare
+from cosfly.planners.compare import CompareConfig, text_tables
 from cosfly.planners.contract import PLANNERS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
@@ -82,7 +81,7 @@ def test_win_rates_count_strict_wins():
 
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (0, 93), (18, 60), (-0.03, 1.05), (0, 0.5)])
 def test_ticks_are_few_and_round(low, high):
-    ticks = compare_plots._ticks(low, high)
+    ticks = compare._ticks(low, high)
     assert 3 <= len(ticks) <= 8
     assert low - 1e-9 <= ticks[0]
     assert ticks[-1] <= high + 1e-9
@@ -131,7 +130,7 @@ def test_the_record_is_what_the_flights_are(made):
 def test_pictures_hold_both_colors(made):
     for name in ("compare_overlay.png", "compare_series.png", "compare_radar.png"):
         picture = cv2.imread(str(made / name))[..., ::-1].reshape(-1, 3).astype(int)
-        for color in map(compare_plots.color_of, PLANNERS):
+        for color in map(compare.color_of, PLANNERS):
             assert (np.abs(picture - color).max(axis=1) <= 2).sum() > 100, name
 
 

@@ -14,7 +14,7 @@ from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenar
 import cosfly.planners.stage as planners
 from cosfly.errors import ConfigError, InputError, NoPathError, NothingKept, ResumeError
 from cosfly.geometry import DT_S, look_at
-from cosfly.planners import wish
+from cosfly.planners import courses
 from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
@@ -245,14 +245,14 @@ def test_low_visibility_runs(low, expected):
 
 def test_headings_follow_the_walk_and_survive_standing_still():
     walk = walk_along("w", [(0, 0), (50, 0), (50, 50)])
-    headings = wish.smoothed_headings(walk.positions_m, 4.0)
+    headings = courses.smoothed_headings(walk.positions_m, 4.0)
     assert headings[0] == pytest.approx(0, abs=1e-6)
     assert headings[-1] == pytest.approx(np.pi / 2, abs=1e-6)
     assert (np.diff(headings) >= -1e-12).all()
     assert np.diff(headings).max() < 0.12  # the turn is spread over seconds
     standing = np.vstack([walk.positions_m[:5], np.repeat(walk.positions_m[4:5], 10, axis=0)])
-    np.testing.assert_allclose(wish.smoothed_headings(standing, 0.0), 0, atol=1e-12)
-    np.testing.assert_array_equal(wish.smoothed_headings(np.zeros((4, 3)), 4.0), 0)
+    np.testing.assert_allclose(courses.smoothed_headings(standing, 0.0), 0, atol=1e-12)
+    np.testing.assert_array_equal(courses.smoothed_headings(np.zeros((4, 3)), 4.0), 0)
 
 
 def test_push_out_reaches_the_nominal_distance_or_stays_at_the_best():

@@ -46,8 +46,7 @@ from cosfly.render.gl.figure import make_body
 from cosfly.render.gl.parts import Boxes, PartBuilder
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.view import View
-from cosfly.render.others import NOBODY, cast_of
-from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.person import NOBODY, cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run, script_flight

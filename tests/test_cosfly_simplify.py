@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.simplify.merge import MergeRule, clusters, fill_share, merge
-from cosfly.simplify.passes import SimplifyConfig, crop_below_ground, prune_nested, simplify
+from cosfly.simplify.passes import (
+    MergeRule,
+    SimplifyConfig,
+    clusters,
+    crop_below_ground,
+    fill_share,
+    merge,
+    prune_nested,
+    simplify,
+)
 from cosfly.simplify.stage import cross_validate, run
 from cosfly.work.config import build
 

@@ -8,10 +8,9 @@ from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenar
 
 import cosfly.planners.stage as planners
 from cosfly.errors import NoPathError
-from cosfly.planners import sight
+from cosfly.planners import sight, track_astar
 from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
-from cosfly.planners.track_astar import smooth, track_astar
-from cosfly.planners.wish import follow
+from cosfly.planners.courses import follow
 from cosfly.space import flight_metrics, kernels
 
 CFG = PlanConfig(planner="track_astar")
@@ -148,7 +147,7 @@ def test_flights_keep_the_nominal_distance_and_see(world):
 def test_smoothing_makes_flights_smoother_and_loses_no_sight():
     scenario, obstacles = scenario_of("corner")
     raw, _ = track_astar.search_flight(scenario, obstacles, CFG, 3.0)
-    points, facts = smooth.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    points, facts = track_astar.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smoothing"] == "accepted"
     assert flight_metrics.jerk_rms(points) < 0.5 * flight_metrics.jerk_rms(raw)
     assert flight_metrics.length_m(points) <= flight_metrics.length_m(raw)
@@ -187,8 +186,8 @@ def heights(count):
 
 def test_anchors_are_the_edges_of_an_occlusion():
     seen = np.array([1, 1, 0.8, 0.2, 1, 1, 1, 0.6, 1])
-    assert smooth.anchor_flags(seen, 0.999).tolist() == [False, True, False, False, True, False, True, False, True]
-    assert not smooth.anchor_flags(np.ones(5), 0.999).any()
+    assert track_astar.anchor_flags(seen, 0.999).tolist() == [False, True, False, False, True, False, True, False, True]
+    assert not track_astar.anchor_flags(np.ones(5), 0.999).any()
 
 
 def test_a_shortcut_takes_the_longest_free_line():
@@ -196,13 +195,13 @@ def test_a_shortcut_takes_the_longest_free_line():
     x = np.arange(25.0)
     points = np.column_stack([x, np.where(x % 2 == 0, 0.0, 2.0), np.full(25, 20.0)])
     targets, floors = np.column_stack([x, np.full(25, 30.0), np.ones(25)]), np.zeros(25)
-    assert smooth.shortcut(points, targets, floors, heights(25), obstacles, limits(), 12) == 2
+    assert track_astar.shortcut(points, targets, floors, heights(25), obstacles, limits(), 12) == 2
     np.testing.assert_allclose(points[:, 1], 0)
     shifted = np.column_stack([x, np.where(x % 2 == 0, -0.5, 2.0), np.full(25, 20.0)])
-    smooth.shortcut(shifted, targets, floors, heights(25), obstacles, limits(), 12)
+    track_astar.shortcut(shifted, targets, floors, heights(25), obstacles, limits(), 12)
     assert kernels.signed_distances(obstacles, shifted[[x for x in range(25) if shifted[x, 1] != -0.5]])[0].min() >= 3.0
     untouched = np.column_stack([x, np.where(x % 2 == 0, 0.0, 2.0), np.full(25, 20.0)])
-    assert smooth.shortcut(untouched, targets, floors, heights(25), obstacles, limits(), 1) == 0
+    assert track_astar.shortcut(untouched, targets, floors, heights(25), obstacles, limits(), 1) == 0
 
 
 def test_the_band_moves_all_but_anchors_and_stops_when_straight():
@@ -212,12 +211,12 @@ def test_the_band_moves_all_but_anchors_and_stops_when_straight():
     targets, none = np.column_stack([x, np.zeros(9), np.ones(9)]), np.zeros(9, dtype=bool)
     held, points = none.copy(), bent.copy()
     held[4] = True
-    smooth.relax(points, targets, none * 1.0, heights(9), held, obstacles, limits(), 30, 0.35, 0.02)
+    track_astar.relax(points, targets, none * 1.0, heights(9), held, obstacles, limits(), 30, 0.35, 0.02)
     assert points[4, 2] == 24
-    smooth.relax(points, targets, none * 1.0, heights(9), none, obstacles, limits(), 30, 0.35, 0.02)
+    track_astar.relax(points, targets, none * 1.0, heights(9), none, obstacles, limits(), 30, 0.35, 0.02)
     assert points[4, 2] < 22.5
     straight = np.column_stack([x, np.zeros(9), np.full(9, 20.0)])
-    assert smooth.relax(straight, targets, none * 1.0, heights(9), none, obstacles, limits(), 30, 0.35, 0.02) == 1
+    assert track_astar.relax(straight, targets, none * 1.0, heights(9), none, obstacles, limits(), 30, 0.35, 0.02) == 1
 
 
 def test_candidates_keep_distance_altitude_and_sight():
@@ -225,7 +224,7 @@ def test_candidates_keep_distance_altitude_and_sight():
     blockers, target = np.empty(len(obstacles.rows), dtype=np.int64), np.array([0.0, 0, 1])
 
     def valid(x, z, floor):
-        return smooth.candidate_is_valid(x, 0.0, z, target, floor, 20.0, 100.0, obstacles, limits(), blockers)
+        return track_astar.candidate_is_valid(x, 0.0, z, target, floor, 20.0, 100.0, obstacles, limits(), blockers)
 
     assert valid(-10.0, 20.0, 1.0)
     assert not valid(7.5, 20.0, 0.0)  # 1.5 m from the wall
@@ -244,7 +243,7 @@ def test_the_verdict_on_distance(height_m, raw_loss, verdict):
     points = np.column_stack([np.arange(10.0), np.full(10, -15.0), np.full(10, height_m)])
     targets = points - [0, 0, 19]
     seen = np.full(10, 1.0 - raw_loss)
-    assert smooth.judge(points, seen, targets, obstacles, CFG.track_astar, 3.0) == verdict
+    assert track_astar.judge(points, seen, targets, obstacles, CFG.track_astar, 3.0) == verdict
 
 
 def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
@@ -254,11 +253,13 @@ def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
     settings = CFG.track_astar
     one_hidden, all_hidden = points.copy(), points + np.array([30.0, 0, 0])
     one_hidden[7, 0] = 20.0
-    assert smooth.judge(one_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "frame_visibility"
-    assert smooth.judge(all_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "mean_visibility"
-    assert smooth.judge(all_hidden, np.zeros(40), targets, obstacles, settings, 3.0) == "accepted"  # as blind as before
-    monkeypatch.setattr(smooth, "judge", lambda *_: "clearance")
-    result, facts = smooth.smooth_flight(
+    assert track_astar.judge(one_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "frame_visibility"
+    assert track_astar.judge(all_hidden, np.ones(40), targets, obstacles, settings, 3.0) == "mean_visibility"
+    assert (
+        track_astar.judge(all_hidden, np.zeros(40), targets, obstacles, settings, 3.0) == "accepted"
+    )  # as blind as before
+    monkeypatch.setattr(track_astar, "judge", lambda *_: "clearance")
+    result, facts = track_astar.smooth_flight(
         points, Scenario("w", targets, np.zeros(40), follow(targets, CFG)), obstacles, CFG, 3.0
     )
     assert result is points

@@ -3,14 +3,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.pedestrians.paces import PACES, Pace, take_pace
 from cosfly.pedestrians.walking import (
+    PACES,
     SLOWEST_SPEED_MPS,
+    Pace,
     arrival_times,
     menger_curvature,
     resample,
     speed_profile,
     stood_s,
+    take_pace,
 )
 
 BEND_45 = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.5]])  # a straight step, then a diagonal one

@@ -24,8 +24,8 @@ from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
-from cosfly.render.gl.atmosphere import fog_extinction, light_direction, lights_on
 from cosfly.render.gl.lamps import APART_M, HIGH_M, lamps_along_streets
+from cosfly.render.gl.weather_pass import fog_extinction, light_direction, lights_on
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run

@@ -25,9 +25,9 @@ from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Segment
 from cosfly.products.traces import DroneTrace
+from cosfly.render.flight import check_flight
 from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.studies import weather

@@ -47,7 +47,7 @@ from cosfly.render.contract import (
     other_id,
     plane_z_m,
 )
-from cosfly.render.layers import layers_of
+from cosfly.render.draping import layers_of
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run

@@ -86,7 +86,7 @@ def plan_compare(
 ) -> None:
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from cosfly.planners import compare
-    from cosfly.planners.compare_tables import text_tables
+    from cosfly.planners.compare import text_tables
     from cosfly.work.config import build
     from cosfly.work.console import console
 

@@ -16,8 +16,7 @@ from pydantic import BaseModel
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.files import Checksums, check_files, check_recorded
-from cosfly.inspection.frames import FrameNumbers, check_frames, choose_frames, target_box
-from cosfly.inspection.others import check_others, others_told
+from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView, draw_flight
 from cosfly.products.coverage import Coverage, coverage_of

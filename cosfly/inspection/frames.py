@@ -16,23 +16,136 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
-from cosfly.inspection.jumps import Jumps
 from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.frames import (
     FILE_NAMES,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
+    FrameMeta,
+    OtherMeta,
     OthersMeta,
     frame_name,
 )
 from cosfly.products.issues import Report
 from cosfly.products.kinds import KIND_NAMES, KINDS
+from cosfly.products.others import BUILDS, Other, distances_to_boxes_m
 from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import read_bytes
+from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
+from cosfly.space.reprojection import Agreement, View, compare_views
 from cosfly.work.runner import advance
+
+# --- jumps ------------------------------------------------------------------------------------------------------------
+# Do the frames of a flight show one world? What stands still is carried from each frame into the next (`cosfly/space/reprojection.py`), and what
+# comes out otherwise than the poses say is a jump: something vanished, or another place.
+
+
+NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
+LEAST_SEEN = 150  # points, for a share of them to mean something
+USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # of the points; of planes, as a share of the depth
+
+
+@dataclass
+class Jumps:
+    """Compares depth and ids of each frame with the one before, through their poses. Colours say nothing: light, rain and zoom change them."""
+
+    flight: Flight
+    _before: tuple[int, View] | None = None
+    _frames: list[int] = field(default_factory=list)
+    _found: list[Agreement] = field(default_factory=list)
+
+    def see(self, i: int, picture: Picture) -> None:
+        """Take the next frame, which has depth."""
+        flight = self.flight
+        pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
+        view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
+        if self._before is not None and i - self._before[0] <= NEAR_FRAMES:
+            k, before = self._before
+            intrinsics = [flight.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]
+            self._frames.append(i)
+            self._found.append(compare_views(before, view, *intrinsics))
+        self._before = (i, view)
+
+    def judge(self, cfg: InspectConfig, report: Report) -> int:
+        """Report the jumps; gives how many frames were judged: none where the depth of somebody else's flight is no world's."""
+        if not self.flight.is_ours and not self._is_one_world():
+            return 0
+        for i, pair in zip(self._frames, self._found, strict=True):
+            if pair.seen < LEAST_SEEN:
+                continue
+            gone, agree, where = pair.through / pair.seen, pair.agree / pair.seen, f"{frame_name(i)}/depth.npy"
+            if gone > cfg.jump_gone_max:
+                got = f"{gone:.1%} of what the frame before shows is gone"
+                report.warn("temporal_jump", where, got, f"at most {cfg.jump_gone_max:.1%}")
+            elif agree < cfg.jump_agree_min:
+                got = f"{agree:.0%} of what the frame before shows is where the poses put it"
+                report.warn("temporal_jump", where, got, f"at least {cfg.jump_agree_min:.0%}")
+        return len(self._found)
+
+    def _is_one_world(self) -> bool:
+        """Tell whether most pairs of frames agree: rough depth agrees with nothing, and is equally rough everywhere."""
+        pairs = [pair for pair in self._found if pair.seen >= LEAST_SEEN]
+        agree = [pair.agree / pair.seen for pair in pairs]
+        errors = [pair.error for pair in pairs if np.isfinite(pair.error)]
+        is_near = bool(pairs) and float(np.median(agree)) >= USUAL_AGREE
+        return is_near and (not errors or float(np.median(errors)) <= ROUGH_ERROR)
+
+
+# --- others -----------------------------------------------------------------------------------------------------------
+# Checks on who else moves in a flight: do they keep clear of drone and person, and what do they hide of the person?
+
+
+def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:
+    """Give what the annotations of frames tell of others, by frame; empty for a flight without, and for one of somebody else."""
+    if not flight.is_ours:
+        return {}
+    return {i: meta.others for i, meta in metas.items() if meta is not None and meta.others is not None}
+
+
+def check_others(
+    flight: Flight, told: dict[int, OthersMeta], clearance_min_m: float, report: Report, metrics: dict
+) -> None:
+    """Measure how near others come to drone and person, and add what they hide of the person."""
+    nearest_m = np.inf
+    for i, frame in told.items():
+        for line in frame.others:
+            other = _other(line)
+            if other is None:
+                where = f"meta.json of frame {i}: others"
+                report.error("broken_annotation", where, f"semantic_id {line.semantic_id}", " or ".join(BUILDS))
+                continue
+            distance_m = float(distances_to_boxes_m(flight.positions_m[i], other)[0])
+            nearest_m = min(nearest_m, distance_m)
+            if distance_m < clearance_min_m - CLEARANCE_TOLERANCE_M:
+                where, expected = (
+                    f"trajectory.json: points[{i}].drone_pose",
+                    f"at least {clearance_min_m:g} m to others",
+                )
+                report.error("clearance", where, f"{distance_m:.2f} m to {line.instance_id}", expected)
+            if other.gap_to_person_m(flight.targets_m[i]) < -CLEARANCE_TOLERANCE_M:
+                where = f"trajectory.json: points[{i}].target.world_location"
+                report.error("collision", where, f"in {line.instance_id}", "a person who touches nobody")
+    if told:
+        hidden = np.array([frame.target_hidden_by_others for frame in told.values()])
+        metrics.update(
+            num_others=max(len(frame.others) for frame in told.values()),
+            others_clearance_min_m=nearest_m if np.isfinite(nearest_m) else None,
+            occluded_by_others_share=float((hidden > 0).mean()),
+            hidden_by_others_max=float(hidden.max()),
+        )
+
+
+def _other(line: OtherMeta) -> Other | None:
+    """The other of an annotation in right-handed axes; None of an unknown kind."""
+    kind = KIND_NAMES.get(line.semantic_id, "")
+    if kind not in BUILDS:
+        return None
+    feet_m = line.center_m - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
+    return Other(kind, feet_m[None], np.array([line.heading_rad]))
+
 
 SMALL_PX, SMALL_ROWS = (
     (128, 72),

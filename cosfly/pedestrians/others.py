@@ -13,9 +13,17 @@ import numpy as np
 from cosfly.geometry import headings_of
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.lanes import Lane
-from cosfly.pedestrians.paces import PACES, STOP_GAP_MIN, Way, speeds_at, take_pace
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
-from cosfly.pedestrians.walking import arrival_times, menger_curvature, sample
+from cosfly.pedestrians.walking import (
+    PACES,
+    STOP_GAP_MIN,
+    Way,
+    arrival_times,
+    menger_curvature,
+    sample,
+    speeds_at,
+    take_pace,
+)
 from cosfly.products.ground import Ground
 from cosfly.products.others import Company, Other, gaps_m
 from cosfly.products.walks import Walk

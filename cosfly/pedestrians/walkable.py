@@ -19,8 +19,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
-from cosfly.pedestrians.paces import PACES
-from cosfly.pedestrians.walking import SLOWEST_SPEED_MPS
+from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, KINDS

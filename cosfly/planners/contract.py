@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 # In the order of comparisons, which hold the first against each of the others.
 PLANNERS = {
-    "foresight": "cosfly.planners.foresight.foresight:plan",
-    "track_astar": "cosfly.planners.track_astar.track_astar:plan",
+    "foresight": "cosfly.planners.foresight:plan",
+    "track_astar": "cosfly.planners.track_astar:plan",
     "muco": "cosfly.planners.muco.muco:plan",
 }
 TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}  # in tables and pictures; others go by their names
@@ -223,7 +223,7 @@ class PlanConfig(Config):
         return self
 
 
-# --- a planner ---------------------------------------------------------------------------------------------------------
+# --- a planner --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

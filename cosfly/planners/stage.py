@@ -42,7 +42,7 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     Raises:
         NoPathError: nobody can walk or follow this: one point, uneven times, huge coordinates, or a way through a box.
     """
-    from cosfly.planners.wish import follow
+    from cosfly.planners.courses import follow
     from cosfly.space.kernels import segments_hit
 
     targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
@@ -109,8 +109,7 @@ def style_rng(walk: Walk, seed: int) -> np.random.Generator:
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
-    from cosfly.planners.camera import view_of
-    from cosfly.planners.intent import why_not_held
+    from cosfly.planners.intent import view_of, why_not_held
     from cosfly.space.kernels import segments_hit, signed_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)

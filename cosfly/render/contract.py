@@ -7,7 +7,7 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain under everything (`ground_plane`), or, where the ground slopes, its triangles and the surfaces on it
   (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M;
-- of coplanar surfaces the one of the higher layer, and of one layer always the same one (layers.py).
+- of coplanar surfaces the one of the higher layer, and of one layer always the same one (draping.py).
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cosfly.errors import RenderError
 from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
 from cosfly.products import frames
@@ -18,16 +19,49 @@ from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, OthersMet
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import Mission, Segment
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
-from cosfly.render.others import Cast
-from cosfly.render.person import Gait
-from cosfly.render.perturbation import HIDDEN, Perturbed, Poses
+from cosfly.render.person import Cast, Gait
+from cosfly.render.perturbation import HIDDEN, STEP_UP_M, Perturbed, Poses, Surroundings
+from cosfly.space.kernels import signed_distances
 from cosfly.work.runner import advance
 from cosfly.work.store import sha256_bytes, storage_errors, write_checksums, write_json
+
+# --- whether a flight can be drawn at all: nobody stands below the ground or looks out of a wall ----------------------
+
+
+TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
+
+
+def check_flight(trace: DroneTrace, surroundings: Surroundings) -> None:
+    """Check that the camera is outside every obstacle and the person on or over the ground, in all frames of a plan.
+
+    Raises:
+        RenderError: names the flight and the first frame where that is not so, and how many there are.
+    """
+    depths_m, _ = signed_distances(surroundings.obstacles, trace.positions_m, 0.0)
+    inside = np.flatnonzero(depths_m < -TOUCH_M)
+    if len(inside):
+        i = int(inside[0])
+        raise RenderError(
+            "a camera inside a box", where=f"{trace.path_id}: frame {i}",
+            got=f"{-depths_m[i]:.2f} m deep; {len(inside)} of {len(depths_m)} frames",
+            expected="a camera in the open", fix="plan the flight again on this map",
+        )  # fmt: skip
+    feet_m = trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]
+    below_m = np.array([surroundings.below_ground_m(place) for place in feet_m])
+    if (below_m > STEP_UP_M).any():
+        i = int(np.argmax(below_m > STEP_UP_M))
+        raise RenderError(
+            "a target under ground", where=f"{trace.path_id}: frame {i}",
+            got=f"feet {below_m[i]:.2f} m below; {int((below_m > STEP_UP_M).sum())} of {len(below_m)} frames",
+            expected="somebody who stands on the ground", fix="walk the path again on this map",
+        )  # fmt: skip
+
 
 REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight

@@ -22,7 +22,7 @@ from cosfly.products.kinds import GROUND_KINDS
 from cosfly.products.shift_draws import shift_draws
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
-from cosfly.render.others import NOBODY, Cast
+from cosfly.render.person import NOBODY, Cast
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.space.kernels import obstacle_index, signed_distances
 from cosfly.work.config import Config

@@ -25,8 +25,7 @@ from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherParams
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
-from cosfly.render.draping import drape, is_draped
-from cosfly.render.layers import layers_of
+from cosfly.render.draping import drape, is_draped, layers_of
 from cosfly.render.solids import are_solids, solids_of
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here

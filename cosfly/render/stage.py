@@ -25,12 +25,10 @@ from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
-from cosfly.render.flight import FlightScript, Writing, render_flight
+from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
-from cosfly.render.others import NOBODY, Cast, cast_of
-from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.person import NOBODY, Cast, cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import Perturbed, Poses, Surroundings, perturb
-from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.work.chance import rng_for

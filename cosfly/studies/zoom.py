@@ -22,9 +22,8 @@ from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.frames import Camera, level_name, rgb_bytes
 from cosfly.products.traces import read_traces
 from cosfly.render.contract import Renderer
-from cosfly.render.flight import MARGIN_M, FlightScript, draw_frame
+from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.sense import check_flight
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
 from cosfly.work.chance import rng_for

@@ -26,8 +26,7 @@ from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
 from cosfly.products.boxes import BoxMap, write_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.simplify.merge import clusters
-from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.simplify.passes import SimplifyConfig, clusters, simplify
 from cosfly.space import flight_metrics as metrics
 from cosfly.space.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.work.chance import rng_for

@@ -292,7 +292,7 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
     return np.inf, num_tries
 
 
-# --- the feasible region ---
+# --- the feasible region ----------------------------------------------------------------------------------------------
 
 
 @njit(cache=True)

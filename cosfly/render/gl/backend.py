@@ -19,9 +19,8 @@ from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
-from cosfly.render.gl.figure import Body, make_body
+from cosfly.render.gl.figure import MOST_CAPSULES, Body, capsules_of, draw_others, make_body, placed
 from cosfly.render.gl.loose import LooseTriangles, attributes
-from cosfly.render.gl.moving import MOST_CAPSULES, capsules_of, draw_others, placed
 from cosfly.render.gl.parts import PART
 from cosfly.render.gl.programs import Programs, open_context, packed, programs_of, set_uniform, sources
 from cosfly.render.gl.scene import build_scene

@@ -6,16 +6,20 @@ up to 12 cm.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cosfly.geometry import rotation_matrix
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, Clothes, PosedPerson
+from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, Clothes, PosedCar, PosedOther, PosedPerson
 from cosfly.render.gl import meshes
-from cosfly.render.gl.parts import CLOTH, PART, tags
+from cosfly.render.gl.parts import CLOTH, PART, Boxes, PartBuilder, tags
+from cosfly.render.gl.shapes import BUILDERS
+from cosfly.render.gl.view import View
 
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
 HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
@@ -130,3 +134,69 @@ def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.n
     ends = np.array([[low, high] for low, high, _ in figure.bones]) @ turn.T + feet_m
     radii = np.array([radius for _, _, radius in figure.bones])
     return Body(records, np.array(mesh), np.array(centers) @ turn.T + feet_m, ends, radii, hip_m)
+
+
+# --- moving -----------------------------------------------------------------------------------------------------------
+# What moves, as drawable parts of one frame: the figures of people, cars, and the capsules that cast the shadows of others.
+
+
+MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera
+SHADOW_M = 5.0  # of a sphere that holds a shadow too, under a sun that stands as usual
+PERSON_RADIUS_M = 1.0  # of a sphere round a person
+PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # low and high end over the feet, radius
+
+
+def placed(body: Body, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give the records of a figure with their places, and their meshes."""
+    records = body.records.copy()
+    records["center"] = body.centers_m - origin_m
+    return records, body.mesh
+
+
+def draw_others(others: Sequence[PosedOther], origin_m: np.ndarray, view: View) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Give records and meshes of the others whom the camera may see."""
+    found = []
+    for other in others:
+        center = other.center_m - origin_m
+        if isinstance(other.body, PosedPerson):
+            if view.can_show(center, PERSON_RADIUS_M):
+                found.append(placed(make_body(other.body, other.instance_id), origin_m))
+        elif view.can_show(center, float(np.linalg.norm(other.body.half_extents_m))):
+            found.append(_car(other.body, other.instance_id, center, view))
+    return found
+
+
+def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """A car of the same shape as those that a map has parked."""
+    builder, turn = PartBuilder(), rotation_matrix(0.0, car.heading_rad, 0.0)
+    half, ids = np.array(car.half_extents_m), np.array([instance_id], np.uint16)
+    BUILDERS[KINDS["Car"]](
+        builder, Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
+    )
+    parts = builder.finish()
+    rows = view.rows(parts)
+    return parts.records[rows], parts.mesh[rows]
+
+
+def capsules_of(others: Sequence[PosedOther], origin_m: np.ndarray, view: View) -> np.ndarray:
+    """Capsules of the others whose shadows the camera may see, relative to the origin, (k, 2, 4): from and radius, to and instance id.
+
+    Every pixel asks every capsule, which costs more than all else that is drawn of others.
+    """
+    seen = (other for other in others if view.can_show(other.center_m - origin_m, SHADOW_M))
+    nearest = sorted(seen, key=lambda other: float(np.linalg.norm(other.center_m - origin_m - view.eye)))[
+        :MOST_CAPSULES
+    ]
+    capsules = np.zeros((len(nearest), 2, 4), np.float32)
+    for capsule, other in zip(capsules, nearest, strict=True):
+        center = other.center_m - origin_m
+        if isinstance(other.body, PosedPerson):
+            low, high, radius = PERSON_CAPSULE_M
+            ends = center + np.array([[0.0, 0.0, low], [0.0, 0.0, high]]) - [0.0, 0.0, TARGET_HEIGHT_M]
+        else:
+            length, width, height = other.body.half_extents_m
+            ahead = (length - width) * np.array([np.cos(other.body.heading_rad), np.sin(other.body.heading_rad), 0.0])
+            radius = max(width, height)
+            ends = center + np.array([-ahead, ahead])
+        capsule[:, :3], capsule[0, 3], capsule[1, 3] = ends, radius, other.instance_id
+    return capsules

@@ -11,16 +11,136 @@ from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import KINDS
-from cosfly.render.contract import NO_INSTANCE, ground_plane, instance_ids, plane_z_m, scene_origin, seeds_of
-from cosfly.render.draping import Draped, drape, is_draped
-from cosfly.render.gl import meshes
+from cosfly.render.contract import (
+    LAYER_STEP,
+    NO_INSTANCE,
+    STANDING_LAYER,
+    chance,
+    ground_plane,
+    instance_ids,
+    plane_z_m,
+    scene_origin,
+    seeds_of,
+)
+from cosfly.render.draping import Draped, drape, is_draped, layers_of
+from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.lamps import lamps_along_streets, lamps_of
 from cosfly.render.gl.loose import Loose
 from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, PartBuilder, Parts
-from cosfly.render.gl.shapes import BUILDERS, plain
-from cosfly.render.gl.solids import loose_solids
-from cosfly.render.layers import layers_of
-from cosfly.render.solids import are_solids, solids_of
+from cosfly.render.gl.shapes import BUILDERS, BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, plain
+from cosfly.render.solids import Solids, are_solids, solids_of
+
+# --- solids -----------------------------------------------------------------------------------------------------------
+# What meshes look like: walls with storeys and windows, flat roofs, tiles on those that slope; plain paint where a file tells colours.
+#
+# The shader draws patterns in the axes of a part, so every plane of a building becomes a part of its own.
+
+
+STEEP, FLAT = 0.35, 0.94  # how far up the normal of a wall points at most, and of a flat roof at least
+SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces as near to one plane as this are one wall
+THINNEST_M = 0.01
+
+
+def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
+    """Give the triangles of solids, seen from both sides, as a shader draws them. ids: (n,) of `instance.png`, of the map's boxes."""
+    if not len(solids):
+        return Loose.all_of({})
+    normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
+    is_house = (kinds == KINDS["Buildings"]) & np.isnan(solids.colors).any(axis=1)
+    is_wall, is_flat = is_house & (np.abs(normals[:, 2]) < STEEP), is_house & (np.abs(normals[:, 2]) > FLAT)
+    materials = np.where(is_house, np.where(is_wall | is_flat, parts.FACADE, parts.TILES), parts.PLAIN)
+    axes, planes = _planes(box_map, solids, is_wall, is_flat, is_house)
+    firsts = np.searchsorted(solids.things, np.arange(solids.things[-1] + 2))[:-1]
+    low = np.minimum.reduceat(solids.corners_m.min(axis=1), firsts)
+    high = np.maximum.reduceat(solids.corners_m.max(axis=1), firsts)
+    middles = (low + high)[solids.things] / 2.0
+    local = np.einsum("kij,kcj->kci", axes, solids.corners_m - middles[:, None])
+    center, half = _spans(local, planes)
+    vertices = np.zeros((len(solids), 3), LOOSE_VERTEX)
+    vertices["position"] = (local - center[:, None]) / half[:, None]
+    vertices["normal"] = (np.einsum("kij,kj->ki", axes, normals) * half)[:, None]
+    vertices["center"] = (np.einsum("kji,kj->ki", axes, center) + middles - origin_m)[:, None]
+    vertices["half"] = half[:, None]
+    vertices["quaternion"] = Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat()[:, None]
+    vertices["color"] = _paint(solids, materials, seeds_of(box_map.ids[rows]))[:, None]
+    tags = kinds.astype(np.uint32) | (materials << 8).astype(np.uint32) | (ids[rows].astype(np.uint32) << np.uint32(16))
+    vertices["tag"] = tags[:, None]
+    vertices["bias"] = LAYER_STEP * STANDING_LAYER
+    backs = vertices[:, ::-1].copy()
+    backs["normal"] *= -1.0
+    both, things = np.concatenate([vertices, backs]), np.tile(solids.things, 2)
+    of = np.tile(materials, 2)
+    order = {
+        int(m): (chosen := np.flatnonzero(of == m))[np.argsort(things[chosen], kind="stable")] for m in np.unique(of)
+    }
+    return Loose(
+        {m: both[chosen].reshape(-1) for m, chosen in order.items()},
+        {m: things[chosen] for m, chosen in order.items()},
+        (low + high) / 2.0 - origin_m,
+        np.linalg.norm(high - low, axis=1) / 2.0,
+    )
+
+
+def _planes(
+    box_map: BoxMap, solids: Solids, is_wall: np.ndarray, is_flat: np.ndarray, is_house: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Axes of the part that each triangle belongs to, (k, 3, 3) part_from_world, and which part that is, (k,).
+
+    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned as its house's largest wall, z up.
+    What is no house's: the box's.
+    """
+    normals, things = solids.normals, solids.things
+    around = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
+    tilt = np.where(is_wall, 0, np.round(np.arcsin(np.clip(normals[:, 2], -1.0, 1.0)) / SAME_ANGLE_RAD)).astype(
+        np.int64
+    )
+    yaw, rise = around * SAME_ANGLE_RAD, tilt * SAME_ANGLE_RAD
+    zero = np.zeros(len(solids))
+    out = np.stack([np.cos(yaw) * np.cos(rise), np.sin(yaw) * np.cos(rise), np.sin(rise)], axis=1)
+    along = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
+    axes = np.stack([along, out, np.cross(along, out)], axis=1)
+    main = _main_yaws(solids, is_wall, around)[things] * SAME_ANGLE_RAD
+    level = np.stack([np.cos(main), np.sin(main), zero], axis=1), np.stack([-np.sin(main), np.cos(main), zero], axis=1)
+    axes[is_flat] = np.stack([*level, np.tile([0.0, 0.0, 1.0], (len(solids), 1))], axis=1)[is_flat]
+    turns = rotation_matrices(np.radians(box_map.rotations_deg[solids.rows])).transpose(0, 2, 1)
+    axes[~is_house] = turns[~is_house]
+    away = np.round(np.einsum("kj,kj->k", out, solids.corners_m.mean(axis=1)) / SAME_PLACE_M).astype(np.int64)
+    level_z = np.round(solids.corners_m[..., 2].mean(axis=1) / SAME_PLACE_M).astype(np.int64)
+    key = np.stack([things, 1 + is_wall + 2 * is_flat, around, tilt, away], axis=1)
+    key[is_flat] = np.stack([things, 3 + 0 * things, 0 * things, 0 * things, level_z], axis=1)[is_flat]
+    key[~is_house, 1:] = 0
+    return axes, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _main_yaws(solids: Solids, is_wall: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """The direction that most of each thing's walls face, (n,) in steps of SAME_ANGLE_RAD within a quarter turn."""
+    quarter = round(np.pi / 2 / SAME_ANGLE_RAD)
+    edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
+    areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall
+    table = np.zeros((int(solids.things[-1]) + 1, quarter))
+    np.add.at(table, (solids.things, around % quarter), areas)
+    return table.argmax(axis=1)
+
+
+def _spans(local: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half size, (k, 3) each, of all triangles of the part that a triangle belongs to; local: (k, 3, 3) corners in its axes."""
+    low = np.full((planes.max() + 1, 3), np.inf)
+    high = -low
+    np.minimum.at(low, planes, local.min(axis=1))
+    np.maximum.at(high, planes, local.max(axis=1))
+    return ((low + high) / 2.0)[planes], np.maximum((high - low) / 2.0, THINNEST_M)[planes]
+
+
+def _paint(solids: Solids, materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Linear RGB and seed, (k, 4): what the file told, or what the kind has."""
+
+    def picked(palette: np.ndarray) -> np.ndarray:
+        return palette[(chance(seeds, 0) * len(palette)).astype(int)]
+
+    of = (materials == parts.FACADE)[:, None], (materials == parts.TILES)[:, None]
+    own = np.where(of[0], picked(BUILDING_COLORS), np.where(of[1], picked(TILE_COLORS), picked(PLAIN_COLORS)))
+    return np.column_stack([np.where(np.isnan(solids.colors), own, solids.colors), seeds * 0.999])
+
 
 HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the shader draws none on it
 

@@ -1,4 +1,4 @@
-// Light and air under weather, in the place of the constants of look.glsl: uniforms that atmosphere.py makes of the six knobs.
+// Light and air under weather, in the place of the constants of look.glsl: uniforms that weather_pass.py makes of the six knobs.
 uniform vec3 sun_light;           // of the sun, or at night of the moon
 uniform vec3 sky_light;           // from above
 uniform vec3 ground_light;        // from below

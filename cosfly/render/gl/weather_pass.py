@@ -14,9 +14,164 @@ import numpy as np
 from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
-from cosfly.render.gl.atmosphere import light_direction, uniforms
 from cosfly.render.gl.parts import Parts
 from cosfly.render.gl.programs import set_uniform
+
+# --- atmosphere -------------------------------------------------------------------------------------------------------
+# The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
+#
+# Colours are linear and already balanced for the exposure that goes with them, as an eye or a camera does it: a night is some twenty
+# times darker here than a day, and not a million times. Between the altitudes of the tables they are interpolated.
+
+
+CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
+FOG_AT_FULL, FOG_POWER = (
+    0.10,
+    2.4,
+)  # extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away
+RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
+MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, which is the light where the sun is down
+LOWEST_SUN_DEG, SUN_IS_DOWN_DEG = 2.5, -3.0  # a sun on the horizon still lights walls
+MOON_DISC, SUN_DISC = 0.99993, 0.99955
+
+ALTITUDES_DEG = (-18.0, -6.0, 0.0, 6.0, 15.0, 42.0, 75.0)
+SUN_ALTITUDES_DEG = (SUN_IS_DOWN_DEG, 0.0, 6.0, 15.0, 42.0, 75.0)
+SUN_LIGHT = (
+    (0, 0, 0),
+    (1.25, 0.50, 0.16),
+    (1.9, 1.05, 0.50),
+    (2.25, 1.70, 1.12),
+    (2.35, 2.12, 1.75),
+    (2.45, 2.28, 1.98),
+)
+MOON_LIGHT = np.array([0.050, 0.062, 0.090])
+SKY_LIGHT = (
+    (0.017, 0.023, 0.042), (0.10, 0.12, 0.20), (0.25, 0.25, 0.37), (0.36, 0.39, 0.50), (0.42, 0.48, 0.62), (0.48, 0.56, 0.68),
+    (0.50, 0.58, 0.70),
+)  # fmt: skip
+GROUND_LIGHT = (
+    (0.010, 0.012, 0.018), (0.05, 0.05, 0.08), (0.15, 0.13, 0.14), (0.20, 0.18, 0.16), (0.24, 0.22, 0.19), (0.27, 0.25, 0.22),
+    (0.29, 0.27, 0.24),
+)  # fmt: skip
+HORIZON = (
+    (0.013, 0.018, 0.036), (0.20, 0.15, 0.19), (0.46, 0.34, 0.34), (0.66, 0.56, 0.50), (0.72, 0.73, 0.74), (0.66, 0.75, 0.84),
+    (0.64, 0.75, 0.86),
+)  # fmt: skip
+ZENITH = (
+    (0.002, 0.004, 0.013), (0.04, 0.06, 0.15), (0.12, 0.17, 0.36), (0.17, 0.28, 0.53), (0.17, 0.33, 0.61), (0.16, 0.34, 0.66),
+    (0.15, 0.33, 0.67),
+)  # fmt: skip
+SUN_GLOW = (
+    (0, 0, 0),
+    (0.50, 0.20, 0.10),
+    (1.15, 0.46, 0.14),
+    (0.9, 0.5, 0.22),
+    (0.6, 0.45, 0.28),
+    (0.5, 0.42, 0.3),
+    (0.5, 0.43, 0.32),
+)
+# Of a sky that is all cloud: how bright, of what hue.
+COVERED_LEVEL = (0.030, 0.11, 0.33, 0.52, 0.72, 0.94, 1.0)
+COVERED_SKY, COVERED_GROUND = np.array([0.82, 0.86, 0.92]), np.array([0.37, 0.37, 0.36])
+COVERED_HORIZON, COVERED_ZENITH = np.array([0.66, 0.69, 0.72]), np.array([0.50, 0.53, 0.57])
+CITY_GLOW = np.array([0.030, 0.021, 0.013])  # what street lamps give back to low cloud and fog
+EXPOSURE = (1.45, 1.30, 1.05, 0.98, 0.88, 0.78, 0.60)
+COVERED_EXPOSURE = 1.4  # times that, under a sky that is all cloud by day
+LAMP_LIGHT = np.array([0.42, 0.29, 0.16])
+
+
+def light_direction(params: WeatherParams) -> np.ndarray:
+    """Unit vector towards what casts the shadows, (3,) world: the sun, or the moon where the sun is down."""
+    if params.sun_altitude_angle <= SUN_IS_DOWN_DEG:
+        return MOON / np.linalg.norm(MOON)
+    altitude, azimuth = np.radians([max(params.sun_altitude_angle, LOWEST_SUN_DEG), params.sun_azimuth_angle])
+    # A compass counts clockwise from north, +y; x is east.
+    return np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+
+
+def lights_on(params: WeatherParams) -> float:
+    """How far street lamps and windows are lit, 0 to 1: by how light the sky is."""
+    level = _at(COVERED_LEVEL, params.sun_altitude_angle) * (1.0 - 0.30 * params.precipitation / 100.0)
+    return float(1.0 - _step(0.33, 0.50, float(level)))
+
+
+def fog_extinction(params: WeatherParams) -> float:
+    """What fog and rain take from a colour, per m."""
+    rain = params.precipitation / 100.0
+    return float(FOG_AT_FULL * (params.fog_density / 100.0) ** FOG_POWER + RAIN_EXTINCTION * rain**1.5)
+
+
+def uniforms(params: WeatherParams) -> dict[str, Any]:
+    """Give the uniforms that hold for a whole flight: name -> number or array."""
+    altitude, cloud, rain = params.sun_altitude_angle, params.cloudiness / 100.0, params.precipitation / 100.0
+    extinction = fog_extinction(params)
+    fogged = 1.0 - float(np.exp(-60.0 * extinction))  # of the sun's light and of what one sees of the sky
+    overcast = float(_step(0.55, 0.92, cloud))
+    grey = max(overcast * 0.9 + 0.1 * cloud, fogged)
+    direct = (1.0 - _step(0.25, 0.92, cloud)) * (1.0 - 0.92 * fogged) * (1.0 - 0.6 * rain)
+    exposure = _at(EXPOSURE, altitude) * (1.0 + (COVERED_EXPOSURE - 1.0) * overcast * _step(-4.0, 12.0, altitude))
+    is_night = altitude <= SUN_IS_DOWN_DEG
+    level = float(_at(COVERED_LEVEL, altitude)) * (1.0 - 0.32 * rain)
+    lit = lights_on(params)
+    city = CITY_GLOW * lit * max(cloud, fogged)
+    sun = MOON_LIGHT if is_night else _table(SUN_LIGHT, altitude, SUN_ALTITUDES_DEG)
+    horizon = _mixed(_table(HORIZON, altitude), COVERED_HORIZON * level, grey) + city
+    zenith = _mixed(_table(ZENITH, altitude), COVERED_ZENITH * level, grey) + 0.6 * city
+    sky_light = _mixed(_table(SKY_LIGHT, altitude), COVERED_SKY * level, grey) + city
+    ground_light = _mixed(_table(GROUND_LIGHT, altitude), COVERED_GROUND * level, grey) + 0.5 * city
+    glow = _table(SUN_GLOW, altitude) * (1.0 - grey)
+    fog_color = _mixed(horizon, 0.5 * (horizon + zenith), 0.25) + 0.12 * glow
+    return {
+        "sun_light": sun * direct,
+        "sky_light": sky_light,
+        "ground_light": ground_light,
+        "horizon": horizon,
+        "zenith": zenith,
+        "sun_glow": glow,
+        "fog_color": fog_color,
+        "fog": np.array([extinction, params.fog_distance]),
+        "overcast": overcast,
+        "cloudiness": cloud,
+        "cloud_light": _mixed(1.15 * sky_light + 0.28 * sun * (1.0 - 0.6 * cloud), 1.1 * horizon, overcast),
+        "cloud_shade": _mixed(0.95 * sky_light + 0.06 * sun, zenith, overcast),
+        "wetness": float(_step(0.0, 0.45, rain)),
+        "puddles": float(_step(0.1, 0.75, rain)),
+        "lights_on": lit,
+        "lamp_light": LAMP_LIGHT * lit,
+        "disc_light": (np.array([0.9, 0.95, 1.0]) if is_night else 4.0 * sun) * (1.0 - fogged) * direct,
+        "disc_size": MOON_DISC if is_night else SUN_DISC,
+        "stars": (1.0 - grey) * float(_step(-4.0, -14.0, altitude)) * 0.8,
+        "penumbra_m": 0.05 + 1.1 * float(_step(0.15, 0.85, cloud)),
+        "haze_m": CLEAR_HAZE_M,
+        "exposure": exposure,
+        "precipitation": rain,
+        "rain_color": _screen_color(sky_light, horizon, exposure, lit),
+    }
+
+
+def _screen_color(sky_light: np.ndarray, horizon: np.ndarray, exposure: float, lit: float) -> np.ndarray:
+    """Colour of a drop on the screen: it gathers the light of the sky, and of lamps."""
+    linear = exposure * (0.75 * sky_light + 0.55 * horizon) + lit * np.array([0.13, 0.115, 0.10])
+    return np.clip(linear, 0.0, 1.0) ** (1.0 / 2.2)
+
+
+def _step(low: float, high: float, value: float) -> float:
+    """The smooth step of shaders; low may be above high."""
+    t = float(np.clip((value - low) / (high - low), 0.0, 1.0))
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _at(values: tuple[float, ...], altitude: float) -> float:
+    return float(np.interp(altitude, ALTITUDES_DEG, values))
+
+
+def _table(rows: tuple, altitude: float, altitudes: tuple[float, ...] = ALTITUDES_DEG) -> np.ndarray:
+    return np.array([np.interp(altitude, altitudes, column) for column in np.array(rows, dtype=float).T])
+
+
+def _mixed(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    return a + (b - a) * share
+
 
 SOFT_M, FAINT = 0.25, 0.02  # from such a border on a shadow is drawn soft; a sun of less light throws none
 LAMP_UNIT, DEPTH_UNIT = 2, 3

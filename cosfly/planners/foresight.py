@@ -1,0 +1,381 @@
+"""Foresight: choose for the whole walk at once the places that see it, then smooth without losing sight.
+
+MuCO improves a flight where it is, so it stays on the blind side of a row of trees; TA*+Smooth sees both sides, but flies from voxel
+to voxel. Here dynamic programming over rings round the wished place finds the sides, with a tenth of the places, and a
+least-squares flight follows them as closely as sight and safety ask for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
+
+from cosfly.errors import NoPathError
+from cosfly.planners.contract import Plan, PlanConfig, Scenario
+from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
+from cosfly.space.kernels import (
+    HIGH_X,
+    HIGH_Y,
+    HIGH_Z,
+    LOW_X,
+    LOW_Y,
+    LOW_Z,
+    BoxIndex,
+    collect_hits,
+    distance_to_box,
+    index_boxes,
+    segments_hit,
+    signed_distances,
+    squared_gap,
+    visibility,
+)
+from cosfly.work.compiled import njit
+
+# --- the places that the search may choose from: rings round the walker, counted from the wished place ----------------
+
+
+NUM_AZIMUTHS = 36
+BETWEEN_KEYS_S, BETWEEN_KEYS_CLIMBING_S = 1.5, 3.0  # the latter lets the drone climb from one of CLIMBS to the next
+# Azimuths between one key frame and the next, against those that the wish turns by: climbing, an orbit without room can stand still.
+MAX_TURN, MAX_TURN_CLIMBING = 2, 6
+
+# Rings as (steps outwards, steps up) from the wished place. Who is hidden below canopies is seen from farther off, who is hidden behind
+# a house from above; CLIMBS lead over what blocks the way.
+RINGS = ((-1, 0), (0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (-1, 1), (0, 1))
+CLIMBS = ((0, 2), (1, 4), (2, 7), (2, 11))
+# Of the wished distance; farther apart, the drone could not change rings between keys.
+STEP_OUT_SHARE, STEP_OUT_MAX_M = 0.3, 8.0
+STEP_UP_M = 7.0
+
+# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished distance. Where the
+# bearing and the altitude are what the flight is for, 64 degrees off are as dear as the hidden walker.
+BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the wished bearing; where any will do
+HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8
+NEAR_COST, FAR_COST = 0.1, 0.03
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where the drone may be at m key frames; r rings, `NUM_AZIMUTHS` places on each.
+
+    frames: (m,) places in the walk. places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) whatever is seen from there.
+    links: (r, r) rings that can be reached from each, itself first, then -1. radius_max_m: of the largest ring.
+    max_turn: azimuths between one key frame and the next.
+    """
+
+    frames: np.ndarray
+    places_m: np.ndarray
+    costs: np.ndarray
+    links: np.ndarray
+    radius_max_m: float
+    max_turn: int
+
+
+def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
+    """Lay the rings round the walker.
+
+    Args:
+        climbing: with places far above the wished ones, at fewer key frames.
+    """
+    wish, targets, num = scenario.wish, scenario.targets_m, len(scenario.targets_m)
+    stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
+    frames = np.unique(np.append(np.arange(0, num, stride), num - 1))
+    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all around it.
+    around, ground_m = 2 * stride + 1, scenario.ground_m
+    least_z = maximum_filter1d(ground_m + wish.altitude_min_m, around, mode="nearest")[frames, None]
+    greatest_z = minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames, None]
+    rings = np.array(RINGS + CLIMBS if climbing else RINGS, dtype=np.float64)
+    distances_m, grounds_m = wish.distance_m[frames, None], wish.ground_distance_m[frames, None]
+    steps_m = np.minimum(STEP_OUT_SHARE * distances_m, STEP_OUT_MAX_M)
+    radii_m = np.maximum(grounds_m + rings[:, 0] * steps_m, grounds_m / 2.0)
+    z = np.maximum((ground_m + wish.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
+    z = np.minimum(z, np.maximum(greatest_z, least_z))
+    turns = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
+    angles = wish.view_rad[frames, None, None] + np.pi + turns
+    x = targets[frames, 0, None, None] + radii_m[:, :, None] * np.cos(angles)
+    y = targets[frames, 1, None, None] + radii_m[:, :, None] * np.sin(angles)
+    places_m = np.stack([x, y, np.broadcast_to(z[:, :, None], x.shape)], axis=-1)
+    off = (radii_m - grounds_m) / distances_m
+    turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if wish.any_bearing else (BEARING_COST, HIGH_COST)
+    aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
+    costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
+    max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
+    return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
+
+
+def _links(rings: np.ndarray) -> np.ndarray:
+    """Give the rings next to each, outwards and up, (r, r): numbers, itself first, then -1."""
+    levels = np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
+    links = np.full((len(rings), len(rings)), -1)
+    for ring in range(len(rings)):
+        near = (abs(rings[:, 0] - rings[ring, 0]) <= 1) & (abs(levels - levels[ring]) <= 1)
+        near[ring] = False
+        found = [ring, *np.flatnonzero(near)]
+        links[ring, : len(found)] = found
+    return links
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+# The cheapest sequence of places that sees the walker: dynamic programming over the key frames of a lattice.
+#
+# Each key frame is looked from once, before any way is known, so the way is the best of all, and it leaves a place before the walker
+# is hidden from there. What it costs to fly a metre is the same in one stride as in several: a jump from ring to ring is what smoothing
+# makes a gentle change of.
+
+
+WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
+NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
+SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
+REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
+
+
+def search_flight(
+    scenario: Scenario, lattice: Lattice, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
+) -> np.ndarray | None:
+    """Search the raw flight of one walk.
+
+    Args:
+        obstacles: at least the boxes of the map that can be near the lattice or hide the walker.
+        clearance_m: that points and the lines between them keep from all boxes.
+    Returns:
+        (n, 3), straight between key frames; None if no sequence of places is free.
+    """
+    frames, num_azimuths = lattice.frames, lattice.places_m.shape[2]
+    places = lattice.places_m.reshape(len(frames), -1, 3)
+    aloft = boxes_aloft(obstacles, scenario.targets_m, lattice)
+    gaps, hidden = np.zeros(places.shape[:2]), np.ones(places.shape[:2])
+    _survey(places, scenario.targets_m[frames], obstacles, aloft.rows, clearance_m, REACH_M, gaps, hidden)
+    before, after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
+    before[0], after[-1] = hidden[0], hidden[-1]
+    own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
+    own[~scenario.wish.keeps_sight[frames]] = 0.0
+    own += lattice.costs.reshape(own.shape)
+    longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=0)
+    chosen = _cheapest(
+        places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn, WAY_COST
+    )
+    if chosen[0] < 0:
+        return None
+    path, every = places[np.arange(len(frames)), chosen], np.arange(len(scenario.targets_m))
+    return np.stack([np.interp(every, frames, path[:, axis]) for axis in range(3)], axis=1)
+
+
+def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
+    """Index the boxes that may be within REACH_M of a place: most end far below a drone."""
+    rows, aside_m = obstacles.rows, lattice.radius_max_m + REACH_M
+    (low_x, low_y), (high_x, high_y) = targets_m[:, :2].min(axis=0) - aside_m, targets_m[:, :2].max(axis=0) + aside_m
+    keep = rows[:, HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
+    keep &= (
+        (rows[:, HIGH_X] >= low_x)
+        & (rows[:, LOW_X] <= high_x)
+        & (rows[:, HIGH_Y] >= low_y)
+        & (rows[:, LOW_Y] <= high_y)
+    )
+    rows = rows[keep]
+    return index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
+
+
+@njit(cache=True)
+def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
+    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the walker, both (m, c).
+
+    Places nearer than `clearance_m` keep what stands in `hidden`. aloft: rows of the boxes of `index` within `reach_m` of places.
+    """
+    near = np.empty(len(aloft), dtype=np.int64)
+    for key in range(len(places)):
+        target = targets[key]
+        away_max, least_slope = 0.0, np.inf
+        for c in range(places.shape[1]):
+            away = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
+            away_max = max(away_max, away)
+            least_slope = min(least_slope, (places[key, c, 2] - target[2] - FOOT_LOW_M) / max(away, 1.0))
+        horizon, num_near = make_horizon(index, target, away_max, least_slope), 0
+        for box in range(len(aloft)):
+            if squared_gap(aloft, box, target[0], target[1], aloft[box, LOW_Z]) <= (away_max + reach_m) ** 2:
+                near[num_near] = box
+                num_near += 1
+        for c in range(places.shape[1]):
+            x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
+            gap = reach_m
+            for k in range(num_near):
+                if gap >= clearance_m and squared_gap(aloft, near[k], x, y, z) < gap * gap:
+                    gap = min(gap, distance_to_box(aloft, near[k], x, y, z))
+            gaps[key, c] = gap
+            if gap >= clearance_m:
+                hidden[key, c] = 1.0 - look(index, horizon, target, x, y, z)
+
+
+@njit(cache=True)
+def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
+    """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
+
+    places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each key frame.
+    links: (rings, r) rings that may be come from, the first -1 ends the list.
+    """
+    num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
+    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
+    for key in range(num_keys):
+        for c in range(num_places):
+            if gaps[key, c] < clearance_m:
+                continue
+            if key == 0:
+                cost[key, c] = own[key, c]
+                continue
+            x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
+            ring, azimuth, best = c // num_azimuths, c % num_azimuths, np.inf
+            for trial in range(2 * max_turn + 1):  # 0, -1, 1, -2, 2: the nearest first rules most others out
+                turn = (trial + 1) // 2 * (1 - 2 * (trial % 2))
+                column = (azimuth + turn) % num_azimuths
+                for link in range(links.shape[1]):
+                    if links[ring, link] < 0:
+                        break
+                    b = links[ring, link] * num_azimuths + column
+                    if cost[key - 1, b] >= best:
+                        continue
+                    u, v, w = places[key - 1, b, 0], places[key - 1, b, 1], places[key - 1, b, 2]
+                    length = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
+                    guess = cost[key - 1, b] + way_cost * length
+                    if guess >= best or length > longest_m[key]:
+                        continue
+                    # Distance changes by at most a metre per metre: where both ends are freer than this, so is the line.
+                    is_close = gaps[key, c] + gaps[key - 1, b] - length < 2.0 * clearance_m
+                    if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, one) > 0:
+                        continue
+                    best, came_from[key, c] = guess, b
+            cost[key, c] = best + own[key, c]
+    chosen = np.full(num_keys, -1, dtype=np.int64)
+    last = int(np.argmin(cost[num_keys - 1]))
+    if cost[num_keys - 1, last] < np.inf:
+        chosen[num_keys - 1] = last
+        for key in range(num_keys - 1, 0, -1):
+            chosen[key - 1] = came_from[key, chosen[key]]
+    return chosen
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+# Smoothing that keeps what the raw flight sees: least squares, drawn to the raw flight where it loses sight or comes too near.
+#
+# The smoothed flight p of a raw flight r minimises the sum over waypoints of pull (p - r)^2 + velocity^2 + acceleration^2 + jerk^2, each
+# with its weight: one band system, the same for x, y and z. Waypoints that see less than their raw ones are pulled harder, up to a
+# limit, and those that come too near a box or fly too fast without one, until none is left.
+
+
+# Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there at wished places,
+# whose halts are part of what is wished; at most for the sake of sight.
+PULL_ANY_BEARING, PULL, PULL_AS_WISHED, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 20.0, 1000.0, 300.0, 4.0
+AS_WISHED_M = 0.5  # from the wished place
+# Weights of squared derivatives with respect to time: that of velocity draws the flight tight.
+VELOCITY_S2, ACCELERATION_S4, JERK_S6 = 8.0, 30.0, 100.0
+DIFFERENCES = ((VELOCITY_S2, (-1.0, 1.0)), (ACCELERATION_S4, (1.0, -2.0, 1.0)), (JERK_S6, (-1.0, 3.0, -3.0, 1.0)))
+SPREAD_S = 1.0  # neighbours are pulled along
+ROUNDS, ROUNDS_MAX = 12, 24  # for the sake of sight; for the sake of safety
+SIGHT_LOSS = 0.01  # of a waypoint that is no loss: the five rays count in fifths
+ASTRAY_SHARE = 0.3  # of the wished distance: farther from the raw flight is not the flight that was searched
+ROUNDING_M = 1e-9
+
+
+def smooth_flight(
+    raw: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
+) -> tuple[np.ndarray, dict]:
+    """Smooth a raw flight that keeps all bounds; give it back as it is if no smooth one does.
+
+    Args:
+        raw: (n, 3). clearance_m: that it keeps.
+    Returns:
+        (n, 3), and facts: visibility of the raw flight, rounds, whether a smooth flight was found.
+    """
+    wish, dt_s = scenario.wish, scenario.dt_s
+    low, high = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
+    seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * wish.distance_m
+    band, pulls = smoothness_band(len(raw), dt_s), first_pulls(raw, scenario)
+    for tried in range(1, ROUNDS_MAX + 1):
+        system = band.copy()
+        system[0] += pulls
+        points = solveh_banded(system, pulls[:, None] * raw, lower=True)
+        points[:, 2] = np.clip(points[:, 2], low, high)
+        blocked = unsafe(points, obstacles, clearance_m, cfg.speed_max_mps * dt_s)
+        lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * wish.keeps_sight
+        lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
+        lost[(lost < SIGHT_LOSS) | (pulls >= PULL_FOR_SIGHT_MAX)] = 0.0
+        is_smooth = not blocked.any()
+        if is_smooth and (tried >= ROUNDS or not lost.any()):
+            break
+        pulls = pulls * PULL_RISE ** _spread(np.maximum(lost, blocked), SPREAD_S / dt_s)
+    facts = {"raw_visibility": round(float(seen_raw.mean()), 4), "rounds": tried, "smooth": is_smooth}
+    return (points if is_smooth else raw), facts
+
+
+def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
+    """Give the pull of each waypoint of a raw flight (n, 3) before anything is lost, (n,)."""
+    if scenario.wish.any_bearing:
+        return np.full(len(raw), PULL_ANY_BEARING)
+    off_m = np.linalg.norm(raw - scenario.wish.places_m(scenario.targets_m, scenario.ground_m), axis=1)
+    return np.where(off_m <= AS_WISHED_M, PULL_AS_WISHED, PULL)
+
+
+def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
+    """Give the lower band of the matrix of squared derivatives of n points `dt_s` apart, (4, n)."""
+    band = np.zeros((4, num_points))
+    for weight, coefficients in DIFFERENCES:
+        order, num = len(coefficients) - 1, max(num_points - len(coefficients) + 1, 0)
+        for k, one in enumerate(coefficients):
+            for m, other in enumerate(coefficients[: k + 1]):
+                band[k - m, m : m + num] += weight / dt_s ** (2 * order) * one * other
+    return band
+
+
+def unsafe(points: np.ndarray, obstacles: BoxIndex, clearance_m: float, step_max_m: float) -> np.ndarray:
+    """Tell which waypoints are too near a box, or begin or end a step that is too long or leads through one, (n,) bool."""
+    found = signed_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M)
+    steps |= segments_hit(obstacles, points[:-1], points[1:])
+    found[:-1] |= steps
+    found[1:] |= steps
+    return found
+
+
+def _spread(amounts: np.ndarray, sigma: float) -> np.ndarray:
+    """Spread amounts over neighbours by a bell that is 1 at its top; at most 1 each."""
+    return np.minimum(
+        gaussian_filter1d(amounts.astype(np.float64), sigma, mode="nearest") * sigma * np.sqrt(2.0 * np.pi), 1.0
+    )
+
+
+def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
+    """Plan one flight (the signature of `planners.contract`); nothing here is random.
+
+    Raises:
+        NoPathError: no places lead along this walk.
+    """
+    raw, start, clearance_m = raw_flight(scenario, obstacles, cfg)
+    points, facts = smooth_flight(raw, scenario, obstacles, cfg, clearance_m)
+    return Plan(points, {"start": start, "clearance_m": clearance_m, **facts})
+
+
+def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
+    """Give the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it keeps, m.
+
+    Where the wished places are free and see all that they are to see, nothing is searched.
+
+    Raises:
+        NoPathError: no places lead along this walk.
+    """
+    wished, step_m = scenario.wish.places_m(scenario.targets_m, scenario.ground_m), cfg.speed_max_mps * scenario.dt_s
+    safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
+    sees_all = bool((~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)).all())
+    if sees_all and not unsafe(wished, obstacles, safety_m, SPEED_SHARE * step_m).any():
+        return wished, "wished", safety_m
+    for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
+        found = search_flight(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
+        if found is not None:
+            return found, "climbing search" if climbing else "search", clearance_m
+    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
+    raise NoPathError(
+        "no free places lead along this walk",
+        where=scenario.path_id,
+        expected=f"places from {low_m:g} to {high_m:g} m up, {relaxed_m:g} m from all boxes",
+        fix="is the walk roofed over? raise altitude_max_m or leave the path out",
+    )

@@ -1,0 +1,588 @@
+"""TA*+Smooth: a search for sight on a time-layered voxel grid, then smoothing (subsec:appendix_planner_tastar).
+
+The state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26 neighbours of a
+voxel (two, with the paper's settings), so that no direction is dearer than another; frames between layers are interpolated. All
+states of a layer have the same way to go in time, so a best-first order by cost alone with a beam per layer is the whole search:
+there is no heuristic to add. The paper names the five weights but not the terms; the terms are these, per layer:
+
+    tracking    distance to the ring round the target at the wished distance and altitude, in voxels; to the wished place on it
+                where the wish is not that of the paper, to which any bearing will do
+    visibility  1 - five-ray visibility
+    path        length of the move, in voxels
+    safety      (1 - clearance / influence)^2 below the influence distance; below the safety distance a voxel is closed
+    smoothness  squared change of the move, in voxels
+
+The move before a state is that of its cheapest predecessor: the smoothness term sees one past, not all.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from cosfly.errors import NoPathError
+from cosfly.geometry import DT_S
+from cosfly.planners.contract import Plan, PlanConfig, Scenario
+from cosfly.planners.sight import look, make_horizon
+from cosfly.space.kernels import (
+    RAY_SPREAD_M,
+    BoxIndex,
+    collect_hits,
+    free_rays,
+    nearest_box,
+    signed_distances,
+    visibility,
+)
+from cosfly.work.compiled import njit
+
+if TYPE_CHECKING:
+    from cosfly.planners.contract import PlanConfig, Scenario, TrackAStarConfig
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+# The search of TA*+Smooth, compiled: layer by layer over voxels, the cheapest states kept. Its terms: track_astar.py.
+
+
+ALTITUDE_ROUNDING_M = 1e-6  # of altitudes
+
+# The 26 neighbours of a voxel and itself.
+MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
+STAY = 13
+UNKNOWN, FREE, BLOCKED = range(3)  # edges between voxels
+
+WEIGHTS = ("tracking", "visibility", "path", "safety", "smoothness")
+TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
+
+
+class Voxels(NamedTuple):
+    """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m.
+
+    columns: (nx, ny) bool, inside the corridor. Caches, filled when first asked: clearances (cells,) m, NaN is unknown;
+    edges (cells, 27): UNKNOWN, FREE or BLOCKED.
+    """
+
+    low: np.ndarray
+    shape: np.ndarray
+    size: np.ndarray
+    columns: np.ndarray
+    clearances: np.ndarray
+    edges: np.ndarray
+
+
+class Costs(NamedTuple):
+    """Weights and lengths of the search; weights: (5,), places below.
+
+    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at each layer, NaN
+    where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
+    """
+
+    weights: np.ndarray
+    ring_m: np.ndarray
+    wished: np.ndarray
+    sight: np.ndarray
+    least_z: np.ndarray
+    preferred_z: np.ndarray
+    greatest_z: np.ndarray
+    influence_m: float
+    safety_m: float
+    start: np.ndarray
+
+
+@njit(cache=True)
+def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
+    """Give the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked from.
+
+    targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
+    """
+    num_layers, num_cells = len(targets), len(voxels.clearances)
+    cells, parents = np.empty((num_layers, beam), dtype=np.int64), np.empty((num_layers, beam), dtype=np.int64)
+    best = np.full(num_cells, np.inf)
+    came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
+    touched, num_seen = np.empty(num_cells, dtype=np.int64), 0
+    lengths, bends = _move_tables(voxels.size)
+    cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)
+    size = 0
+    for layer in range(num_layers):
+        if layer == 0:
+            num = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
+        else:
+            num = _expand(
+                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], lengths, bends, voxels, costs, index,
+                best, came_from, came_by, touched,
+            )  # fmt: skip
+        chosen, total, seen = _choose(touched[:num], best, targets[layer], layer, voxels, costs, index, beam)
+        num_seen += seen
+        size = len(chosen)
+        if size == 0:
+            return np.full(num_layers, -1, dtype=np.int64), np.inf, num_seen
+        for b in range(size):
+            cells[layer, b], parents[layer, b] = chosen[b], came_from[chosen[b]]
+            cost_before[b], move_before[b] = total[b], came_by[chosen[b]]
+        for place in range(num):
+            best[touched[place]] = np.inf
+    way, b = np.empty(num_layers, dtype=np.int64), int(np.argmin(cost_before[:size]))
+    cost = cost_before[b]
+    for layer in range(num_layers - 1, -1, -1):
+        way[layer] = cells[layer, b]
+        b = parents[layer, b]
+    return way, cost, num_seen
+
+
+@njit(cache=True)
+def _move_tables(size):
+    """Give the length of each move, m, and the squared change between each two, in voxels."""
+    lengths, bends = np.empty(len(MOVES)), np.empty((len(MOVES), len(MOVES)))
+    for m in range(len(MOVES)):
+        lengths[m] = np.sqrt(((MOVES[m] * size) ** 2).sum())
+        for k in range(len(MOVES)):
+            bends[m, k] = ((MOVES[m] - MOVES[k]) ** 2).sum()
+    return lengths, bends
+
+
+@njit(cache=True)
+def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came_by, touched):
+    """Put the free cells within the corridor of the first target into `touched`; they cost the way from the plain start."""
+    num_y, num_z, num = voxels.shape[1], voxels.shape[2], 0
+    for ix in range(voxels.shape[0]):
+        for iy in range(num_y):
+            x, y = voxels.low[0] + ix * voxels.size[0], voxels.low[1] + iy * voxels.size[1]
+            if (x - target[0]) ** 2 + (y - target[1]) ** 2 > corridor_m * corridor_m or not voxels.columns[ix, iy]:
+                continue
+            for iz in range(num_z):
+                cell, z = (ix * num_y + iy) * num_z + iz, voxels.low[2] + iz * voxels.size[2]
+                if not _is_in_bounds(z, costs, 0) or _clearance(cell, voxels, costs, index) < costs.safety_m:
+                    continue
+                away = np.sqrt((x - costs.start[0]) ** 2 + (y - costs.start[1]) ** 2 + (z - costs.start[2]) ** 2)
+                best[cell] = costs.weights[PATH] * away / voxels.size[0]
+                came_from[cell], came_by[cell], touched[num] = -1, STAY, cell
+                num += 1
+    return num
+
+
+@njit(cache=True)
+def _expand(
+    sources,
+    cost_before,
+    move_before,
+    layer,
+    reach_m,
+    lengths,
+    bends,
+    voxels,
+    costs,
+    index,
+    best,
+    came_from,
+    came_by,
+    touched,
+):
+    """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from` and `came_by`."""
+    num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
+    for b in range(len(sources)):
+        cell = sources[b]
+        ix, iy, iz = cell // (num_y * num_z), (cell // num_z) % num_y, cell % num_z
+        for move in range(len(MOVES)):
+            jx, jy, jz = ix + MOVES[move, 0], iy + MOVES[move, 1], iz + MOVES[move, 2]
+            if lengths[move] > reach_m + 1e-9 or not (0 <= jx < num_x and 0 <= jy < num_y and 0 <= jz < num_z):
+                continue
+            there = (jx * num_y + jy) * num_z + jz
+            cost = (
+                cost_before[b]
+                + costs.weights[PATH] * lengths[move] / voxels.size[0]
+                + costs.weights[SMOOTHNESS] * bends[move_before[b], move]
+            )
+            if cost >= best[there] or not voxels.columns[jx, jy]:
+                continue
+            if not _is_in_bounds(voxels.low[2] + jz * voxels.size[2], costs, layer):
+                continue
+            if voxels.edges[cell, move] == UNKNOWN:
+                voxels.edges[cell, move] = FREE if _edge_is_free(cell, there, voxels, costs, index) else BLOCKED
+            if voxels.edges[cell, move] == BLOCKED:
+                continue
+            if best[there] == np.inf:
+                touched[num] = there
+                num += 1
+            best[there], came_from[there], came_by[there] = cost, b, move
+    return num
+
+
+@njit(cache=True)
+def _choose(touched, best, target, layer, voxels, costs, index, beam):
+    """Add the cost of being there and give the `beam` cheapest cells, their costs, and how many were looked from.
+
+    Visibility is asked only where the cost without it is within the beam.
+    """
+    bounds, reach_m = np.empty(len(touched)), 0.0
+    for k in range(len(touched)):
+        cell = touched[k]
+        x, y, z = _place(cell, voxels)
+        away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
+        reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
+        wished_x, wished_y = costs.wished[layer, 0], costs.wished[layer, 1]
+        if not np.isnan(wished_x):
+            aside = np.sqrt((x - wished_x) ** 2 + (y - wished_y) ** 2)
+        climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known: the way here has asked for it
+        near = max(0.0, 1.0 - gap / costs.influence_m)
+        off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
+        bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
+    horizon = make_horizon(index, target, reach_m, 0.0)
+    total, num = np.full(len(touched), np.inf), 0
+    limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
+    for k in range(len(touched)):  # those that would stay if all saw everything
+        if bounds[k] <= limit:
+            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            num += 1
+    if num < len(touched):
+        limit = np.partition(total, beam - 1)[beam - 1]
+    for k in range(len(touched)):  # and those that are cheaper than what has turned out to be hidden
+        if total[k] == np.inf and bounds[k] < limit:
+            total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
+            num += 1
+            if num % 256 == 0:
+                limit = np.partition(total, beam - 1)[beam - 1]
+    limit = np.partition(total, beam - 1)[beam - 1] if num > beam else np.inf
+    chosen, kept, size = np.empty(min(num, beam), dtype=np.int64), np.empty(min(num, beam)), 0
+    for k in range(len(touched)):
+        if total[k] <= limit and total[k] < np.inf and size < beam:
+            chosen[size], kept[size] = touched[k], total[k]
+            size += 1
+    return chosen[:size], kept[:size], num
+
+
+@njit(cache=True, inline="always")
+def _is_in_bounds(z, costs, layer):
+    """Tell whether a height keeps the altitudes of a layer."""
+    return costs.least_z[layer] - ALTITUDE_ROUNDING_M <= z <= costs.greatest_z[layer] + ALTITUDE_ROUNDING_M
+
+
+@njit(cache=True, inline="always")
+def _look(cell, voxels, index, horizon, target):
+    x, y, z = _place(cell, voxels)
+    return look(index, horizon, target, x, y, z)
+
+
+@njit(cache=True, inline="always")
+def _place(cell, voxels):
+    num_y, num_z = voxels.shape[1], voxels.shape[2]
+    return (
+        voxels.low[0] + (cell // (num_y * num_z)) * voxels.size[0],
+        voxels.low[1] + ((cell // num_z) % num_y) * voxels.size[1],
+        voxels.low[2] + (cell % num_z) * voxels.size[2],
+    )
+
+
+@njit(cache=True)
+def _clearance(cell, voxels, costs, index):
+    """Signed distance of a cell's centre to the nearest box, m, at most what the costs ask for."""
+    if np.isnan(voxels.clearances[cell]):
+        x, y, z = _place(cell, voxels)
+        # Farther than the influence matters to the edges alone: beyond this no edge needs a closer look.
+        reach_m = max(costs.influence_m, costs.safety_m + np.sqrt((voxels.size**2).sum()) / 2.0)
+        voxels.clearances[cell], _ = nearest_box(index, x, y, z, reach_m)
+    return voxels.clearances[cell]
+
+
+@njit(cache=True)
+def _edge_is_free(cell, there, voxels, costs, index):
+    """Tell whether the line between two cells keeps the safety distance."""
+    a, b = _clearance(cell, voxels, costs, index), _clearance(there, voxels, costs, index)
+    if a < costs.safety_m or b < costs.safety_m:
+        return False
+    ax, ay, az = _place(cell, voxels)
+    bx, by, bz = _place(there, voxels)
+    length = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
+    if a + b - length >= 2.0 * costs.safety_m:  # distance changes by at most a metre per metre
+        return True
+    return collect_hits(index, ax, ay, az, bx, by, bz, costs.safety_m, np.empty(1, dtype=np.int64)) == 0
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+# The smoothing of TA*+Smooth: shortcuts, then an elastic band, then a verdict (subsec:appendix_planner_tastar).
+#
+# Only positions change; each keeps its frame and its target. A candidate is valid if the point keeps the safety distance, its
+# altitude and the speed limit, hits nothing on the way to its neighbours, and sees at most `visibility_loss_point` less than the
+# raw flight at that frame (five rays: a fifth is the least that can be lost, so nothing is).
+#
+# The paper leaves open which waypoints are "flagged as visibility anchors". Were it all that see fully, almost none could move;
+# here it is those that see fully beside one that does not: the edges of an occlusion, which hold the path round it.
+
+
+ROUNDING_M = 1e-9
+GAP, STEP = range(2)  # places in `limits`: least distance to boxes, longest step, m
+LOW, HIGH = range(2)  # columns of `heights`, (n, 2): least and greatest z of each waypoint
+
+
+def smooth_flight(
+    raw: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, safety_m: float
+) -> tuple[np.ndarray, dict]:
+    """Smooth a raw flight; give it back as it is if the result is not accepted.
+
+    Args:
+        raw: (n, 3). safety_m: the distance that it keeps.
+    Returns:
+        (n, 3), and facts: shortcuts, elastic iterations, anchors, `smoothing`: `accepted` or the criterion that failed.
+    """
+    settings, wish = cfg.track_astar, scenario.wish
+    raw = np.ascontiguousarray(raw, dtype=np.float64)
+    targets = np.ascontiguousarray(scenario.targets_m, dtype=np.float64)
+    seen = visibility(obstacles, raw, targets)
+    floors = seen - settings.visibility_loss_point
+    limits = np.array([safety_m, cfg.speed_max_mps * scenario.dt_s])
+    heights = scenario.ground_m[:, None] + np.stack([wish.altitude_min_m, wish.altitude_max_m], axis=1)
+    anchors = anchor_flags(seen, settings.anchor_visibility)
+    points = raw.copy()
+    num_shortcuts = shortcut(points, targets, floors, heights, obstacles, limits, settings.shortcut_frames)
+    num_iterations = relax(
+        points, targets, floors, heights, anchors, obstacles, limits,
+        settings.elastic_iterations, settings.elastic_step, settings.elastic_step_min,
+    )  # fmt: skip
+    verdict = judge(points, seen, targets, obstacles, settings, safety_m)
+    facts = {
+        "shortcuts": int(num_shortcuts), "elastic_iterations": int(num_iterations), "anchors": int(anchors.sum()),
+        "raw_visibility": round(float(seen.mean()), 4), "smoothing": verdict,
+    }  # fmt: skip
+    return (points if verdict == "accepted" else raw), facts
+
+
+def anchor_flags(seen: np.ndarray, threshold: float) -> np.ndarray:
+    """Flag frames that see more than `threshold` beside one that does not, (n,) bool."""
+    full = seen > threshold
+    beside = np.zeros(len(seen), dtype=bool)
+    beside[1:] |= ~full[:-1]
+    beside[:-1] |= ~full[1:]
+    return full & beside
+
+
+def judge(
+    points: np.ndarray, seen_raw: np.ndarray, targets: np.ndarray, obstacles: BoxIndex, cfg: TrackAStarConfig, safety_m: float
+) -> str:  # fmt: skip
+    """Apply the three criteria to a smoothed flight; give `accepted`, or the name of the first that fails."""
+    seen = visibility(obstacles, points, targets)
+    if seen_raw.mean() - seen.mean() > cfg.visibility_loss_mean:
+        return "mean_visibility"
+    if (seen_raw - seen)[seen <= cfg.anchor_visibility].max(initial=0.0) > cfg.visibility_loss_frame:
+        return "frame_visibility"
+    if signed_distances(obstacles, points, safety_m)[0].min() < safety_m - ROUNDING_M:
+        return "clearance"
+    return "accepted"
+
+
+# --- compiled ---------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def candidate_is_valid(x, y, z, target, floor, low, high, index, limits, blockers):
+    """Tell whether a waypoint keeps distance, altitude (low to high) and sight. limits: (2,) m, places above."""
+    if z < low - ROUNDING_M or z > high + ROUNDING_M:
+        return False
+    gap, _ = nearest_box(index, x, y, z, limits[GAP])
+    if gap < limits[GAP]:
+        return False
+    if floor <= 0.0:
+        return True
+    count = collect_hits(index, target[0], target[1], target[2], x, y, z, RAY_SPREAD_M, blockers)
+    return count == 0 or free_rays(index, blockers, count, x, y, z, target) >= floor
+
+
+@njit(cache=True)
+def step_is_valid(ax, ay, az, bx, by, bz, index, limits, one):
+    """Tell whether a step between two valid waypoints is short enough and hits nothing."""
+    length = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
+    if length > limits[STEP] + ROUNDING_M:
+        return False
+    # Both ends keep the safety distance: a step shorter than twice that reaches no box.
+    return length < 2.0 * limits[GAP] or collect_hits(index, ax, ay, az, bx, by, bz, 0.0, one) == 0
+
+
+@njit(cache=True)
+def shortcut(points, targets, floors, heights, index, limits, frames_max):
+    """Replace runs of up to `frames_max` waypoints by straight lines, in place, the longest that is valid first.
+
+    Args:
+        points, targets: (n, 3). floors: (n,) least visibility. heights: (n, 2), columns above.
+    Returns:
+        number of lines drawn.
+    """
+    blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
+    first, drawn, last = 0, 0, len(points) - 1
+    while first < last - 1:
+        step = 1
+        for span in range(min(frames_max, last - first), 1, -1):
+            if _line_is_valid(points, targets, floors, heights, first, span, index, limits, blockers, one):
+                start, end = points[first].copy(), points[first + span].copy()
+                for k in range(1, span):
+                    points[first + k] = start + (end - start) * (k / span)
+                step = span
+                drawn += 1
+                break
+        first += step
+    return drawn
+
+
+@njit(cache=True)
+def _line_is_valid(points, targets, floors, heights, first, span, index, limits, blockers, one):
+    ax, ay, az = points[first, 0], points[first, 1], points[first, 2]
+    dx, dy, dz = points[first + span, 0] - ax, points[first + span, 1] - ay, points[first + span, 2] - az
+    px, py, pz = ax, ay, az
+    for k in range(1, span + 1):
+        x, y, z = ax + dx * (k / span), ay + dy * (k / span), az + dz * (k / span)
+        i = first + k
+        low, high = heights[i, LOW], heights[i, HIGH]
+        if k < span and not candidate_is_valid(x, y, z, targets[i], floors[i], low, high, index, limits, blockers):
+            return False
+        if not step_is_valid(px, py, pz, x, y, z, index, limits, one):
+            return False
+        px, py, pz = x, y, z
+    return True
+
+
+@njit(cache=True)
+def relax(points, targets, floors, heights, anchors, index, limits, iterations, step_first, step_least):
+    """Draw each interior waypoint that is no anchor towards the middle of its neighbours, in place.
+
+    A step that is not valid is halved down to `step_least`, then left out. Stops when no waypoint has moved.
+
+    Returns:
+        number of iterations.
+    """
+    blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
+    for iteration in range(iterations):
+        moved = False
+        for i in range(1, len(points) - 1):
+            dx = 0.5 * (points[i - 1, 0] + points[i + 1, 0]) - points[i, 0]
+            dy = 0.5 * (points[i - 1, 1] + points[i + 1, 1]) - points[i, 1]
+            dz = 0.5 * (points[i - 1, 2] + points[i + 1, 2]) - points[i, 2]
+            if anchors[i] or dx * dx + dy * dy + dz * dz < 1e-10:  # a hundredth of a millimetre
+                continue
+            step = step_first
+            while step >= step_least:
+                x, y, z = points[i, 0] + step * dx, points[i, 1] + step * dy, points[i, 2] + step * dz
+                if (
+                    candidate_is_valid(
+                        x, y, z, targets[i], floors[i], heights[i, LOW], heights[i, HIGH], index, limits, blockers
+                    )
+                    and step_is_valid(points[i - 1, 0], points[i - 1, 1], points[i - 1, 2], x, y, z, index, limits, one)
+                    and step_is_valid(x, y, z, points[i + 1, 0], points[i + 1, 1], points[i + 1, 2], index, limits, one)
+                ):
+                    points[i, 0], points[i, 1], points[i, 2] = x, y, z
+                    moved = True
+                    break
+                step *= 0.5
+        if not moved:
+            return iteration + 1
+    return iterations
+
+
+MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
+
+
+def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
+    """Plan one flight (the signature of `planners.contract`); nothing here is random.
+
+    Raises:
+        NoPathError: the grid is too large, or no voxels lead along this walk.
+    """
+    for safety_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
+        found = search_flight(scenario, obstacles, cfg, safety_m)
+        if found is not None:
+            raw, facts = found
+            points, smoothing = smooth_flight(raw, scenario, obstacles, cfg, safety_m)
+            return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
+    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
+    raise NoPathError(
+        "no free voxels lead along this walk",
+        where=scenario.path_id,
+        expected=f"places from {low_m:g} to {high_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
+        fix="is the walk roofed over? raise altitude_max_m or leave the path out",
+    )
+
+
+def search_flight(
+    scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, safety_m: float
+) -> tuple[np.ndarray, dict] | None:
+    """Search the raw flight of one walk.
+
+    Args:
+        safety_m: least distance to obstacles of points and of the lines between them.
+    Returns:
+        (n, 3) one position per target, and facts of the search; None if there is no way.
+    """
+    settings, targets, wish = cfg.track_astar, scenario.targets_m, scenario.wish
+    voxels = make_voxels(scenario, cfg)
+    stride = frames_per_layer(cfg, scenario.dt_s)
+    frames = np.unique(np.append(np.arange(0, len(targets), stride), len(targets) - 1))
+    # Between layers the flight is straight while the ground may rise and fall: a layer keeps the bounds of all frames around it.
+    around, ground_m = 2 * stride + 1, scenario.ground_m
+
+    def highest(altitudes_m: np.ndarray) -> np.ndarray:
+        return maximum_filter1d(ground_m + altitudes_m, around, mode="nearest")[frames]
+
+    preferred_z, places = highest(wish.altitude_m), wish.places_m(targets, ground_m)[frames, :2]
+    costs = Costs(
+        weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
+        ring_m=wish.ground_distance_m[frames], wished=np.full_like(places, np.nan) if wish.any_bearing else places,
+        sight=settings.weight_visibility * wish.keeps_sight[frames],
+        least_z=highest(wish.altitude_min_m), preferred_z=preferred_z,
+        greatest_z=minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames],
+        influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
+    )  # fmt: skip
+    reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
+    cells, cost, num_seen = search_layers(
+        targets[frames], reaches_m, voxels, costs, obstacles, settings.beam, settings.corridor_m
+    )
+    if cells[0] < 0:
+        return None
+    places = voxels.low + np.stack(np.unravel_index(cells, tuple(voxels.shape)), axis=1) * voxels.size
+    every = np.arange(len(targets))
+    raw = np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1)
+    sizes = {"num_layers": len(frames), "num_cells": len(voxels.clearances), "states_seen": int(num_seen)}
+    return raw, {**sizes, "cost": float(cost)}
+
+
+def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:
+    """Frames that the drone needs at most to reach a neighbouring voxel."""
+    settings = cfg.track_astar
+    diagonal_m = float(np.sqrt(2.0 * settings.voxel_m**2 + settings.voxel_height_m**2))
+    return int(np.ceil(diagonal_m / (cfg.speed_max_mps * dt_s) - 1e-9))
+
+
+def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
+    """Lay the grid round a walk: the corridor in the plane, the altitude bounds above it.
+
+    Raises:
+        NoPathError: more than MAX_CELLS.
+    """
+    settings, flat, wish = cfg.track_astar, scenario.targets_m[:, :2], scenario.wish
+    low_xy = flat.min(axis=0) - settings.corridor_m
+    num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1
+    least_z, greatest_z = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
+    num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
+    if num_xy.prod() * num_z > MAX_CELLS:
+        raise NoPathError(
+            "the walk is too long for the voxel grid", where=scenario.path_id, got=f"{num_xy.prod() * num_z:.0f} voxels",
+            expected=f"at most {MAX_CELLS}", fix="raise track_astar.voxel_m",
+        )  # fmt: skip
+    shape = np.array([*num_xy, num_z], dtype=np.int64)
+    size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])
+    low = np.array([*low_xy, least_z.min()])
+    num_cells = int(shape.prod())
+    return Voxels(
+        low, shape, size, _corridor(low, shape, size, np.ascontiguousarray(flat), settings.corridor_m),
+        np.full(num_cells, np.nan), np.zeros((num_cells, len(MOVES)), dtype=np.int8),
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _corridor(low, shape, size, flat, margin_m):
+    """Tell which columns are within `margin_m` of a point of the walk."""
+    inside = np.zeros((shape[0], shape[1]), dtype=np.bool_)
+    for ix in range(shape[0]):
+        for iy in range(shape[1]):
+            x, y = low[0] + ix * size[0], low[1] + iy * size[1]
+            for point in range(len(flat)):
+                if (flat[point, 0] - x) ** 2 + (flat[point, 1] - y) ** 2 <= margin_m * margin_m:
+                    inside[ix, iy] = True
+                    break
+    return inside

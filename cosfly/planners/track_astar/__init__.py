@@ -1,1 +1,0 @@
-"""TA*+Smooth: a search for sight, then smoothing."""
