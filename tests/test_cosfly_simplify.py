@@ -377,8 +377,6 @@ def test_simplifying_is_deterministic_and_leaves_its_input_alone():
 
 
 def test_settings_name_their_problems():
-    with pytest.raises(ConfigError, match=r"ground_z_m: unknown setting \(leave it out: the header of the map"):
-        build(SimplifyConfig, {"ground_z_m": 2}, "x")
     with pytest.raises(ConfigError, match=r"min_fill.*less than or equal to 1"):
         build(SimplifyConfig, {"min_fill": 2}, "x")
     with pytest.raises(ConfigError, match=r"merge_gap_m\.Vegetatoin.*Vegetation"):
