@@ -292,12 +292,7 @@ def write_flight(folder: Path, flight: Flight) -> None:
     raw["source"] = flight.source
     raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
     camera = flight.camera
-    raw["camera"] = {
-        **object_of(raw, "camera"),
-        "width": camera.width_px,
-        "height": camera.height_px,
-        **_focal(camera),
-    }
+    raw["camera"] = {**object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **_focal(camera)}
     raw["augmentation"] = {
         "enabled": not flight.is_original,
         "aug_index": 0 if flight.is_original else 1,

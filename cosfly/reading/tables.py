@@ -46,9 +46,7 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[pq.ParquetFi
     with open_file(path, what="parquet file", tree=tree) as file:
         with arrow_errors(path):
             table = pq.ParquetFile(
-                file,
-                thrift_string_size_limit=MOST_FOOTER_BYTES,
-                thrift_container_size_limit=MOST_FOOTER_BYTES,
+                file, thrift_string_size_limit=MOST_FOOTER_BYTES, thrift_container_size_limit=MOST_FOOTER_BYTES
             )
         with table:
             yield table

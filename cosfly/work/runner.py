@@ -131,12 +131,7 @@ def _in_this_process(
 
 
 def _in_processes(
-    stage: StageFolder,
-    items: Sequence[Item],
-    start: _Start,
-    workers: int,
-    watch: Watch,
-    progress: _Progress,
+    stage: StageFolder, items: Sequence[Item], start: _Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[ItemRecord, None, None]:
     events = EventLog(stage.path, progress.how_far)
     pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move)
