@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -44,25 +44,6 @@ class Entry:
     @property
     def place(self) -> Place:
         return Place(*self.name.split("/"))
-
-
-class FlightSource(Protocol):
-    """What gives the rows and pictures of flights. files: kinds of pictures that every row has."""
-
-    @property
-    def files(self) -> tuple[FrameFile, ...]: ...
-
-    def rows(self, entry: Entry) -> list[Row]:
-        """Give the rows of a flight, without pictures. Raises InputError where they cannot be read."""
-        ...
-
-    def pictures(self, entry: Entry) -> Iterator[Pictures]:
-        """Yield the pictures of each row, in their order. Raises InputError as `rows`."""
-        ...
-
-
-def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
-    return FlightRows(entry.name, source.rows(entry), entry.given_id, entry.num_frames)
 
 
 def with_ids(entries: list[Entry], shown: Mapping[str, str] | None = None) -> list[Entry]:
@@ -235,3 +216,10 @@ class Tree:
                 else None
                 for file in self.files
             }
+
+
+FlightSource = Shards | Tree
+
+
+def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
+    return FlightRows(entry.name, source.rows(entry), entry.given_id, entry.num_frames)
