@@ -1,7 +1,7 @@
 """Slots: the teacher names facts, their values are filled in from the flight, in both languages.
 
-Numbers, units, sides, trends and the mirror are right by construction. A sentence with a slot is proved, unless a word stands in it
-that a slot could have said; a sentence without one is unread.
+Numbers, units, sides, trends and the mirror are right by construction. A sentence is proved if its words beside slots are known and
+fit them (earned.py); else it is unread.
 """
 
 from __future__ import annotations
