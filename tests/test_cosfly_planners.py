@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
-from cosfly.errors import ConfigError, InputError, NoPathError, NothingKept, ResumeError
+from cosfly.errors import InputError, NoPathError, NothingKept, ResumeError
 from cosfly.geometry import DT_S, look_at
 from cosfly.planners import courses
 from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
@@ -23,7 +23,6 @@ from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
 from cosfly.space import flight_metrics as metrics
 from cosfly.space import kernels
-from cosfly.work.config import load
 
 CFG = PlanConfig()
 
@@ -386,15 +385,6 @@ def test_a_small_learning_rate_lets_the_papers_step_fall():
     assert slow["stopped"] in ("converged", "iteration_limit")
 
 
-def test_the_safety_checker_notices_a_flight_through_a_tower():
-    _, obstacles = scenario_of("tower_behind")
-    through = np.column_stack([np.linspace(-40, 0, 30), np.zeros(30), np.full(30, 20.0)])
-    with pytest.raises(AssertionError):
-        assert_safe(through, obstacles)
-    scenario, _ = scenario_of("tower_behind")
-    assert not step.is_feasible(through, muco.make_problem(scenario, CFG), obstacles, nothing_nearby(len(through)))
-
-
 def test_a_thin_wall_between_two_waypoints_is_a_collision():
     wall = kernels.obstacle_index(town_of(((0, 0, 20), (0.01, 50, 40))))
     points = np.array([[-2.45, 0, 20.0], [2.45, 0, 20.0]])
@@ -447,11 +437,6 @@ def test_a_flight_whose_optimizer_was_stopped_is_dropped(inputs, tmp_path, muco_
     assert {trace.solver["stopped"] for trace in traces} == {"iteration_limit"} or not dropped
 
 
-def test_the_former_setting_of_the_gradient_is_known():
-    with pytest.raises(ConfigError, match="it goes with the step"):
-        load(PlanConfig, None, ["muco.gradient=analytic"])
-
-
 def test_settings_that_contradict_are_refused():
     for bad in (
         {"relaxed_safety_m": 4.0},
@@ -461,11 +446,6 @@ def test_settings_that_contradict_are_refused():
     ):
         with pytest.raises(ValueError, match=r"may not exceed|ascending|lower one first|Extra inputs"):
             PlanConfig.model_validate(bad)
-
-
-def test_settings_are_read_without_compiled_code():
-    code = "import sys, cosfly.planners.contract, cosfly.planners.stage; sys.exit('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -484,6 +464,11 @@ def inputs(tmp_path_factory):
     ]
     write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
     return folder / "map.json", folder / "path.json"
+
+
+def test_settings_are_read_without_compiled_code():
+    code = "import sys, cosfly.planners.contract, cosfly.planners.stage; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_stage_counts_failures_and_does_the_others(inputs, tmp_path):

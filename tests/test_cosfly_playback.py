@@ -12,7 +12,6 @@ from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from specimens import PERSON_ID, make_playback_tree
@@ -240,10 +239,6 @@ def test_an_offset_that_is_not_on_record_is_unknown_and_no_zero(tree, tmp_path):
     write_flight(target, flight)
     assert json.loads((target / "trajectory.json").read_text())["points"][1]["perturbation"]["drone_position"] is True
     assert_array_equal(read_flight(target).drone_offsets_m, flight.drone_offsets_m)
-
-
-def test_names():
-    assert sample_id("trajectory_1776047127_ORI", 4) == "trajectory_1776047127_ORI_frame_00004"
 
 
 def test_not_a_tree(tmp_path):

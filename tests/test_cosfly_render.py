@@ -311,11 +311,6 @@ def test_gait_follows_motion_and_keeps_the_heading_when_standing():
 # --- the target in the picture ----------------------------------------------------------------------------------------
 
 
-def test_focal_length_is_the_papers_formula():
-    assert focal_px(1280, 90.0) == pytest.approx(640.0)
-    assert focal_px(1280, 110.0) == pytest.approx(448.13, abs=0.01)
-
-
 def test_target_in_the_middle_of_the_picture():
     hip = np.array([0.0, 10.0, 0.9])
     view = view_target(hip, pose_towards((0, 0, 0.9), hip), CAMERA)

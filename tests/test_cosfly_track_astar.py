@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
+from specimens_planning import WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
 from cosfly.errors import NoPathError
@@ -27,7 +27,7 @@ def random_town(seed):
 # --- sight ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_look_sees_what_the_kernel_sees(seed):
     obstacles, rng = random_town(seed), np.random.default_rng(seed)
     target = np.array([*rng.uniform(-30, 30, 2), 1.0])
@@ -40,12 +40,6 @@ def test_a_look_sees_what_the_kernel_sees(seed):
     expected = kernels.visibility(obstacles, points, np.repeat(target[None], len(points), axis=0))
     np.testing.assert_array_equal(seen, expected)
     assert 0.02 < expected.mean() < 0.98  # the sample holds both
-
-
-def test_without_boxes_everything_is_seen():
-    obstacles, target = kernels.obstacle_index(town_of()), np.array([0.0, 0.0, 1.0])
-    horizon = sight.make_horizon(obstacles, target, 50.0, 0.0)
-    assert sight.look(obstacles, horizon, target, 10.0, 0.0, 20.0) == 1.0
 
 
 # --- search -----------------------------------------------------------------------------------------------------------
@@ -264,16 +258,3 @@ def test_the_verdict_on_sight_and_the_fallback(monkeypatch):
     )
     assert result is points
     assert facts["smoothing"] == "clearance"
-
-
-def test_the_stage_flies_it(tmp_path):
-    from cosfly.products.boxes import write_boxes
-    from cosfly.products.traces import read_traces
-    from cosfly.products.walks import write_paths
-
-    write_boxes(tmp_path / "map.json", town_of(*CANYON))
-    write_paths(tmp_path / "path.json", [walk_along("a", [(0, 0), (40, 0)])], {})
-    product = planners.run(CFG, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
-    (trace,) = read_traces(product)
-    assert trace.planner == "track_astar"
-    assert trace.solver["smoothing"] == "accepted"

@@ -381,16 +381,6 @@ def test_the_look_is_in_the_picture(renderer_name):
     assert len({round(value) for value in brightness}) == len(brightness), brightness
 
 
-def test_the_same_scene_twice_gives_the_same_bytes(renderer_name):
-    digests = []
-    for _ in range(2):
-        renderer = opened(renderer_name, street())
-        digests.append(_digest(renderer))
-        digests.append(_digest(renderer))
-        renderer.close()
-    assert len(set(digests)) == 1
-
-
 def test_another_process_gives_the_same_picture(renderer_name):
     renderer = opened(renderer_name, street())
     here = _digest(renderer)
