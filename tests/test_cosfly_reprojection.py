@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from cosfly.products.frames import grid_rows
 from cosfly.products.kinds import KINDS
 from cosfly.render.contract import LAYERS
-from cosfly.space.reprojection import COLUMNS, FLAT, View, compare_views, median_of
+from cosfly.space.reprojection import COLUMNS, FLAT, GRID_ROWS, View, compare_views, median_of
 
 
 def test_flat_is_what_renderers_lay_in_layers():
@@ -66,7 +65,7 @@ def test_points_come_out_in_a_picture_of_another_size():
     wall = building_at(20.0)
     halved = View(wall.depth[::2, ::2].copy(), wall.instance[::2, ::2].copy(), np.eye(3), np.array([-20.0, 0.0, 0.0]))  # fmt: skip
     found = compare_views(wall, halved, CAMERA, CAMERA / 2.0)
-    columns, rows = ((np.arange(num) + 0.5) * size // num for num, size in ((COLUMNS, 160), (len(grid_rows(90)), 90)))
+    columns, rows = ((np.arange(num) + 0.5) * size // num for num, size in ((COLUMNS, 160), (GRID_ROWS, 90)))
     s, t = (columns + 0.5) / 2.0 + 40.0, (rows + 0.5) / 2.0
     assert found.seen == ((s > 1.5) & (s < 77.5)).sum() * ((t > 1.5) & (t < 42.5)).sum()
     assert (found.agree, found.through, found.same) == (found.seen, 0, found.seen)

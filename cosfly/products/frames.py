@@ -44,12 +44,6 @@ COORDINATES = {
     "rotation": "degrees; yaw clockwise seen from above, pitch nose-up, roll right-side-down",
     "camera": "pose of the camera; image x right, y down; depth along the optical axis",
 }
-GRID_ROWS = 36  # rows of a picture that are compared between frames: what is read of one without the whole
-
-
-def grid_rows(height_px: int) -> np.ndarray:
-    """Rows of the grid, (GRID_ROWS,)."""
-    return ((np.arange(GRID_ROWS) + 0.5) * height_px / GRID_ROWS).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -324,7 +318,7 @@ def depth_values(data: memoryview, where: Path) -> np.ndarray:
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:
     """The content of `rgb.png`, of (h, w, 3) uint8. The rows that pictures are compared by can be read without the others."""
-    return colours_png(rgb, grid_rows(len(rgb)))
+    return colours_png(rgb)
 
 
 def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:

@@ -1,10 +1,10 @@
 """PNG as playback trees and releases hold it: 8 bits, grey to RGBA, not interlaced (RFC 2083).
 
 Read: the checksums of chunks and stream and the number of bytes are always compared, so a picture that passes is whole; it is never unpacked to
-more than its header says. Filters are undone when rows are wanted, and where few are, in these alone and those they lean on.
+more than its header says. Filters are undone when pixels are wanted.
 
-Written, of two kinds: colours have texture, so each row is stored as the difference to the average of its left and upper neighbours, but rows that
-somebody reads alone to the left one. Instance masks have areas: their bytes stay as they are, and the packing finds the row above.
+Written, of two kinds: colours have texture, so each row is stored as the difference to the average of its left and upper neighbours. Instance masks
+have areas: their bytes stay as they are, and the packing finds the row above.
 """
 
 from __future__ import annotations
@@ -14,15 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from isal import isal_zlib as zlib
 
 from cosfly.errors import InputError
 from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 from cosfly.work.compiled import njit
-
-try:
-    from isal import isal_zlib as zlib
-except ImportError:  # the same pixels in two to three times the time
-    import zlib  # type: ignore[no-redef]
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
 MOST_NAMED = 8  # chunks
@@ -45,16 +41,6 @@ class Png:
     others: tuple[str, ...] = ()
     num_behind: int = 0
     _pixels: np.ndarray | None = None
-
-    def rows(self, wanted: np.ndarray) -> np.ndarray:
-        """Give some rows, (k, w, channels) uint8."""
-        if self._pixels is None:
-            stands_alone = self.lines[:, 0] <= SUB
-            first = np.maximum.accumulate(np.where(stands_alone, np.arange(self.height_px), 0))[wanted]
-            if (wanted - first + 1).sum() < self.height_px // 2:
-                found = [_undone(self.lines[a : b + 1], self.channels)[-1] for a, b in zip(first, wanted, strict=True)]
-                return np.array(found).reshape(len(wanted), self.width_px, self.channels)
-        return self.pixels()[wanted]
 
     def pixels(self) -> np.ndarray:
         """Give the picture, (h, w, channels) uint8."""
@@ -85,12 +71,11 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     return Png(width, height, channels, lines, others, num_behind)
 
 
-def colours_png(rgb: np.ndarray, rows_alone: np.ndarray) -> bytes:
-    """Encode a picture with texture, (h, w, 3) uint8 RGB. rows_alone: rows that can be read without any other."""
+def colours_png(rgb: np.ndarray) -> bytes:
+    """Encode a picture with texture, (h, w, 3) uint8 RGB."""
     height, width, _ = rgb.shape
     lines = np.empty((height, 1 + RGB * width), np.uint8)
     lines[:, 0] = AVERAGE
-    lines[rows_alone, 0] = SUB
     _filter(np.ascontiguousarray(rgb).reshape(height, -1), lines)
     return _png(lines)
 
@@ -184,17 +169,12 @@ def _undone(lines, channels):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _filter(pixels, lines):  # type: ignore[no-untyped-def]
-    """Fill rows by the filter that stands before each: pixels (h, 3 w), lines (h, 1 + 3 w). Above the first row and left of it stands 0."""
+    """Fill rows with what they are more than the average of left and above: pixels (h, 3 w), lines (h, 1 + 3 w)."""
     height, size = pixels.shape
     nothing = np.zeros(size, np.uint8)
     for y in range(height):
         row, line, above = pixels[y], lines[y], pixels[y - 1] if y > 0 else nothing
-        if line[0] == SUB:
-            line[1 : 1 + RGB] = row[:RGB]
-            for x in range(RGB, size):
-                line[1 + x] = row[x] - row[x - RGB]
-        else:
-            for x in range(RGB):
-                line[1 + x] = row[x] - (above[x] >> 1)
-            for x in range(RGB, size):
-                line[1 + x] = row[x] - ((np.uint16(row[x - RGB]) + np.uint16(above[x])) >> 1)
+        for x in range(RGB):
+            line[1 + x] = row[x] - (above[x] >> 1)
+        for x in range(RGB, size):
+            line[1 + x] = row[x] - ((np.uint16(row[x - RGB]) + np.uint16(above[x])) >> 1)

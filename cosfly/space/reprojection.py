@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.products.frames import GRID_ROWS
 from cosfly.work.compiled import njit
 
-COLUMNS = 64  # points are taken at the middle of so many cells of GRID_ROWS rows
+COLUMNS, GRID_ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky
 LEAST_PLANES = 30  # points, for their depth to say something
 LEAST_SHIFTED = 12  # points of a thing

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.products.frames import GRID_ROWS, SKY_DEPTH_M
+from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import KINDS
-from cosfly.space.reprojection import COLUMNS
+from cosfly.space.reprojection import COLUMNS, GRID_ROWS
 from cosfly.work.compiled import njit
 
 PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
