@@ -1,4 +1,4 @@
-"""Flights against each other: rows wait in files and are looked at in passes, which find what one look at all of them finds."""
+"""Flights against each other: rows of one value, splits, pairs, copies."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from release.verify import across
 from release.verify.across import COMPARED, NO_SECOND, RowFiles, Summary, check_across
 from release.verify.findings import Findings
 
@@ -40,20 +37,18 @@ def table(num_rows: int, rng: np.random.Generator, most: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("column", ["sample_id", "image", "cell"])
-@given(sizes=st.lists(st.integers(0, 12), max_size=6), most=st.integers(1, 30), seed=st.integers(0, 1000), at_once=st.integers(1, 40))  # fmt: skip
-def test_passes_find_what_one_look_finds(tmp_path_factory, column, sizes, most, seed, at_once):
-    rng = np.random.default_rng(seed)
-    tables = [table(size, rng, most) for size in sizes]
-    wanted = defaultdict(list)
-    for k, own in enumerate(tables):
-        for i, value in enumerate(own[column].tolist()):
-            if value not in (0, [NO_SECOND] * 3):
-                wanted[str(value)].append((k, i))
-    rows, flights = stored(tmp_path_factory.mktemp("rows"), tables)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(across, "ROWS_AT_ONCE", at_once)
+def test_rows_of_one_value_are_found(tmp_path, column):
+    for sizes, most in (((), 3), ((0, 0), 3), ((1,), 3), ((12, 0, 7, 30), 5), ((40, 3), 200)):
+        rng = np.random.default_rng(most)
+        tables = [table(size, rng, most) for size in sizes]
+        wanted = defaultdict(list)
+        for k, own in enumerate(tables):
+            for i, value in enumerate(own[column].tolist()):
+                if value not in (0, [NO_SECOND] * 3):
+                    wanted[str(value)].append((k, i))
+        rows, flights = stored(tmp_path, tables)
         found = [[tuple(place) for place in places.tolist()] for _, places in rows.groups(flights, column)]
-    assert sorted(found) == sorted(places for places in wanted.values() if len(places) > 1)
+        assert sorted(found) == sorted(places for places in wanted.values() if len(places) > 1)
 
 
 def found_in(folder, flights: list[np.ndarray], **told) -> dict[str, int]:

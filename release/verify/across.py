@@ -1,7 +1,6 @@
 """Relations between flights: one row a frame, splits that share no walk, pairs, pictures that stand in one place alone.
 
-Of each row 80 bytes are compared with those of all other rows. They wait in files (`RowFiles`), and as many of them as memory has room for
-are looked at in one pass: those whose key leaves the same rest. So memory is the same for a thousand rows and for a million.
+Of each row 80 bytes are compared with those of all other rows; they come from the worker processes in files (`RowFiles`).
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ PLACE_M = 0.01  # two people on one pavement step on the same centimetre by chan
 MOVED_M, TURNED_DEG = 0.5, 2.0  # between two cameras that cannot take the same picture
 GROUND_MOST_M, LEAST_GROUNDS = 0.05, 5  # between twins: rounding of depth as float16; frames, for a median
 MOST_SHARED = 64  # flights in one cell; more are a crowd of copies, of which these are enough
-ROWS_AT_ONCE = 40_000
 NO_SECOND = np.iinfo(np.int64).min  # of rows between two whole seconds, or without a person
 # What is kept of a row. sample_id, image, depth: digests, 0 where there is none; place, cell: of the clean person x, y and second, x, y;
 # pose: as POSE.
@@ -124,27 +122,25 @@ class RowFiles:
         Yields:
             their COMPARED, and FLIGHT: the number of the flight in `flights` and that of the row in it.
         """
-        num_passes = -(-sum(flight.num_rows for flight in flights) // ROWS_AT_ONCE)
-        for number in range(num_passes):
-            parts, places = [], []
-            for k, flight in enumerate(flights):
-                rows = self.read(flight.rows_file)
-                values = np.atleast_2d(rows[column].T)
-                is_value = values[0] != (NO_SECOND if column == "cell" else 0)
-                own = np.flatnonzero(is_value & (values.sum(axis=0).astype(np.uint64) % num_passes == number))
-                place = np.zeros(len(own), FLIGHT)
-                place["flight"], place["row"] = k, own
-                parts.append(rows[own])
-                places.append(place)
-            rows, place = np.concatenate(parts), np.concatenate(places)
-            values = np.atleast_2d(rows[column].T)
-            order = np.lexsort(values)  # stable: flights and rows stay in their order
-            values = values[:, order]
-            is_first = np.ones(len(order), np.bool_)
-            is_first[1:] = (values[:, 1:] != values[:, :-1]).any(axis=0)
-            for group in np.split(order, np.flatnonzero(is_first)[1:]):
-                if len(group) > 1:
-                    yield rows[group], place[group]
+        parts, places = [], []
+        for k, flight in enumerate(flights):
+            rows = self.read(flight.rows_file)
+            own = np.flatnonzero(np.atleast_2d(rows[column].T)[0] != (NO_SECOND if column == "cell" else 0))
+            place = np.zeros(len(own), FLIGHT)
+            place["flight"], place["row"] = k, own
+            parts.append(rows[own])
+            places.append(place)
+        if not parts:
+            return
+        rows, place = np.concatenate(parts), np.concatenate(places)
+        values = np.atleast_2d(rows[column].T)
+        order = np.lexsort(values)  # stable: flights and rows stay in their order
+        values = values[:, order]
+        is_first = np.ones(len(order), np.bool_)
+        is_first[1:] = (values[:, 1:] != values[:, :-1]).any(axis=0)
+        for group in np.split(order, np.flatnonzero(is_first)[1:]):
+            if len(group) > 1:
+                yield rows[group], place[group]
 
 
 def check_across(flights: list[Summary], rows: RowFiles, *, by_town: bool, both: bool, findings: Findings) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -113,6 +112,3 @@ def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: 
             findings.error("range", place, number, f"at most {LARGEST * 10:g}")
         else:
             findings.error("range", place, number, f"{low:g} to {high:g}")
-
-
-Check = Callable[[FlightRows, Findings], None]
