@@ -23,36 +23,14 @@ from cosfly.products.captions import Claim, Language
 
 # Said of two quantities as well as of one that changes.
 COMPARATIVES = frozenset(
-    (
-        "shorter",
-        "longer",
-        "larger",
-        "bigger",
-        "smaller",
-        "higher",
-        "lower",
-        "wider",
-        "taller",
-        "更高",
-        "更大",
-        "更长",
-        "更宽",
-        "更低",
-        "更小",
-        "更短",
-    )
-)
+    ("shorter", "longer", "larger", "bigger", "smaller", "higher", "lower", "wider", "taller",
+     "更高", "更大", "更长", "更宽", "更低", "更小", "更短")
+)  # fmt: skip
 
 # Words, negated or not, that say that the person is seen, and that not all is.
 _SEEN = {
-    ("glimpsed", False),
-    ("visible", False),
-    ("full", False),
-    ("partly", False),
-    ("hidden", True),
-    ("gone", True),
-    ("partly", True),
-}
+    ("glimpsed", False), ("visible", False), ("full", False), ("partly", False), ("hidden", True), ("gone", True), ("partly", True),
+}  # fmt: skip
 _UNSEEN = {("hidden", False), ("gone", False), ("visible", True), ("glimpsed", True)}
 _PARTLY = {("partly", False), ("hidden", False), ("visible", False), ("full", True)}
 
@@ -64,13 +42,8 @@ _OF_CHANGE = re.compile(
 
 
 _PAIRS = (
-    ("up", "down"),
-    ("left", "right"),
-    ("faster", "slower"),
-    ("near", "far"),
-    ("visible", "hidden"),
-    ("above", "below"),
-)
+    ("up", "down"), ("left", "right"), ("faster", "slower"), ("near", "far"), ("visible", "hidden"), ("above", "below"),
+)  # fmt: skip
 _OPPOSITES = {**dict(_PAIRS), **{other: one for one, other in _PAIRS}}
 
 

@@ -1,8 +1,8 @@
-"""Whether a sentence with slots is proved: its words beside them are on a closed list, and its slots are of what they speak of.
+"""Whether a sentence with slots is proved: its words beside them are on a closed list and fit its slots.
 
-A slot is true by construction; what a sentence says with it is not. So the drone's values must stand behind the drone and the
-person's behind the person, a quantity's name beside its own values, a comparison between its two sides in their order, and "now", a
-frame's name and "from ... to ..." beside values of these frames. A word that is not listed leaves the sentence unread.
+A slot is true by construction; what a sentence says with it is not. So the drone's values must stand behind the
+drone and the person's behind the person, a quantity's name beside its own values, a comparison between its two sides in
+their order, and "now", a frame's name and "from ... to ..." beside values of these frames. A word that is not listed leaves the sentence unread.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from caption.truth.references import TURNING, Reference
 from cosfly.products.captions import Language
 
 _OF_DRONE = frozenset(
-    ("speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement", "drone_motion")
+    ("speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement",
+     "drone_motion")
 )  # fmt: skip
 _OF_TARGET = frozenset(
     (
@@ -25,6 +26,7 @@ _OF_TARGET = frozenset(
         "box_width", "box_height", "offset_x", "offset_y",
     )
 )  # fmt: skip
+_STATES = ("visibility", "target_motion", "drone_motion", "framing", "walking")
 _SINCE_START = frozenset(("yaw", "travelled", "displacement", "target_travelled"))  # counted from the first frame
 _BREAK = re.compile(r"[,;:.!?()，；：。！？（）、—]|\b(?:and|but|while)\b|并且|且|而")
 _LINKS = ("of", "for", "by", "的")
@@ -33,7 +35,7 @@ _SIDED = {"comparison": ("drone", "target"), "compared": ("target", "drone")}
 
 
 class Token(NamedTuple):
-    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame | break | link. clause: which it stands in."""
+    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame | from | link. clause: its number."""
 
     kind: str
     clause: int
@@ -137,7 +139,7 @@ def _first(reference: Reference) -> int | None:
 
 
 def _has_owner(tokens: Sequence[Token], i: int) -> bool:
-    """Tell whether a value stands behind the one whose it is: named last in its clause, or before where that names no quantity."""
+    """Tell whether a value stands behind its owner: named last in its clause, or before where that names no quantity."""
     reference, clause = tokens[i].reference, tokens[i].clause
     assert reference is not None
     before, after = tokens[:i], [one for one in tokens[i + 1 :] if one.clause == clause]
@@ -162,13 +164,7 @@ def _has_name(tokens: Sequence[Token], i: int) -> bool:
     """Tell whether the name of a quantity nearest to a value, before it in its clause or else after it, is its own."""
     reference, clause = tokens[i].reference, tokens[i].clause
     assert reference is not None
-    if reference.aspect in _SIDED or reference.quantity in (
-        "visibility",
-        "target_motion",
-        "drone_motion",
-        "framing",
-        "walking",
-    ):
+    if reference.aspect in _SIDED or reference.quantity in _STATES:
         return True
     before = [one for one in tokens[:i] if one.clause == clause and one.kind == "quantity"]
     after = [one for one in tokens[i + 1 :] if one.clause == clause and one.kind == "quantity"]
