@@ -1,8 +1,9 @@
 """Whether a sentence with slots is proved: its words beside them are on a closed list and fit its slots.
 
-A slot is true by construction; what a sentence says with it is not. So the drone's values must stand behind the
-drone and the person's behind the person, a quantity's name beside its own values, a comparison between its two sides in
-their order, and "now", a frame's name and "from ... to ..." beside values of these frames. A word that is not listed leaves the sentence unread.
+A slot is true by construction; what a sentence says with it is not. So the drone's values must stand behind the drone
+and the person's behind the person, a quantity's name beside its own values, a comparison between its two sides in
+their order, and "now", a frame's name and "from ... to ..." beside values of these frames. A word that is not listed
+leaves the sentence unread.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def _first(reference: Reference) -> int | None:
 
 
 def _has_owner(tokens: Sequence[Token], i: int) -> bool:
-    """Tell whether a value stands behind its owner: named last in its clause, or before where that names no quantity."""
+    """Tell whether a value stands behind its owner: last in its clause, or before where that names no quantity."""
     reference, clause = tokens[i].reference, tokens[i].clause
     assert reference is not None
     before, after = tokens[:i], [one for one in tokens[i + 1 :] if one.clause == clause]
