@@ -1,14 +1,11 @@
-"""The worst answers of tests/test_cosfly_answers.py through `cosfly caption`, with a kill and a restart: no window is lost, none is wrong."""
+"""The worst answers of tests/test_cosfly_answers.py through `cosfly caption`, and again: no window is lost, none is wrong."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 
 from teacher_server import CHINESE, ENGLISH, MODEL, TeacherServer, kept_answers, obedient_answer
@@ -51,7 +48,7 @@ def shape_of(body: dict) -> int:
     return int(hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest(), 16) % len(SHAPES)
 
 
-def test_the_worst_answers_through_the_command_killed_and_started_again(tmp_path):
+def test_the_worst_answers_through_the_command_and_again(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 2, 20, with_augmented=False)  # 22 windows
     out = tmp_path / "out"
     shapes: Counter[int] = Counter()
@@ -80,12 +77,6 @@ def test_the_worst_answers_through_the_command_killed_and_started_again(tmp_path
         command += [word for name, value in sets.items() for word in ("--set", f"caption.endpoint.{name}={value}")]
         command += ["--set", "caption.image.max_side_px=32"]
         command = [str(word) for word in command]
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        deadline_s = time.monotonic() + 60
-        while len(server.bodies) < 30 and child.poll() is None and time.monotonic() < deadline_s:
-            time.sleep(0.005)
-        os.kill(child.pid, signal.SIGKILL)
-        assert child.wait() == -signal.SIGKILL, "the kill must fall in the middle"
         ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         asked = len(server.bodies)
         again = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

@@ -122,33 +122,25 @@ SERVER_FAULTS = {
 
 
 @pytest.mark.parametrize("name", SERVER_FAULTS)
-def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path, name):
+def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path, whole, name):
     status, text, words = SERVER_FAULTS[name]
-    out = tmp_path / "out"
-    with hovering(Switched(status, text)) as server, pytest.raises(TeacherError) as caught:
-        run(settings(server.url), tree, out)
-    assert text in str(caught.value)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert len(server.bodies) < 30  # no window is asked in vain for long
-    assert not (out / "manifest.json").exists()
-    assert quarantine(out) == {}
-    parts = [caption for path in (out / "parts").glob("*") for caption in read_captions(path)]
-    assert [caption.checks.refusal for caption in parts if caption.checks.refusal] == []
+    out, behaviour = tmp_path / "out", Switched(status, text)
+    with hovering(behaviour) as server:
+        with pytest.raises(TeacherError) as caught:
+            run(settings(server.url), tree, out)
+        assert text in str(caught.value)
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert len(server.bodies) < 30  # no window is asked in vain for long
+        assert not (out / "manifest.json").exists()
+        assert quarantine(out) == {}
+        parts = [caption for path in (out / "parts").glob("*") for caption in read_captions(path)]
+        assert [caption.checks.refusal for caption in parts if caption.checks.refusal] == []
+        behaviour.mend()
+        assert run(settings(server.url), tree, out).read_bytes() == whole.product
 
 
 TOLD_APART = ("a lower image limit", "a shorter context", "words that nobody knows", "a schema that is not the cause")
-
-
-@pytest.mark.parametrize("name", TOLD_APART)
-def test_a_run_that_the_server_ended_goes_on_as_if_nothing_had_been(tree, tmp_path, whole, name):
-    status, text, _ = SERVER_FAULTS[name]
-    out, behaviour = tmp_path / "out", Switched(status, text)
-    with hovering(behaviour) as server:
-        with pytest.raises(TeacherError):
-            run(settings(server.url), tree, out)
-        behaviour.mend()
-        assert run(settings(server.url), tree, out).read_bytes() == whole.product
 
 
 @pytest.mark.parametrize("name", TOLD_APART)

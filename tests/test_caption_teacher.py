@@ -51,8 +51,7 @@ PASSING_FAULTS = [
     ("429", 1, None), ("500", 1, None), ("503", 1, None), ("reset", 1, None), ("truncated_body", 1, None),
     ("not_json", 1, None), ("false_gzip", 1, None), ("empty_choices", 1, None), ("null_content", 1, None), ("slow", 1, None), ("drip", 1, None),
     ("wrong_shape", 1, None), ("wrong_decision", 1, None), ("short", 1, None), ("cut", 1, None), ("empty_text", 1, None),
-    ("prose", 0, "prose_around"), ("fence", 0, "code_fence"), ("thinking", 0, "thinking_tags"),
-    ("control", 0, "control_characters"), ("comma", 0, "trailing_comma"),
+    ("fence", 0, "code_fence"), ("control", 0, "control_characters"),
 ]  # fmt: skip
 
 
