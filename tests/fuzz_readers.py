@@ -105,12 +105,12 @@ from release.export import stage as export
 from release.export.captions import export as export_captions
 from release.export.contract import ExportConfig
 from release.export.stage import read_export
-from release.get import stage as get
-from release.get.stage import Choice
 from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
 from release.stats import stats
+from release.transfer import stage as get
+from release.transfer.stage import Choice
 from release.verify.verify import verify
 from release.viewer import page as viewer
 from release.viewer.content import ViewerConfig

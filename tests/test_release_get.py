@@ -32,12 +32,12 @@ from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes
 from release.columns import PICTURES
 from release.export.contract import ExportConfig
 from release.export.stage import run as export
-from release.get import remote as remotes
-from release.get import stage
-from release.get.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
-from release.get.stage import NOT_ASKED_FOR, Choice
-from release.get.stage import run as get
 from release.record import read_record
+from release.transfer import remote as remotes
+from release.transfer import stage
+from release.transfer.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
+from release.transfer.stage import NOT_ASKED_FOR, Choice
+from release.transfer.stage import run as get
 from release.verify.verify import verify
 from specimens import make_playback_tree
 

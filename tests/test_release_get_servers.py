@@ -22,9 +22,9 @@ from test_release_export import TWO_SPLITS, make_release
 from test_release_package import all_bytes
 
 from cosfly.work.config import build
-from release.get.stage import Choice
-from release.get.stage import run as get
 from release.record import read_record
+from release.transfer.stage import Choice
+from release.transfer.stage import run as get
 
 ROOT = Path(__file__).resolve().parents[1]
 PART = {"towns": ["Town01"], "splits": ["train"], "modalities": ["rgb"]}

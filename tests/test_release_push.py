@@ -15,7 +15,7 @@ import pytest
 from test_release_export import TWO_SPLITS, make_release
 
 from cosfly.errors import ConfigError
-from release.push import check_name, pack
+from release.transfer.push import check_name, pack
 from release.verify.verify import verify
 
 pytest.importorskip("huggingface_hub")

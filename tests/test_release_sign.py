@@ -20,10 +20,10 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.reading.documents import read_json
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes, write_checksums, write_json
-from release.get.stage import Choice
-from release.get.stage import run as get
-from release.push import pack
 from release.sign import PASSPHRASE, SIGNATURE, read_private_key, read_public_key, sign
+from release.transfer.push import pack
+from release.transfer.stage import Choice
+from release.transfer.stage import run as get
 from release.verify.findings import Verified
 from release.verify.verify import verify
 

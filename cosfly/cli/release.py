@@ -246,8 +246,8 @@ def release_get(
 ) -> None:
     """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and are checked."""
     from cosfly.work.config import build
-    from release.get import stage as get
-    from release.get.stage import Choice
+    from release.transfer import stage as get
+    from release.transfer.stage import Choice
 
     asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}
     choice = build(Choice, {name: value for name, value in asked.items() if value}, "the options")
@@ -269,7 +269,7 @@ def release_push(
     """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
     from caption.run.released import read_released
     from cosfly.work.console import answer_console
-    from release import push
+    from release.transfer import push
 
     push.check_name(repo)
     parcel = push.pack(folder)

@@ -16,8 +16,8 @@ from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherEr
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.source import SHARD_NAME, open_release
-from release.get.remote import without_secrets
 from release.sign import SIGNATURE, is_signed
+from release.transfer.remote import without_secrets
 from release.verify.findings import Verified
 from release.verify.verify import Level, verify
 

@@ -43,7 +43,6 @@ from cosfly.work.store import (
 )
 from release.card.numbers import compute_numbers
 from release.columns import PLACE, SPLIT_NAMES, SplitName, flight_name, flight_spans, schema
-from release.get.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
 from release.package.records import DATASET, PARTS, Finished, check_parts, name_shards, write_records
 from release.package.rows import open_writer
 from release.record import (
@@ -59,6 +58,7 @@ from release.record import (
     shard_path,
 )
 from release.sign import MOST_SIGNATURE_BYTES, SIGNATURE
+from release.transfer.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
 from release.verify.findings import Verified
 from release.verify.verify import verify
 
