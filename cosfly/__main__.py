@@ -1,5 +1,23 @@
-"""`python -m cosfly`."""
+"""The command `cosfly`, also `python -m cosfly`: hears Ctrl-C before anything heavy is imported."""
 
-from cosfly.cli import main
+import os
+import signal
+from types import FrameType
 
-main()
+
+def main() -> None:
+    """Run the command. Ctrl-C while modules are imported ends the process: an exception there may go anywhere."""
+    signal.signal(signal.SIGINT, _end)
+    from cosfly import cli
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    cli.main()
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"error: interrupted before anything was done; run the same command again\n")
+    os._exit(128 + number)
+
+
+if __name__ == "__main__":
+    main()

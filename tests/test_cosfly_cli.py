@@ -212,17 +212,27 @@ def test_a_log_whose_disk_gets_full_is_told_once(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_ctrl_c_is_one_line():
-    process = subprocess.Popen(
-        [sys.executable, "-c", STAND_IN],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    _, text = process.communicate(timeout=20)
+IMPORTING = """
+import os, signal, sys
+class Interrupts:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupts())
+from cosfly.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize("code", [STAND_IN, IMPORTING])
+def test_ctrl_c_is_one_line(code):
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
+        assert process.stdout is not None
+        if process.stdout.readline() == "ready\n":
+            time.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+        _, text = process.communicate(timeout=20)
     assert process.returncode == 130
     assert text.startswith("error: interrupted")
     assert text.count("\n") == 1

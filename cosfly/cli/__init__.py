@@ -110,10 +110,11 @@ def main() -> None:
         app(options_first(sys.argv[1:]))
     except CosflyError as error:
         _fail(str(error), 1)
-    except SystemExit as end:
-        if end.code in ENDED:
-            _fail(f"{ENDED[end.code]}; finished work is kept: run the same command again to continue", end.code)
-        _end(end.code)
+    except (SystemExit, KeyboardInterrupt) as end:
+        code = end.code if isinstance(end, SystemExit) else 130  # before Typer, which catches it, has begun
+        if code in ENDED:
+            _fail(f"{ENDED[code]}; finished work is kept: run the same command again to continue", code)
+        _end(code)
     except OSError as error:
         from cosfly.work.store import DISK_FULL
 
