@@ -290,20 +290,41 @@ def test_foreign_text_is_escaped_in_one_place():
     assert [name for name, text in texts.items() if name != "cosfly.work.console" and console.search(text)] == []
 
 
-def test_what_the_container_installs_is_pinned_with_hashes_and_is_what_the_project_needs():
-    text = (ROOT / "docs/container/requirements.txt").read_text(encoding="utf-8")
-    entries = re.findall(r"^([a-z0-9-]+)==\S+((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", text, re.MULTILINE)
-    pinned = {name for name, _ in entries}
-    assert len(pinned) == len(re.findall("^[a-z0-9]", text, re.MULTILINE)), "a line without a hash"
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    needed = [
-        *project["project"]["dependencies"], *project["project"]["optional-dependencies"]["pyrender"],
-        *project["build-system"]["requires"],
-    ]  # fmt: skip
-    assert {re.split("[<>=!~]", line)[0] for line in needed} <= pinned
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
 
 
-def test_the_container_has_the_gl_libraries_of_the_makefile():
-    packages = re.search("^GL_PACKAGES := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+def test_what_the_container_and_ci_install_is_pinned_and_is_what_the_project_needs():
+    def names(requirements: list[str]) -> set[str]:
+        return {re.split(r"[\[<>=!~]", line)[0].lower().replace("_", "-") for line in requirements} - {"cosfly"}
+
+    text = text_of("docs/container/requirements.txt")
+    hashed = re.findall(r"^([a-z0-9-]+)==\S+((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", text, re.MULTILINE)
+    assert len(hashed) == len(re.findall("^[a-z0-9]", text, re.MULTILINE)), "a line without a hash"
+    setup = tomllib.loads(text_of("pyproject.toml"))
+    needed, extras = setup["project"]["dependencies"], setup["project"]["optional-dependencies"]
+    in_container = names([*needed, *extras["pyrender"], *setup["build-system"]["requires"]])
+    assert in_container <= {name for name, _ in hashed}
+    constrained = names([line for line in text_of("tests/constraints.txt").splitlines() if not line.startswith("#")])
+    in_ci = [line for extra in ("dev", "distill", "pyrender", "remote", "sign") for line in extras[extra]]
+    assert names([*needed, *in_ci]) <= constrained
+
+
+def test_the_container_has_the_libraries_of_the_makefile_its_files_and_a_user():
+    recipe, ignored = text_of("docs/container/Containerfile"), text_of(".dockerignore").splitlines()
+    packages = re.search("^GL_PACKAGES := (.*)$", text_of("Makefile"), re.MULTILINE)
     assert packages is not None
-    assert packages[1] in (ROOT / "docs/container/Containerfile").read_text(encoding="utf-8")
+    assert packages[1] in recipe
+    copied = [word for line in re.findall("^COPY (.*) ", recipe, re.MULTILINE) for word in line.split()]
+    assert {f"!{name}" for name in copied} == {line for line in ignored if line.startswith("!")}
+    assert re.search("^USER (?!root)", recipe, re.MULTILINE)
+
+
+def test_the_workflow_runs_what_the_makefile_and_ci_have():
+    workflow = text_of(".github/workflows/ci.yml")
+    assert "- run: .ci/run\n" in workflow
+    assert "make test SLOW=1" in text_of(".ci/run")
+    targets = re.search(r"target: \[(.*)\]", workflow)
+    assert targets is not None
+    assert targets[1].split(", ") == ["audit", "fuzz"]
+    assert all(re.search(f"^{target}:", text_of("Makefile"), re.MULTILINE) for target in targets[1].split(", "))
