@@ -1,5 +1,6 @@
 """The cache of compiled functions: never stale, never in the way."""
 
+import logging
 import os
 import shutil
 import subprocess
@@ -52,6 +53,14 @@ def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     ]
     assert said[0].count("compiling kernels, once") == 1
     assert said[1] == ""
+
+
+def test_a_process_tells_once_of_what_its_workers_compile(monkeypatch, caplog):
+    monkeypatch.setattr(compiled.log, "filters", [compiled.FirstRecord()])
+    for pid in range(3):
+        record = logging.makeLogRecord({"name": compiled.log.name, "msg": f"of worker {pid}", "levelno": logging.INFO})
+        compiled.log.handle(record)
+    assert caplog.messages == ["of worker 0"]
 
 
 def test_old_caches_go_and_the_present_one_stays(tmp_path, monkeypatch):

@@ -4,8 +4,9 @@ Numba keeps a compiled function until its own file changes, with everything it c
 alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken together, has a cache folder
 of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
 
-Of several processes that need a function, one compiles it and the others wait for its lock and load it. Compiling costs seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its
-own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop,
+Of several processes that need a function, one compiles it and the others wait for its lock and load it. Compiling costs
+seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its own to
+numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop,
 because numba's `array[:] = ...` brings the formatting of its error message along.
 """
 
@@ -115,25 +116,29 @@ def cache_folder() -> Path | None:
     return Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else None  # type: ignore[attr-defined]
 
 
-class _TellsOnce(event.Listener):
+class _Tells(event.Listener):
     """Says that something is compiled, which is not what usually takes time: it is loaded from the cache."""
 
-    def __init__(self) -> None:
-        self._is_told = False
-
     def on_start(self, event: event.Event) -> None:
-        if not self._is_told:
-            self._is_told = True
-            log.info(
-                "compiling kernels, once on this machine (planning: about 30 s); kept in %s",
-                cache_folder() or "__pycache__",
-            )
+        place = cache_folder() or "__pycache__"
+        log.info("compiling kernels, once on this machine (planning: about 30 s); kept in %s", place)
 
     def on_end(self, event: event.Event) -> None:
         """Nothing to say."""
 
 
-event.register("numba:compile", _TellsOnce())
+class FirstRecord(logging.Filter):
+    """Lets one record through: a process hears of compiling by itself, and from each of its workers."""
+
+    has_passed = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        had_passed, self.has_passed = self.has_passed, True
+        return not had_passed
+
+
+log.addFilter(FirstRecord())
+event.register("numba:compile", _Tells())
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
