@@ -25,7 +25,7 @@ from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
-from cosfly.reading.documents import read_model, validation_errors
+from cosfly.reading.documents import read_model, validated
 from cosfly.reading.tables import TableRows
 from cosfly.work import in_place
 from cosfly.work.provenance import fingerprint
@@ -230,8 +230,7 @@ class Samples(Sequence[Sample]):
         system, user = row.pop("system"), row.pop("prompt")
         if not isinstance(system, int) or not 0 <= system < len(self._systems) or not isinstance(user, str):
             raise InputError("no prompt", where=where, got=repr((system, user))[:80], expected=f"as {RECORD} has them")
-        with validation_errors(where):
-            return Sample.model_validate({**row, "prompt": Prompt(system=self._systems[system], user=user)})
+        return validated(Sample, {**row, "prompt": Prompt(system=self._systems[system], user=user)}, where)
 
 
 def open_split(dataset: Path, split: Split) -> Samples:

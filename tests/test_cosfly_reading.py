@@ -40,7 +40,7 @@ from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Kept, StageFolder, read_failures, read_manifest, result_of
 from cosfly.work.store import CHECKSUMS, inside, read_checksums
 from distill.schema import RECORD, read_training_set
-from release.record import read_record
+from release.record import RELEASE_VERSION, read_record
 
 
 @pytest.fixture
@@ -180,6 +180,32 @@ def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
     assert documents.read_json(tmp_path / "x.json") == {"result": "accepted"}
     with pytest.raises(InputError, match="'result' is given twice"):
         documents.read_json(tmp_path / "x.json", each_key_once=True)
+
+
+@pytest.mark.timeout(20)
+def test_a_key_given_twice_among_very_many_is_found_soon():
+    text = "{" + ", ".join(f'"k{k}": 0' for k in (*range(300_000), 299_999)) + "}"
+    with pytest.raises(ValueError, match="'k299999' is given twice"):
+        documents.parse_json(text, each_key_once=True)
+
+
+@pytest.mark.parametrize("field", ["shards", "flights", "maps"])
+def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
+    head = {"schema": "cosfly.release", "schema_version": RELEASE_VERSION, field: [{}] * 30_000}
+    (tmp_path / "release.json").write_text(json.dumps(head))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"release\.json: name: Field required") as caught:
+            read_record(tmp_path / "release.json")
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+
+
+def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_lists():
+    with pytest.raises(ValueError, match="20,000,000 lists and objects"):
+        documents.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
 
 
 def test_the_place_of_a_number_is_named(tmp_path):

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 
 from caption.truth.facts import Facts
 from cosfly.products.captions import Claim, Coc, Language
-from cosfly.reading.documents import parse_document, validation_errors
+from cosfly.reading.documents import parse_document, validated
 from cosfly.reading.files import read_unpacked
 
 GOLD = Path(__file__).with_name("gold.jsonl.gz")
@@ -75,5 +75,4 @@ def read_gold(path: Path = GOLD) -> Iterator[GoldCaption]:
     for number, line in enumerate(read_unpacked(path, what="gold captions").splitlines(), 1):
         where = f"{path}:{number}"
         value = parse_document(line, where, what="line")
-        with validation_errors(where):
-            yield GoldCaption.model_validate(value)
+        yield validated(GoldCaption, value, where)

@@ -23,7 +23,7 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.reading.documents import read_json, validation_errors
+from cosfly.reading.documents import read_json, validated
 from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
@@ -216,8 +216,7 @@ def _read_nodes(path: Path) -> list[_Node]:
     for number, value in enumerate(_group(read_json(path, what="SimWorld world"), "nodes", list, path)):
         name = value.get("id", "?") if isinstance(value, dict) else "?"
         where = f"{path}: nodes[{number}] ({name})"
-        with validation_errors(where):
-            node = _Node.model_validate(value)
+        node = validated(_Node, value, where)
         scale, turn = node.properties.scale, node.properties.orientation
         if min(scale.x, scale.y, scale.z) <= 0:
             got = str([scale.x, scale.y, scale.z])
@@ -239,8 +238,7 @@ def _read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
         for group in table:
             for name, value in _group(table, group, dict, path).items():
                 where = f"{path}: {group}.{name}"
-                with validation_errors(where):
-                    box = _Size.model_validate(value).bbox
+                box = validated(_Size, value, where).bbox
                 if min(box.x, box.y, box.z) <= 0:
                     raise InputError("a size is not positive", where=f"{where}: bbox", got=str([box.x, box.y, box.z]))
                 sizes.setdefault(name, np.array([box.x, box.y, box.z]))

@@ -26,7 +26,7 @@ from cosfly.planners.stage import check_ids, plan_flight, warm_up
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.reading.documents import read_object, validation_errors
+from cosfly.reading.documents import read_object, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest, result_of
@@ -506,8 +506,7 @@ def text_tables(product: Path) -> list[TextTable]:
         InputError: they are not what a comparison writes.
     """
     found = read_object(product, what="comparison")
-    with validation_errors(product):
-        record = _Comparison.model_validate(found | {"timings": read_manifest(product.parent).facts.get("timings")})
+    record = validated(_Comparison, found | {"timings": read_manifest(product.parent).facts.get("timings")}, product)
     first, *others = planners = list(record.means)
     titles = [title_of(planner) for planner in planners]
     axes = [

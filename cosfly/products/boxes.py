@@ -18,7 +18,7 @@ from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
-from cosfly.reading.documents import MISSING, check_schema, read_json, validation_errors
+from cosfly.reading.documents import MISSING, check_schema, read_json, validated
 from cosfly.work.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
@@ -297,16 +297,14 @@ def read_boxes(path: Path) -> BoxMap:
     records: Any = value
     if not isinstance(value, list):
         records = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path).pop("boxes", None)
-        with validation_errors(path):
-            header = MapHeader.model_validate({key: told for key, told in value.items() if key not in COMPUTED})
+        header = validated(MapHeader, {key: told for key, told in value.items() if key not in COMPUTED}, path)
         if records is None:
             raise InputError(MISSING, where=f"{path}: boxes", expected="a list")
         if not isinstance(records, list):
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:
         raise InputError("the map holds no boxes", where=path, fix="check the source, or the stage that made it")
-    with validation_errors(path):
-        boxes = _Boxes.model_validate({"boxes": records}).boxes
+    boxes = validated(_Boxes, {"boxes": records}, path).boxes
     centers, extents, rotations = ([getattr(box, name) for box in boxes] for name in ("center", "extent", "rotation"))
     kinds, ids = [KINDS[box.type] for box in boxes], [box.id for box in boxes]
     refs = {box.id: box.mesh for box in boxes if box.mesh is not None}

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from cosfly.products.playback import Flight
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.products.weather import preset_token
-from cosfly.reading.documents import read_json, validation_errors
+from cosfly.reading.documents import read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
 
@@ -155,5 +155,4 @@ def coverage_of(flight: Flight) -> Coverage:
 @cache
 def default_coverage() -> Coverage:
     """Give what the plain run that ships covers (`configs/quickstart.yaml`)."""
-    with validation_errors(DEFAULT):
-        return Coverage.model_validate(read_json(DEFAULT))
+    return validated(Coverage, read_json(DEFAULT), DEFAULT)

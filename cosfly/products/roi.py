@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
-from cosfly.reading.documents import read_json, validation_errors
+from cosfly.reading.documents import read_json, validated
 from cosfly.reading.geojson import Feature, features_of, is_geojson
 from cosfly.reading.limits import limits, over_limit
 
@@ -45,8 +45,7 @@ def read_roi(path: Path) -> Roi:
     value = read_json(path, what="region of interest")
     if is_geojson(value):
         value = {"polygons": _polygons_of(features_of(value, path), path)}
-    with validation_errors(path):
-        roi = Roi.model_validate(value)
+    roi = validated(Roi, value, path)
     if not roi.closed:
         where, fix = f"{path}: closed", "close it in the editor"
         raise InputError("the polygon is not closed", where=where, got="false", expected="true", fix=fix)

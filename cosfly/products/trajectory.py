@@ -14,7 +14,7 @@ from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import check_pixels
-from cosfly.reading.documents import MISSING, validation_errors
+from cosfly.reading.documents import MISSING, validated
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
@@ -122,8 +122,7 @@ class FieldReader:
         if not (isinstance(told, dict) and ("params" in told or "mode" in told)):
             return
         try:
-            with validation_errors(f"{self.path}: weather"):
-                WeatherRecord.model_validate(told)
+            validated(WeatherRecord, told, f"{self.path}: weather")
         except InputError as error:
             if self.strict:
                 raise

@@ -1,20 +1,24 @@
 """JSON on disk: into plain values, and into models. Whatever stands there, a reader gets what it asked for or an InputError.
 
 Refused beyond what JSON forbids: numbers that are not finite (NaN, 1e999) or whole with more than DIGITS digits, nesting deeper than
-DEPTH, half a surrogate pair, which no file could hold again, and in files of ours a key that is given twice.
+DEPTH, half a surrogate pair, which no file could hold again, more brackets than such a text has, and in files of ours a key that is given twice.
 """
 
 from __future__ import annotations
 
+import builtins
 import contextlib
+import functools
 import json
 import math
 import re
+import reprlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import SchemaValidator
 
 from cosfly.errors import InputError, plain
 from cosfly.reading.files import CHECK_PATH, decoded, not_utf8, read_bytes, read_lines
@@ -24,6 +28,8 @@ Model = TypeVar("Model", bound=BaseModel)
 DEPTH = 64  # the deepest honest file, a CityJSON CompositeSolid, has 10
 DIGITS = 40  # ids have up to 20; a float holds no number of 309
 MOST_SHOWN = 40  # characters of a number in a message
+# An empty list or object takes 80 bytes of memory: 0.8 GB, or ten times the file.
+MOST_GROUPS, LEAST_GROUP_BYTES = 10_000_000, 8
 
 # A number that may overflow has an exponent of three digits, or very many digits: looked for with these, which takes a
 # fortieth of the time of a parse. A text that looks so is harmless and only parsed more slowly.
@@ -59,11 +65,11 @@ def _whole(text: str) -> int:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{twice[:MOST_SHOWN]!r} is given twice")
+    members: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in members:
+            raise ValueError(f"{name[:MOST_SHOWN]!r} is given twice")
+        members[name] = value
     return members
 
 
@@ -74,6 +80,9 @@ def parse_json(text: str | bytes, *, each_key_once: bool = False) -> Any:
         ValueError: it is no JSON, or holds what no file of a data set may hold.
     """
     data = text.encode() if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
+    num_groups = data.count(b"[") + data.count(b"{")
+    if num_groups > max(MOST_GROUPS, len(data) / LEAST_GROUP_BYTES):
+        raise ValueError(f"{num_groups:,} lists and objects in {len(data):,} characters")
     hooks: dict[str, Any] = {"object_pairs_hook": _each_once} if each_key_once else {}
     flat = data.translate(_ZEROS, b"+")
     if _LONG_EXPONENT in flat or _LONG_NUMBER in flat:
@@ -83,7 +92,7 @@ def parse_json(text: str | bytes, *, each_key_once: bool = False) -> Any:
         value = json.loads(data.decode() if isinstance(text, bytes) else text, parse_constant=_no_constants, **hooks)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    if data.count(b"[") + data.count(b"{") > DEPTH and _is_deep(value):
+    if num_groups > DEPTH and _is_deep(value):
         raise ValueError(f"nested deeper than {DEPTH}")
     return value
 
@@ -175,17 +184,43 @@ def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> 
 # --- models -----------------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def validation_errors(where: str | Path) -> Iterator[None]:
-    """Turn what pydantic says of data that was read into an InputError that names the file and the first wrong field."""
+def validated(model: type[Model], value: Any, where: str | Path) -> Model:
+    """Give what a JSON value says as a model. It ends at the first wrong member of a list or object: each error takes kilobytes.
+
+    Raises:
+        InputError: names the file and the first wrong field.
+    """
     try:
-        yield
+        return _validator(model).validate_python(value)
     except ValidationError as error:
-        detail = error.errors()[0]
+        detail = error.errors(include_url=False, include_context=False)[0]
         places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field = "".join(places).removeprefix(".") or "top level"
         what = "not an object" if detail["type"] == "model_type" else plain(detail["msg"])
-        raise InputError(what, where=f"{where}: {field}", got=repr(detail["input"])[:80]) from None
+        raise InputError(what, where=f"{where}: {field}", got=_shown(detail["input"])) from None
+
+
+@functools.cache
+def _validator(model: type[BaseModel]) -> SchemaValidator:
+    # The models inside would bring validators of their own, which collect all errors.
+    return SchemaValidator(_ending_early(model.__pydantic_core_schema__), _use_prebuilt=False)  # type: ignore[call-arg]
+
+
+def _ending_early(schema: Any) -> Any:
+    """Give a schema of pydantic's with `fail_fast` in all that has members."""
+    if isinstance(schema, list):
+        return [_ending_early(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    copied = {key: one if key in ("default", "metadata") else _ending_early(one) for key, one in schema.items()}
+    return (
+        copied | {"fail_fast": True} if copied.get("type") in ("list", "tuple", "set", "frozenset", "dict") else copied
+    )
+
+
+def _shown(value: Any) -> str:
+    """A value in a message; of one with members the first few."""
+    return (reprlib if isinstance(value, dict | list) else builtins).repr(value)[:80]
 
 
 def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Iterator[tuple[str, Model]]:
@@ -208,9 +243,7 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
                 expected=repr(version),
                 fix=f"make it anew: {fix}",
             )
-        with validation_errors(f"{path}:{number}"):
-            content = model.model_validate(value)
-        yield line, content
+        yield line, validated(model, value, f"{path}:{number}")
 
 
 MISSING = "the field is missing or null"
@@ -251,5 +284,4 @@ def read_model(
         InputError: names the file and the field.
     """
     value = check_schema(read_json(path, what=what, tree=tree, each_key_once=True), schema, version, path)
-    with validation_errors(path):
-        return model.model_validate({key: v for key, v in value.items() if key not in ("schema", "schema_version")})
+    return validated(model, {key: v for key, v in value.items() if key not in ("schema", "schema_version")}, path)

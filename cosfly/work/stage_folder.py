@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 
 import cosfly
 from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.reading.documents import Model, model_lines, read_model, validation_errors
+from cosfly.reading.documents import Model, model_lines, read_model, validated
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import Config
 from cosfly.work.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
@@ -99,8 +99,7 @@ def result_of(record: Kept | Dropped, model: type[Model]) -> Model:
     Raises:
         InputError: the journal holds something else; names the field.
     """
-    with validation_errors(f"items.jsonl: {record.id}: result"):
-        return model.model_validate(record.result)
+    return validated(model, record.result, f"items.jsonl: {record.id}: result")
 
 
 _ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discriminator="status")])

@@ -22,7 +22,7 @@ from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Coc, Language
 from cosfly.products.predictions import PREDICTIONS, Prediction
 from cosfly.products.splits import Split
-from cosfly.reading.documents import parse_document, validation_errors
+from cosfly.reading.documents import parse_document, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json, write_bytes
 from distill.evaluation.scores import Answer, number_of
@@ -43,8 +43,7 @@ def coc_of(sample: Sample) -> Coc:
     Raises:
         InputError: it is none.
     """
-    with validation_errors(sample.key):
-        return Coc.model_validate(parse_document(sample.answer, sample.key, what="answer"))
+    return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
 
 
 def majority(decisions: Iterable[str]) -> str | None:

@@ -17,7 +17,7 @@ from cosfly.products.actions import ActionSet, action_tokens
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
-from cosfly.reading.documents import read_model, read_object, validation_errors
+from cosfly.reading.documents import read_model, read_object, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.journal import Journal
 from cosfly.work.provenance import MANIFEST_SCHEMA
@@ -73,8 +73,7 @@ def _last_start(folder: Path) -> tuple[float | None, int]:
     path = folder / "manifest.json"
     if not path.is_file() or read_object(path, what="manifest").get("schema") != MANIFEST_SCHEMA:
         return None, 0
-    with validation_errors(path):
-        found = _LastStart.model_validate(read_manifest(folder).facts.get("speed", {}))
+    found = validated(_LastStart, read_manifest(folder).facts.get("speed", {}), path)
     return found.seconds, found.answers
 
 

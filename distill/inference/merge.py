@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 
 from cosfly.chat.student_chat import TAUGHT
 from cosfly.errors import InputError
-from cosfly.reading.documents import read_json, read_object, validation_errors
+from cosfly.reading.documents import read_json, read_object, validated
 from cosfly.work.config import Config
 from cosfly.work.console import progress_bar
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
@@ -121,8 +121,7 @@ class Updates:
     def __init__(self, adapter: Path) -> None:
         path = adapter / "adapter_config.json"
         value = read_json(path, what="adapter")
-        with validation_errors(path):
-            self._scale = LoraSettings.model_validate(value).scale
+        self._scale = validated(LoraSettings, value, path).scale
         _, tensors = _read_tensors(adapter / "adapter_model.safetensors")
         self._pairs: dict[str, list[Any]] = {}
         for name, tensor in tensors.items():

@@ -22,7 +22,7 @@ from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.places import Place, flight_ids, folder_name, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
 from cosfly.products.splits import SPLITS, Course, Split, assign_splits, town_family, walks_of
-from cosfly.reading.documents import read_model, validation_errors
+from cosfly.reading.documents import read_model, validated
 from cosfly.reading.tables import rows_of
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
@@ -137,8 +137,7 @@ def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
         return
     path = split_path(dataset, split)
     for number, row in enumerate(rows_of(path, COLUMNS.names, tree=dataset)):
-        with validation_errors(f"{path}: row {number}"):
-            yield TrackSample.model_validate(row)
+        yield validated(TrackSample, row, f"{path}: row {number}")
 
 
 STAGE = "distill.dual_track"

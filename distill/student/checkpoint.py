@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_json, read_json, read_model, read_object, validation_errors
+from cosfly.reading.documents import parse_json, read_json, read_model, read_object, validated
 from cosfly.reading.files import read_lines, sha256_file
 from cosfly.work.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
 from distill.student.model import Student, weight_files
@@ -273,8 +273,7 @@ def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
     value = read_json(
         path, what="adapter", fix="a training that was stopped goes on: run its cosfly distill train again"
     )
-    with validation_errors(path):
-        facts = AdapterFacts.model_validate(value)
+    facts = validated(AdapterFacts, value, path)
     found = base_digests(model)
     if facts.base_sha256 != found:
         raise InputError(

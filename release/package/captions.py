@@ -12,7 +12,7 @@ from cosfly.escaping import published_name
 from cosfly.products.actions import action_tokens, not_in_set
 from cosfly.products.captions import Caption, caption_lines
 from cosfly.products.places import sample_id, town_folder
-from cosfly.reading.documents import parse_document, parse_json, validation_errors
+from cosfly.reading.documents import parse_document, parse_json, validated
 from cosfly.reading.files import read_span
 from cosfly.work.store import dump_json
 from release.columns import LANGUAGES
@@ -44,8 +44,7 @@ class FlightCaptions:
         for first, size in self.spans:
             for line in read_span(self.path, first, size, what="captions").splitlines():
                 value = parse_document(line, self.path, what="line")
-                with validation_errors(self.path):
-                    yield Caption.model_validate(value)
+                yield validated(Caption, value, self.path)
 
 
 @dataclass

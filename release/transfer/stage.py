@@ -25,7 +25,7 @@ from pydantic import BaseModel, Field
 
 from cosfly.errors import InputError, VerifyError, nearest
 from cosfly.products.frames import FrameFile
-from cosfly.reading.documents import check_schema, parse_document, validation_errors
+from cosfly.reading.documents import check_schema, parse_document, validated
 from cosfly.reading.files import open_file, sha256_file
 from cosfly.reading.tables import arrow_errors, open_stream, read_row_group, row_groups
 from cosfly.work.config import Config
@@ -103,8 +103,7 @@ def fetch_record(remote: Remote, expected: str | None) -> tuple[ReleaseRecord, b
             expected=str(listed)[:80],
         )
     value = check_schema(parse_document(data, where, each_key_once=True), RELEASE_SCHEMA, RELEASE_VERSION, where)
-    with validation_errors(where):
-        record = ReleaseRecord.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
+    record = validated(ReleaseRecord, {k: v for k, v in value.items() if k not in ("schema", "schema_version")}, where)
     _check_shards(record, where)
     if expected is not None and not record.content_digest.startswith(expected):
         raise InputError("not the release that is expected", where=where, got=record.content_digest, expected=expected)

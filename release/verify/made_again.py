@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cosfly
 from cosfly.errors import CosflyError, InputError
-from cosfly.reading.documents import validation_errors
+from cosfly.reading.documents import validated
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import open_table
 from cosfly.work.runner import Watch
@@ -32,8 +32,7 @@ def check_made_again(
     """
     try:
         release = open_release(source)
-        with validation_errors("export.json: settings"):
-            cfg = ExportConfig.model_validate(record.settings)
+        cfg = validated(ExportConfig, record.settings, "export.json: settings")
     except InputError as error:
         findings.error("source", error.where, error.got or error.what, "the release of the export")
         return
