@@ -14,7 +14,7 @@ from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, Ve
 from cosfly.reading.documents import read_json
 from cosfly.work import store
 from cosfly.work.config import Config, MayDiffer
-from cosfly.work.folder_lock import give_up
+from cosfly.work.folder_lock import LOCK, give_up, hold_folder, is_held
 from cosfly.work.journal import Journal
 from cosfly.work.provenance import fingerprint, has_grown_from, read_stage_record
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
@@ -387,6 +387,14 @@ def test_where_the_system_has_no_locks_work_goes_on_and_leaves_none(tmp_path, mo
     assert not _open(tmp_path / "out").is_complete
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["stage.json"]
     assert "no lock against a second run" in caplog.text
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_in_the_place_of_a_lock_holds_nobody_up(tmp_path):
+    os.mkfifo(tmp_path / LOCK)
+    assert not is_held(tmp_path)
+    with pytest.raises(StorageError, match=r"\.lock: cannot lock the folder; got no regular file"):
+        hold_folder(tmp_path)
 
 
 def test_atomic_folder(tmp_path):
