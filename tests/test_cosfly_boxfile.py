@@ -213,6 +213,47 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, text, words):
         loaded(tmp_path, text, ".geojson")
 
 
+HOUSES = [f"Buildings,{40 * (k % 5)},{40 * (k // 5)},20,15,{9 + k % 4},{20 * k % 90}" for k in range(25)]
+
+
+def town_table(*rows: str, yaw: str = "yaw_deg", houses: list[str] = HOUSES) -> str:
+    return "\n".join([f"type,x,y,length,width,height,{yaw}", *houses, *rows])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (town_table(houses=[re.sub(r"\d+$", lambda deg: f"{np.radians(int(deg[0])):.3f}", row) for row in HOUSES]), "all 22 yaws lie within 1.4 degrees.*yaw_rad"),
+        (town_table(*[HOUSES[3]] * 20), "20 of 45 boxes repeat another exactly"),
+        (town_table(*(f"Buildings,10,10,12,8,{5 + 0.1 * k},0" for k in range(150))), "150 of 175 buildings have their middle at x 10, y 10"),
+        (town_table(), ""),
+        (town_table(*("Buildings,7,7,4,4,3,5", "Buildings,17,7,4,4,3,5", "Buildings,27,7,4,4,3,2"), houses=[]), ""),
+    ],
+)  # fmt: skip
+def test_what_can_be_meant_and_hardly_is_gets_a_warning(tmp_path, caplog, text, words):
+    loaded(tmp_path, text)
+    assert len(caplog.messages) == bool(words)
+    assert re.search(words, caplog.text)
+
+
+def test_degrees_in_the_column_of_radians_are_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"line 3: yaw_rad is more than a full turn of 6\.2832; .* yaw_deg \(and 21 more\)"
+    ):
+        loaded(tmp_path, town_table(yaw="yaw_rad"))
+
+
+def test_a_town_wholly_below_its_ground_is_refused(tmp_path):
+    rows = [
+        "type,x,y,z,length,width,height",
+        "Roads,0,0,-50,90,7,0.2",
+        *(f"Buildings,{30 * k},0,-45,9,9,10" for k in range(5)),
+    ]
+    with pytest.raises(InputError, match=r"below the ground; got 5 boxes, the highest ends 40 m .*ground_z_m=-50$"):
+        loaded(tmp_path, "\n".join(rows))
+    assert len(loaded(tmp_path, "\n".join(rows), ground_z_m=-50.0)) == 6
+
+
 def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
     with pytest.raises(ConfigError, match=r"--set maps\.boxes\.path"):
         load(BoxesConfig())

@@ -1,8 +1,11 @@
 """Step 1: the three sources, their conversions, their errors, and known answers on real maps."""
 
+import ast
 import copy
 import gzip
 import json
+import re
+import shlex
 from itertools import combinations
 from pathlib import Path
 
@@ -25,7 +28,7 @@ from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
-from cosfly.work.config import build
+from cosfly.work.config import apply_overrides, build
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
@@ -174,8 +177,33 @@ def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWor
 def test_a_world_without_a_size_table_says_which_setting_names_one(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
     (tmp_path / "Bbox.json").unlink()
-    with pytest.raises(InputError, match=r"Bbox\.json: there is no asset size table.*maps\.simworld\.sizes"):
+    with pytest.raises(InputError, match=r"Bbox\.json: there is no asset size table.*--set maps\.simworld\.sizes=FILE"):
         simworld(cfg)
+
+
+def test_one_path_of_a_size_table_is_enough(tmp_path: Path):
+    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
+    (tmp_path / "Bbox.json").rename(tmp_path / "sizes.json")
+    one = apply_overrides({}, [f"maps.simworld.world={cfg.world}", f"maps.simworld.sizes={tmp_path / 'sizes.json'}"])
+    assert simworld(MapsConfig.model_validate(one["maps"]).simworld).counts()["Vegetation"] == 1
+
+
+def test_cures_of_messages_can_be_pasted_into_a_shell():
+    """A setting in a message of steps 1 to 4 stands behind --set, in quotes where a shell needs them."""
+    found = 0
+    rooms = [Path(__file__).parents[1] / "cosfly" / room for room in ("maps", "simplify", "pedestrians", "planners")]
+    for path in [path for room in rooms for path in room.rglob("*.py")]:
+        for part in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(part, ast.JoinedStr):
+                text = "".join(str(v.value) if isinstance(v, ast.Constant) else "1" for v in part.values)
+            else:
+                text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else ""
+            for match in re.finditer(r"(?:maps|simplify|pedestrians|plan)\.[a-z_.]+=", text):
+                words = shlex.split(text[max(0, match.start() - len("--set '")) :].partition("--set")[2])
+                apply_overrides({}, [words[0]])
+                assert words[0].startswith(match.group()), text
+                found += 1
+    assert found >= 8
 
 
 def simworld(cfg: SimWorldConfig) -> BoxMap:

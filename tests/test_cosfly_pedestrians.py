@@ -233,6 +233,17 @@ def test_no_ground_says_what_to_change(box_map, settings, roi, words):
     assert caught.value.where == ("roi.json" if roi else "map.json")
 
 
+def test_a_region_that_lies_beside_the_map_is_told_and_whether_its_axes_are_swapped(caplog):
+    long = make_box_map([[100, 0, -0.5]], [[100, 20, 0.5]], np.zeros((1, 3)), [ROADS])
+    region = [(0, 0), (0, 150), (10, 150), (10, 0)]  # x and y changed over
+    walkable_ground(long, PedestriansConfig(min_component_cells=10), Roi(points_world=region), roi_where="roi.json")
+    assert (
+        "roi.json: 87 % of the region of interest lies outside the map; with x and y changed over, 100%" in caplog.text
+    )
+    with pytest.raises(NoPathError, match="in the map's world metres; with x and y changed over, 100% of it would lie"):
+        walkable_ground(long, PedestriansConfig(), Roi(points_world=[(0, 50), (0, 150), (10, 150), (10, 50)]))
+
+
 # --- one walk ---------------------------------------------------------------------------------------------------------
 
 

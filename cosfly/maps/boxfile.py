@@ -1,7 +1,8 @@
 """Boxes of one's own: a `boxes_3d.json`, a table (CSV), or GeoJSON.
 
-A row of a table is a box: its middle, its size or half of it, its yaw, its type, under any of the NAMES. A feature of GeoJSON is a point with these
-properties, or an outline with a height; an outline that is no rectangle becomes the rectangles that cover it. All that is wrong with a file is told at once.
+A row of a table is a box: its middle, its size or half of it, its yaw, its type, under any of the NAMES. A feature of
+GeoJSON is a point with these properties, or an outline with a height; an outline that is no rectangle becomes the
+rectangles that cover it. All that is wrong with a file is told at once; what can be meant, but hardly is, in warnings.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.products.columns import LARGEST
-from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
 from cosfly.reading.files import read_text
 from cosfly.reading.geojson import read_features
 from cosfly.work.config import Config
@@ -59,6 +60,8 @@ DEGREES_AT_MOST = 2.0  # a map of less than 2 m is none: coordinates this near t
 TYPES = [kind for kind in KINDS if kind != "NONE"]
 SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
 WIDEST_M, TALL_M = 20_000.0, 400.0  # no map is wider, the usual building is lower: else the file is in centimetres
+MOST_AT_A_PLACE = 10  # buildings with one middle: a body, its roof, rooms inside; more is a mistake in x and y
+FEWEST_TURNED = 3  # boxes, for their yaws to look like radians
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
 
@@ -108,7 +111,7 @@ class BoxesConfig(Config):
 
     def inputs(self) -> dict[str, Path]:
         if self.path is None:
-            fix = "--set maps.boxes.path=..."
+            fix = "--set maps.boxes.path=FILE"
             raise ConfigError("no file is given", where="maps.boxes.path", expected="a path", fix=fix)
         return {"boxes": self.path}
 
@@ -165,6 +168,12 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     box_map = boxes.box_map(header)
     if len(box_map) == len(rows) and all(ids):
         box_map = replace(box_map, ids=_ids(ids, path))
+    yaws_deg = [yaw for row in rows if (yaw := float(row.values.get("yaw_deg", 0.0)))]
+    if len(yaws_deg) >= FEWEST_TURNED and max(map(abs, yaws_deg)) <= 2 * math.pi and any(yaw % 1 for yaw in yaws_deg):
+        log.warning(
+            "%s: all %d yaws lie within %.3g degrees: if these are radians, name the column yaw_rad",
+            path, len(yaws_deg), max(map(abs, yaws_deg)),
+        )  # fmt: skip
     return _told(box_map, cfg, path)
 
 
@@ -176,8 +185,8 @@ def _placed(where: Sequence[str], wrong: str) -> str:
 def _hint(problems: Sequence[str]) -> str | None:
     """Say what would have been right, where names are what is wrong."""
     hints = {
-        "has no meaning": f"columns {', '.join(FIELDS)}; maps.boxes.ignore leaves others out",
-        "type": f"types are {', '.join(TYPES)}; maps.boxes.types={{house: Buildings}} translates others",
+        "has no meaning": f"columns {', '.join(FIELDS)}; --set 'maps.boxes.ignore=[\"*\"]' leaves the others out",
+        "type": f"types are {', '.join(TYPES)}; --set 'maps.boxes.types={{house: Buildings}}' translates others",
     }
     found = [hint for word, hint in hints.items() if any(word in problem for problem in problems)]
     return "; ".join(found) or None
@@ -192,8 +201,41 @@ def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
     return read_boxes(path)
 
 
+def _warn(box_map: BoxMap, path: Path) -> None:
+    """Tell what can be meant, and hardly is: boxes given again and again, many buildings at one place."""
+    parts = (box_map.kinds[:, None], box_map.centers, box_map.half_extents, box_map.rotations_deg)
+    boxes = np.unique(np.column_stack(parts), axis=0)
+    if len(boxes) < len(box_map):
+        num_again = len(box_map) - len(boxes)
+        log.warning("%s: %d of %d boxes repeat another exactly: leave them out", path, num_again, len(box_map))
+    middles = np.round(boxes[boxes[:, 0] == KINDS["Buildings"], 1:3], 1)
+    places, counts = np.unique(middles, axis=0, return_counts=True)
+    if counts.max(initial=0) > MOST_AT_A_PLACE:
+        x, y = places[counts.argmax()]
+        log.warning(
+            "%s: %d of %d buildings have their middle at x %g, y %g: do the columns x and y hold the places?",
+            path, counts.max(), len(middles), x, y,
+        )  # fmt: skip
+
+
+def _check_heights(box_map: BoxMap, path: Path) -> None:
+    """Refuse a map of whose obstacles none reaches above the ground."""
+    box_map = box_map.select(~box_map.is_any_of(SURFACE_KINDS))
+    tops_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
+    if len(tops_m) and tops_m.max() <= 0.0:
+        foot_m, is_ours = np.median(box_map.mins[:, 2]), path.suffix.lower() == ".json"
+        raise InputError(
+            "all that stands lies below the ground", where=path,
+            got=f"{len(tops_m)} boxes, the highest ends {-tops_m.max():.6g} m below it", expected="boxes above the ground",
+            fix=f"mend ground_z_m of the header, or z; most feet are at {foot_m:.6g} m" if is_ours
+            else f"mend z, or tell where the ground is: --set maps.boxes.ground_z_m={foot_m:.6g}",
+        )  # fmt: skip
+
+
 def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
     """Give the map with what the settings say of it, near the origin, if its size can be."""
+    _check_heights(box_map, path)
+    _warn(box_map, path)
     low, high = box_map.bounds()
     heights_m = 2 * box_map.half_extents[box_map.kinds == KINDS["Buildings"], 2]
     usual_m = float(np.median(heights_m)) if len(heights_m) else 0.0
@@ -202,7 +244,7 @@ def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
             "the map is too wide, or its buildings too high: are these centimetres?", where=path,
             got=f"{' x '.join(f'{size:.6g}' for size in high - low)} m, buildings of usually {usual_m:.6g} m",
             expected=f"at most {WIDEST_M / 1000:g} km, and less than {TALL_M:g} m",
-            fix="write all of the file in metres; maps.boxes.metres_per_unit=0.01 divides positions and sizes of a table by 100",
+            fix="write all of the file in metres; of a table --set maps.boxes.metres_per_unit=0.01 divides positions and sizes by 100",
         )  # fmt: skip
     given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=cfg.tool or box_map.header.source.tool or "boxes", file=path.name)
@@ -332,6 +374,8 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
     kind, numbers = _read_values(row.values, cfg.types)
     if "yaw_deg" in numbers and "yaw_rad" in numbers:
         raise WrongRow("yaw twice, in degrees and in radians")
+    if abs(numbers.get("yaw_rad", 0.0)) > 2 * math.pi:
+        raise WrongRow("yaw_rad is more than a full turn of 6.2832; a column of degrees is called yaw_deg")
     yaw_deg = numbers.pop("yaw_deg", math.degrees(numbers.pop("yaw_rad", 0.0)))
     metres = {name: value * cfg.metres_per_unit for name, value in numbers.items()}
     low_m, high_m = _span_of(metres, kind, cfg.ground_z_m)

@@ -95,7 +95,7 @@ class CityJsonConfig(Config):
 
     def inputs(self) -> dict[str, Path]:
         if self.path is None:
-            fix = "--set maps.cityjson.path=..."
+            fix = "--set maps.cityjson.path=FILE"
             raise ConfigError("no file is given", where="maps.cityjson.path", expected="a path", fix=fix)
         return {"city_model": self.path}
 

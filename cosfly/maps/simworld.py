@@ -12,10 +12,10 @@ import itertools
 import logging
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat, field_validator
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
@@ -74,7 +74,8 @@ class SimWorldConfig(Config):
     name: str = Field("SimWorld", min_length=1, description="map name, the head of the playback tree's folder names")
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
-        [], description="asset size tables, the first that knows an asset counts; none: Bbox.json beside the world"
+        [],
+        description="asset size table or a list; the first that knows an asset counts; none: Bbox.json beside the world",
     )
     tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
     licence: LicenceId = Field(
@@ -90,15 +91,20 @@ class SimWorldConfig(Config):
     )
     paint: bool = Field(True, description="add centre dashes to the roads, which the source does not hold")
 
+    @field_validator("sizes", mode="before")
+    @classmethod
+    def _one_path_is_a_list(cls, sizes: Any) -> Any:
+        return [sizes] if isinstance(sizes, str | Path) else sizes
+
     def inputs(self) -> dict[str, Path]:
         if self.world is None:
-            fix = "--set maps.simworld.world=..."
+            fix = "--set maps.simworld.world=FILE"
             raise ConfigError("no file is given", where="maps.simworld.world", expected="a path", fix=fix)
         for number, path in enumerate(self.size_tables()):
             if not path.is_file():
                 raise InputError(
                     "there is no asset size table", where=path, expected="SimWorld's Bbox.json",
-                    fix=f"--set maps.simworld.sizes=[...] (now {'beside the world' if not self.sizes else f'entry {number}'})",
+                    fix=f"--set maps.simworld.sizes=FILE (now {'beside the world' if not self.sizes else f'entry {number}'})",
                 )  # fmt: skip
         return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(self.size_tables())}}
 

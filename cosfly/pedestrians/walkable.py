@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import shapely
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import NoPathError, nearest
@@ -45,6 +46,7 @@ PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground")
 # Surfaces of a map without paved ones are trusted down to this share of its free cells: below, they are lawns between unnamed streets.
 SURFACE_SHARE_MIN = 0.5
 OFF_GROUND_SHARE_MAX = 0.1  # a flyover and a few stray kerbs are no slope
+ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map: below, it is hardly of this map
 SLOPE_MAX = 0.58  # rise over run, 30 degrees: as steep as stairs
 
 
@@ -194,6 +196,7 @@ def walkable_ground(
     with clock("project"):
         grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
+    turned = "" if roi is None else _check_roi(roi, box_map, roi_where)
     with clock("inflate"):
         inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
@@ -217,7 +220,7 @@ def walkable_ground(
         **({} if is_steep is None else {"cells_steep": _count(is_steep)}),
         "cells_walkable": _count(free),
     }
-    _check_walkable(counts, where, roi_where)
+    _check_walkable(counts, where, roi_where, turned)
     with clock("connectivity"):
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
@@ -294,7 +297,21 @@ def _parts_of_large_components(
     return parts
 
 
-def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path) -> None:
+def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
+    """Warn if most of a region lies outside the map; gives a remark if more would lie inside with x and y changed over."""
+    low, high = box_map.bounds()
+    region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
+    inside, turned = (
+        shapely.intersection(area, bounds).area / max(region.area, 1e-9)
+        for area in (region, shapely.transform(region, lambda points: points[:, ::-1]))
+    )
+    remark = f"; with x and y changed over, {turned:.0%} of it would lie inside: are they?" if turned > inside else ""
+    if 0.0 < inside < ROI_SHARE_MIN:
+        log.warning("%s: %.0f %% of the region of interest lies outside the map%s", where, 100 * (1 - inside), remark)
+    return remark
+
+
+def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path, turned: str) -> None:
     if counts["cells_walkable"]:
         return
     if counts["cells_free"] and counts["cells_in_roi"] is None:
@@ -309,7 +326,7 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
             "the region of interest leaves no walkable cell",
             where=roi_where,
             got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
-            fix="draw it over free ground of this map, in the map's world metres",
+            fix=f"draw it over free ground of this map, in the map's world metres{turned}",
         )
     raise NoPathError(
         "the map leaves no walkable cell",

@@ -21,3 +21,5 @@ KIND_COLORS: dict[str, str] = {
 
 # Surfaces that people and cars stand on: never an obstacle, whatever their thickness.
 GROUND_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Terrain", "RoadLines", "Ground", "RailTrack"))
+# Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0.
+SURFACE_KINDS = GROUND_KINDS | {KINDS["Water"], KINDS["Bridge"]}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 from pydantic import BaseModel
+from shapely.geometry.base import BaseGeometry
 
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
@@ -34,6 +35,14 @@ class Roi(RoiPolygon):
     def rings(self) -> list[RoiPolygon]:
         """All polygons in one form."""
         return [self, *self.polygons] if self.points_world else self.polygons
+
+    def region(self) -> BaseGeometry:
+        """All polygons, each without its holes, as one area."""
+        areas = [
+            shapely.Polygon(ring.points_world) - shapely.union_all([shapely.Polygon(hole) for hole in ring.holes])
+            for ring in self.rings()
+        ]
+        return shapely.union_all(areas)
 
 
 def read_roi(path: Path) -> Roi:

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.boxes import BoxMap, SimplifyPass
-from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.kinds import KINDS, SURFACE_KINDS
 from cosfly.products.meshes import Meshes
 from cosfly.work.compiled import njit
 from cosfly.work.config import Config
@@ -217,9 +217,7 @@ def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
     return covered.sum() / covered.size
 
 
-VEGETATION, WATER = KINDS["Vegetation"], KINDS["Water"]
-# Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0, and a renderer needs them.
-SURFACE_KINDS = GROUND_KINDS | {WATER, KINDS["Bridge"]}
+VEGETATION = KINDS["Vegetation"]
 
 
 class MergeGaps(Config):

@@ -10,7 +10,8 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.simplify.passes import SURFACE_KINDS, Simplified, SimplifyConfig, simplify
+from cosfly.products.kinds import SURFACE_KINDS
+from cosfly.simplify.passes import Simplified, SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_json

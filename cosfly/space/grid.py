@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import shapely
 
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
@@ -220,14 +221,9 @@ def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
                         x = xi + (y - yi) / (yj - yi) * (xj - xi)
                         left, right = min(left, x), max(right, x)
         if left <= right:
-            _fill_row(occupied, row, np.floor(left + touch), np.ceil(right - touch))
-
-
-@njit(cache=True)
-def _fill_row(mask, row, start, stop):  # pragma: no cover (compiled)
-    """Mark the cells of a row from start up to stop, whole numbers as floats, as far as they lie on the grid."""
-    for column in range(int(max(0.0, start)), int(max(0.0, min(float(mask.shape[1]), stop)))):
-        mask[row, column] = True
+            stop = int(max(0.0, min(float(occupied.shape[1]), np.ceil(right - touch))))
+            for column in range(int(max(0.0, np.floor(left + touch))), stop):
+                occupied[row, column] = True
 
 
 def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
@@ -270,46 +266,12 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
 
 
 def roi_mask(grid: OccupancyGrid, roi: Roi) -> np.ndarray:
-    """Tell which cells have their centre in a region of interest, (ny, nx) bool.
-
-    In one of its polygons is enough; in a polygon means in its outer ring and in none of its holes. A ring that crosses itself is
-    read by the even-odd rule.
-    """
-    mask = np.zeros(grid.occupied.shape, dtype=bool)
-    for polygon in roi.rings():
-        inside = _ring_mask(grid, polygon.points_world)
-        for hole in polygon.holes:
-            inside &= ~_ring_mask(grid, hole)
-        mask |= inside
-    return mask
-
-
-def _ring_mask(grid: OccupancyGrid, ring: list[tuple[float, float]]) -> np.ndarray:
-    points = (np.array(ring, dtype=np.float64) - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
-    mask = np.zeros(grid.occupied.shape, dtype=bool)
-    _fill_ring(points, mask)
-    return mask
-
-
-@njit(cache=True)
-def _fill_ring(points, mask):  # pragma: no cover (compiled)
-    """Mark the cells whose centre lies in a ring (k, 2) in cells, by the even-odd rule."""
-    crossings = np.empty(len(points))
-    for row in range(len(mask)):
-        y = row + 0.5
-        count = 0
-        for i in range(len(points)):
-            xi, yi, xj, yj = points[i, 0], points[i, 1], points[i - 1, 0], points[i - 1, 1]
-            if (yi <= y) != (yj <= y):
-                x = xi + (y - yi) / (yj - yi) * (xj - xi)
-                place = count  # insertion keeps the few crossings in order
-                while place > 0 and crossings[place - 1] > x:
-                    crossings[place] = crossings[place - 1]
-                    place -= 1
-                crossings[place] = x
-                count += 1
-        for k in range(0, count - 1, 2):
-            _fill_row(mask, row, np.ceil(crossings[k] - 0.5), np.ceil(crossings[k + 1] - 0.5))
+    """Tell which cells have their centre in a region of interest, (ny, nx) bool."""
+    region, (num_x, num_y) = roi.region(), grid.size
+    shapely.prepare(region)
+    x = grid.centers_of(np.stack([np.arange(num_x), np.zeros(num_x)], axis=1))[:, 0]
+    y = grid.centers_of(np.stack([np.zeros(num_y), np.arange(num_y)], axis=1))[:, 1]
+    return np.stack([shapely.contains_xy(region, x, row) for row in y])
 
 
 def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np.ndarray]:
