@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
-from cosfly.reading.files import open_file
+from cosfly.reading.files import SMALL_UNPACKED_MB, open_file
 from cosfly.reading.limits import MB, limits, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
@@ -36,8 +37,24 @@ def arrow_errors(path: Path | str) -> Iterator[None]:
         raise InputError("not a whole parquet file", where=path, got=str(error)) from None
 
 
+class _Table(pq.ParquetFile):
+    """A parquet file. packed: the same, which leaves texts as their dictionaries and indices."""
+
+    def __init__(self, file: io.IOBase, **how: Any) -> None:
+        how |= {"thrift_string_size_limit": MOST_FOOTER_BYTES, "thrift_container_size_limit": MOST_FOOTER_BYTES}
+        super().__init__(file, **how)
+        leaves = [self.schema.column(j) for j in range(len(self.schema))]
+        texts = [leaf.path for j, leaf in enumerate(leaves) if leaf.logical_type.type == "STRING" or self._repeats(j)]
+        self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **how)
+
+    def _repeats(self, j: int) -> bool:
+        """Whether a column holds bytes of any kind by a dictionary; pictures stand plainly, and looking for equal ones would take long."""
+        groups = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
+        return any(one.physical_type == "BYTE_ARRAY" and one.has_dictionary_page for one in groups)
+
+
 @contextlib.contextmanager
-def open_table(path: Path, *, tree: Path | None = None) -> Iterator[pq.ParquetFile]:
+def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
     """Open a parquet file for its schema and metadata.
 
     Raises:
@@ -45,28 +62,20 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[pq.ParquetFi
     """
     with open_file(path, what="parquet file", tree=tree) as file:
         with arrow_errors(path):
-            table = pq.ParquetFile(
-                file, thrift_string_size_limit=MOST_FOOTER_BYTES, thrift_container_size_limit=MOST_FOOTER_BYTES
-            )
+            table = _Table(file)
         with table:
             yield table
 
 
 @contextlib.contextmanager
-def open_stream(file: io.RawIOBase, where: str) -> Iterator[pq.ParquetFile]:
+def open_stream(file: io.RawIOBase, where: str) -> Iterator[_Table]:
     """Open a parquet file that is read by ranges, as one that lies somewhere else; checksums of pages are held against the pages.
 
     Raises:
         InputError: it is no whole parquet file; or what `file` raises.
     """
     with arrow_errors(where):
-        table = pq.ParquetFile(
-            file,
-            pre_buffer=True,
-            page_checksum_verification=True,
-            thrift_string_size_limit=MOST_FOOTER_BYTES,
-            thrift_container_size_limit=MOST_FOOTER_BYTES,
-        )
+        table = _Table(file, pre_buffer=True, page_checksum_verification=True)
     with table:
         yield table
 
@@ -87,21 +96,46 @@ def row_groups(
                 yield read_row_group(path, table, k, columns)
 
 
-def read_row_group(path: Path | str, table: pq.ParquetFile, k: int, columns: list[str] | None) -> pa.Table:
-    """Read one row group of an open table; `path` is for messages.
+def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
+    """Read one row group of an open table; `path` is for messages. A text is unpacked once it is known how much all of them are.
 
     Raises:
         InputError: it is damaged, or over the limit.
     """
     _check_size(path, table, k)
-    threads = table.metadata.row_group(k).total_byte_size > WORTH_THREADS_BYTES
+    about = table.metadata.row_group(k)
     with arrow_errors(path):
-        return table.read_row_group(k, columns=columns, use_threads=threads)
+        group = table.packed.read_row_group(k, columns=columns, use_threads=about.total_byte_size > WORTH_THREADS_BYTES)
+        size = sum(_text_bytes(chunk) for column in group.columns for chunk in column.chunks)
+    stored = sum(about.column(j).total_compressed_size for j in range(about.num_columns))
+    if size > max(SMALL_UNPACKED_MB * MB, limits().unpack_factor * stored):
+        got = f"{stored:,} bytes with texts of {size:,}"
+        raise over_limit("unpack_factor", f"{path}: row group {k}", got, " times the row group")
+    with arrow_errors(path):
+        plain = [member.with_type(_plain(member.type)) for member in group.schema]
+        return group.cast(pa.schema(plain, group.schema.metadata))
 
 
-def row_batches(
-    path: Path | str, table: pq.ParquetFile, k: int, columns: list[str], num_rows: int
-) -> Iterator[pa.RecordBatch]:
+def _text_bytes(values: pa.Array) -> int:
+    """Give the bytes of packed texts, also inside of lists and structs."""
+    if pa.types.is_dictionary(values.type):
+        lengths = pc.binary_length(values.dictionary).cast(pa.int64())
+        return pc.sum(lengths.take(values.indices)).as_py() or 0
+    if pa.types.is_struct(values.type):
+        return sum(map(_text_bytes, values.flatten()))
+    return _text_bytes(values.flatten()) if pa.types.is_list(values.type) else 0
+
+
+def _plain(kind: pa.DataType) -> pa.DataType:
+    """Give the type with its texts unpacked."""
+    if pa.types.is_struct(kind):
+        return pa.struct([member.with_type(_plain(member.type)) for member in kind])
+    if pa.types.is_list(kind):
+        return pa.list_(kind.value_field.with_type(_plain(kind.value_type)))
+    return kind.value_type if pa.types.is_dictionary(kind) else kind
+
+
+def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num_rows: int) -> Iterator[pa.RecordBatch]:
     """Yield one row group of an open table, few rows at a time, so that the same memory serves again; raises as `read_row_group`."""
     _check_size(path, table, k)
     with arrow_errors(path):
@@ -114,7 +148,7 @@ def row_batches(
         yield batch
 
 
-def _check_size(path: Path | str, table: pq.ParquetFile, k: int) -> None:
+def _check_size(path: Path | str, table: _Table, k: int) -> None:
     about = table.metadata.row_group(k)
     size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
     if size > limits().file_mb * MB:
@@ -146,7 +180,7 @@ class TableRows(Sequence[dict[str, Any]]):
     def _begin(self) -> None:
         self._process, self._lock = os.getpid(), threading.Lock()
         self._stack = contextlib.ExitStack()
-        self._table: pq.ParquetFile | None = None
+        self._table: _Table | None = None
         self._firsts: list[int] = []  # number of the first row of each group, and of all rows
         self._held: OrderedDict[int, pa.Table] = OrderedDict()
 
@@ -157,7 +191,7 @@ class TableRows(Sequence[dict[str, Any]]):
         self._path, self._columns = state
         self._begin()
 
-    def _opened(self) -> pq.ParquetFile:
+    def _opened(self) -> _Table:
         if self._process != os.getpid():  # a fork shares the place in the open file with its parent
             self._begin()
         if self._table is None:
