@@ -19,24 +19,8 @@ import pyarrow as pa
 
 from cosfly.escaping import published_name
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.captions import (
-    FIELDS,
-    Caption,
-    LabelFrom,
-    Language,
-    SentenceState,
-    TeacherKind,
-    Verdict,
-    Writing,
-)
-from cosfly.products.frames import (
-    INVALID_DEPTH_M,
-    LEAST_FOV_DEG,
-    MOST_FOV_DEG,
-    SKY_DEPTH_M,
-    FrameFile,
-    Look,
-)
+from cosfly.products.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.products.frames import INVALID_DEPTH_M, LEAST_FOV_DEG, MOST_FOV_DEG, SKY_DEPTH_M, FrameFile, Look
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.weather import WeatherMode, WeatherParams

@@ -19,15 +19,7 @@ from release import columns
 from release.card.numbers import compute_numbers
 from release.package.records import write_records
 from release.package.rows import open_writer
-from release.record import (
-    ReleasedFlight,
-    ReleaseRecord,
-    Shard,
-    SplitNumbers,
-    content_digest,
-    read_record,
-    shard_path,
-)
+from release.record import ReleasedFlight, ReleaseRecord, Shard, SplitNumbers, content_digest, read_record, shard_path
 from release.verify.verify import verify
 
 Row = dict[str, Any]

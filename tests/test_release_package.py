@@ -52,13 +52,7 @@ from release.verify.verify import verify
 from specimens import make_flight, make_playback_tree
 
 NUM_POINTS = 12
-FREE = {
-    "licence": "cc-by-4.0",
-    "unbound": "accept",
-    "pairs": "any",
-    "validation_fraction": 0,
-    "test_fraction": 0,
-}
+FREE = {"licence": "cc-by-4.0", "unbound": "accept", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
 CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
 
 PLACED = Placed("a walk", "train")

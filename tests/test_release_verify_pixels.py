@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from release.verify.pixels import (
-    NUM_IDS,
-    PERSON,
-    SKY,
-    depths_of_person,
-    new_kinds,
-    rays_to_person,
-    survey,
-)
+from release.verify.pixels import NUM_IDS, PERSON, SKY, depths_of_person, new_kinds, rays_to_person, survey
 
 FAR_M = np.float32(1000.0)
 
