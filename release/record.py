@@ -64,9 +64,11 @@ class ReleasedMap(TownMap):
 
 
 class Settings(Strict):
-    """The settings that change what is released. num_frames: of each flight, null for all; window_frames: of a caption's window."""
+    """The settings that change what is released. num_frames: of each flight, null for all; uniform_stride: chosen one by one and not in runs;
+    window_frames: of a caption's window."""
 
     num_frames: int | None = Field(ge=1)
+    uniform_stride: bool = False
     window_frames: int = Field(ge=1)
     tracks: list[str]
     pairs: Pairs

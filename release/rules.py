@@ -1,7 +1,7 @@
 """The rules that the record of a release tells: which frames of a flight are released, and which walks stand in which split.
 
 The paper strides evenly (sec:dataset_stats), which at its flights of 618 to 770 frames and 400 of them leaves no window of five frames
-whole. Runs of six windows' steps keep five sixths of them.
+whole (`release.uniform_stride` does so). Runs of six windows' steps keep five sixths of them.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ WINDOWS_A_RUN = 6  # a run of 6 (w - 1) frames holds 5 (w - 1) + 1 whole windows
 
 RULE = (
     "of n frames m are kept, all where n <= m or m is null, in r = max(1, floor(m / max(1, 6 (w - 1)))) runs (w: frames of a caption's "
-    "window): frame k of m is in run j = floor(((k + 1) r - 1) / m) and is frame k + floor(j (n - m) / (r - 1)) of the flight, k + floor((n - m) / 2) "
+    "window, 1 with uniform_stride): frame k of m is in run j = floor(((k + 1) r - 1) / m) and is frame k + floor(j (n - m) / (r - 1)) of the flight, k + floor((n - m) / 2) "
     "where r = 1. A caption is released where all frames of its window are"
 )
 
 
-def select_frames(num_points: int, num_frames: int | None, window_frames: int) -> np.ndarray:
+def select_frames(num_points: int, num_frames: int | None, window_frames: int, uniform: bool = False) -> np.ndarray:
     """Choose frames of a flight in runs that are spread evenly.
 
     Args:
         num_points: n, the flight's frames.
         num_frames: m, how many to keep; None keeps all. A flight of m or fewer is kept whole, never padded.
-        window_frames: w, frames of a caption's window. With 1 every run is one frame: the paper's even stride.
+        window_frames: w, frames of a caption's window. uniform: take it for 1, so that every run is one frame: the paper's even stride.
     Returns:
         (min(n, m),) int64, strictly increasing; runs differ in length, and the gaps between them, by at most one. With two runs or more
         the first and the last frame are kept; one run stands in the middle.
@@ -39,7 +39,7 @@ def select_frames(num_points: int, num_frames: int | None, window_frames: int) -
         raise ValueError(f"cannot choose {num_frames} of {num_points} frames for windows of {window_frames}")
     if num_frames is None or num_points <= num_frames:
         return np.arange(num_points)
-    num_runs = max(1, num_frames // max(1, WINDOWS_A_RUN * (window_frames - 1)))
+    num_runs = max(1, num_frames // max(1, 0 if uniform else WINDOWS_A_RUN * (window_frames - 1)))
     left_out, k = num_points - num_frames, np.arange(num_frames, dtype=np.int64)
     if num_runs == 1:
         return k + left_out // 2

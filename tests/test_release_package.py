@@ -294,6 +294,17 @@ def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
     assert verify(folder).is_ok
 
 
+def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(inputs, tmp_path):
+    folder = build(inputs, tmp_path / "r", CFG.model_copy(update={"uniform_stride": True, "num_frames": 6}))
+    assert verify(folder).is_ok
+    record = read_record(folder / "release.json")
+    flight = [row["frame_index"] for row in rows_of(folder)][:6]
+    assert flight == [0, 2, 4, 6, 8, 11]
+    assert record.settings.window_frames == 5
+    assert record.history.captions.released == 0
+    assert record.history.captions.window_not_whole == 4 * 3
+
+
 def test_tracks_and_review_are_settings(inputs, tmp_path):
     cfg = CFG.model_copy(update={"tracks": ("clean",), "include_review": True, "modalities": ("depth",)})
     record = read_json(build(inputs, tmp_path / "r", cfg) / "release.json")
@@ -465,17 +476,6 @@ def test_one_run_keeps_the_ids_of_its_tree(inputs, built):
     assert set(ids_of(built)) < {sample_id(flight.flight_id, i) for flight in flights for i in range(NUM_POINTS)}
 
 
-def test_captions_of_before_the_tree_was_converted_are_read(inputs, tmp_path):
-    older = other_run(inputs, tmp_path / "in", {"Town01": "delft", "Town02": "Town_x"})
-    before = run(CFG, [source_of(older)], tmp_path / "r1")
-    (older / "tree/delft").rename(older / "tree/Town_delft")
-    after = run(CFG, [source_of(older)], tmp_path / "r2")
-    assert verify(after).is_ok
-    assert ids_of(after) == ids_of(before)
-    found = pq.read_table(after / "data", columns=["town", "has_caption"]).to_pylist()
-    assert {row["town"] for row in found if row["has_caption"]} == {"Town_delft", "Town_x"}
-
-
 def test_runs_are_given_as_folders_or_file_by_file(inputs, tmp_path):
     for name in ("a", "b"):
         place = tmp_path / "runs" / name
@@ -503,7 +503,7 @@ def test_runs_are_given_as_folders_or_file_by_file(inputs, tmp_path):
     assert result.exit_code == 0, result.output
     assert {i.partition("_")[0] for i in ids_of(tmp_path / "out/dataset")} == {"a", "b"}
     assert CliRunner().invoke(app, ["release", "build", *files[:2], *more]).exit_code == 2
-    assert CliRunner().invoke(app, ["release", "build", *files, *more, "--frames", "some"]).exit_code == 2
+    assert CliRunner().invoke(app, ["release", "build", *files, *more, "--frames", "some"]).exit_code == 1
     refused = CliRunner().invoke(app, ["release", "build", str(inputs), *more])
     assert isinstance(refused.exception, InputError)
     assert "not a run folder" in str(refused.exception)
@@ -574,6 +574,7 @@ def rewrite_captions(root: Path, change) -> None:
         (lambda lines: lines[0].update(zh=None), "lacks a language"),
         (lambda lines: lines[0]["zh"].update(flight_decision="hover"), "decide differently"),
         (lambda lines: lines[0].update(frame_index="x"), "frame_index"),
+        (lambda lines: lines[0].update(picture_px=[2**64, 54]), "picture_px: not the size of a picture; got .18446744"),
     ],
 )
 def test_captions_that_cannot_be_are_one_clear_error(inputs, tmp_path, change, word):

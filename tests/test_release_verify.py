@@ -95,6 +95,11 @@ def test_a_file_that_no_record_knows_is_told_but_for_a_licence_and_what_the_hub_
     assert errors_in(folder, "structure") == ({"unexpected": 1} if is_found else {})
 
 
+def test_an_empty_folder_is_seen(dataset):
+    (dataset / "data/more/inner").mkdir(parents=True)
+    assert errors_in(dataset, "structure") == {"unexpected": 1}
+
+
 @pytest.mark.parametrize(
     ("add", "expected"),
     [

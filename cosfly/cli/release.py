@@ -146,7 +146,7 @@ def release_stats(
         Option(min=0, help="Frames whose depth and instance pictures are decoded, spread evenly; 0 for none."),
     ] = 200,
 ) -> None:
-    """Compute every table that the paper gives of its data again from the rows, and draw what is covered."""
+    """Compute the tables of the paper that a release can tell again from the rows, and draw what is covered."""
     from release.stats import stats
 
     typer.echo(stats.run(folder, out, pixels=pixels))

@@ -11,7 +11,7 @@ from cosfly.errors import InputError
 from cosfly.escaping import published_name
 from cosfly.products.actions import action_tokens, not_in_set
 from cosfly.products.captions import Caption, caption_lines
-from cosfly.products.places import sample_id, town_folder
+from cosfly.products.places import sample_id
 from cosfly.reading.documents import parse_document, parse_json, validated
 from cosfly.reading.files import read_span
 from cosfly.work.store import dump_json
@@ -19,6 +19,7 @@ from release.columns import LANGUAGES
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other
+MOST_SIDE_PX = 20_000  # of a picture that a teacher was shown
 MOST_SPAN_BYTES = 4_000_000  # of which the captions are in memory at once
 
 
@@ -103,7 +104,7 @@ def index_captions(
         size = len(line.encode())
         begin, first = first, first + size
         where = f"{path}: {caption.sample_id}"
-        key = (town_folder(caption.town), caption.trajectory, caption.variant)
+        key = (caption.town, caption.trajectory, caption.variant)
         problem = _no_place(caption, key, lengths, others, where)
         if problem is None and caption.status == "accepted":
             problem = _no_caption(caption, where)
@@ -163,6 +164,11 @@ def _no_caption(caption: Caption, where: str) -> InputError | None:
     if not window or window[0] < 0 or window[-1] != caption.frame_index or window != sorted(set(window)):
         expected = f"frames in order of time, the last one {caption.frame_index}"
         return InputError("not the window of a caption", where=where, got=str(window)[:80], expected=expected)
+    if not all(1 <= side <= MOST_SIDE_PX for side in caption.picture_px):
+        return InputError(
+            "not the size of a picture", where=f"{where}: picture_px", got=str(caption.picture_px)[:80],
+            expected=f"1 to {MOST_SIDE_PX:,}",
+        )  # fmt: skip
     if any(index <= caption.frame_index for index in caption.future):
         return InputError("the future of a caption has begun", where=where, got=str(caption.future)[:80])
     if any(language not in caption.prompt for language in LANGUAGES):

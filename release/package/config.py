@@ -27,6 +27,10 @@ class ReleaseConfig(Config):
         ge=1,
         description="frames per flight, in evenly spread runs that keep captions' windows whole; shorter flights are whole, never padded; null: all",
     )
+    uniform_stride: bool = Field(
+        False,
+        description="choose num_frames evenly, frame by frame, as the paper does; captions whose windows are then not whole are left out and counted",
+    )
     flights: tuple[str, ...] = Field(
         (),
         description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI or Town0[12]; empty: all",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.errors import CosflyError, InputError, NothingKept, VerifyError
-from cosfly.products.frames import FILE_NAMES, FrameFile, frame_name
+from cosfly.products.frames import FILE_NAMES, frame_name
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, write_failures
@@ -77,14 +77,12 @@ def plan_shards(sizes: Sequence[int], target_bytes: int) -> list[list[int]]:
     return groups
 
 
-def selected_bytes(
-    flight: Surveyed, files: Sequence[FrameFile], num_frames: int | None, window_frames: int, tell: Tell
-) -> tuple[int, int]:
+def selected_bytes(flight: Surveyed, cfg: ReleaseConfig, window_frames: int, tell: Tell) -> tuple[int, int]:
     """Give the number of a flight's selected frames and the bytes of their files; `tell` takes files that are not there."""
     folder, total = flight.candidate.folder, 0
-    selected = select_frames(flight.num_frames, num_frames, window_frames).tolist()
+    selected = select_frames(flight.num_frames, cfg.num_frames, window_frames, cfg.uniform_stride).tolist()
     for i in selected:
-        for file in files:
+        for file in cfg.modalities:
             path = folder / frame_name(i) / FILE_NAMES[file]
             size = _size(path)
             total += size
@@ -163,7 +161,7 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
         (
             flight,
             captions[flight.name],
-            *selected_bytes(flight, cfg.modalities, cfg.num_frames, account.window_frames, findings.tell),
+            *selected_bytes(flight, cfg, account.window_frames, findings.tell),
         )
         for flight in flights
     ]

@@ -172,6 +172,7 @@ def make_record(
         made_by=f"cosfly {cosfly.__version__}",
         settings=Settings(
             num_frames=cfg.num_frames,
+            uniform_stride=cfg.uniform_stride,
             window_frames=plan.window_frames,
             tracks=list(cfg.tracks),
             pairs=cfg.pairs,

@@ -131,6 +131,7 @@ class ShardPlan(BaseModel):
 
     num_frames: int | None
     window_frames: int
+    uniform_stride: bool
     files: tuple[FrameFile, ...]
     depth: DepthCodingName
     row_group_bytes: int

@@ -165,7 +165,7 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
     folder = part.candidate.folder
     digests = _digests(part.candidate)
     flight = open_flight(part.candidate)
-    selected = select_frames(len(flight), plan.num_frames, plan.window_frames).tolist()
+    selected = select_frames(len(flight), plan.num_frames, plan.window_frames, plan.uniform_stride).tolist()
     captions, not_selected, not_whole = _captions_of(part.captions, set(selected))
     placing, tree = part.placing, tree_of(flight.frame_folder(0))
     check_stays_below(folder / FRAMES_DIR, tree)

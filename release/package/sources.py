@@ -12,11 +12,11 @@ from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name, town_folder
+from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
 from cosfly.reading.files import check_stays_below, read_text
-from cosfly.work.provenance import fingerprint, is_bound, was_made_of
+from cosfly.work.provenance import is_bound
 from cosfly.work.store import inside
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
@@ -101,7 +101,7 @@ class Candidate:
     """A flight that a source has: where it stands and what it is called.
 
     left_out: why the inspection leaves it out, `result: reason`, None where it does not. sha256: of its files as they were inspected; None where no
-    inspection says, or it saw the tree in its older form. five_ray_mean: as it was inspected.
+    inspection says. five_ray_mean: as it was inspected.
     """
 
     source: int
@@ -125,7 +125,7 @@ class Candidate:
     @property
     def key(self) -> FlightKey:
         """What its captions call it."""
-        return town_folder(self.place.town), self.place.trajectory, self.place.variant
+        return self.place.town, self.place.trajectory, self.place.variant
 
 
 @dataclass(frozen=True)
@@ -168,14 +168,11 @@ def gather(
             continue
         inspection = read_settled(source.inspect)
         inspections.append(inspection)
-        saw_older = was_made_of(source.inspect, "data") not in (None, fingerprint(source.data))
         for flight in inspection.flights:
             left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
             left_out = left_out or _not_chosen(choice, flight.folder)
-            folder = inside(source.data, flight.folder, beside=True)
-            sha256 = None if saw_older else flight.sha256
-            five_ray = flight.metrics.get("five_ray_mean")
-            found.append((number, _inspected_place(source, flight, folder), folder, left_out, sha256, five_ray))
+            folder, five_ray = inside(source.data, flight.folder, beside=True), flight.metrics.get("five_ray_mean")
+            found.append((number, _inspected_place(source, flight), folder, left_out, flight.sha256, five_ray))
     # What is left out makes no name longer: `release verify` knows the released ones alone.
     ids = flight_ids([place for _, place, *_ in found])
     ids |= flight_ids([place for _, place, _, left_out, *_ in found if left_out is None])
@@ -202,20 +199,15 @@ def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
 
 
-def _inspected_place(source: Source, flight: FlightInspection, folder: Path) -> Place:
-    """Tell a flight's place from where it stands now: its tree may have been converted since the inspection.
-
-    Raises:
-        InputError: the record of one flight has the folder of another.
-    """
+def _inspected_place(source: Source, flight: FlightInspection) -> Place:
+    """Tell a flight's place; raises InputError where the record of one flight has the folder of another."""
     parts = Path(flight.folder).parts[-2:]
     if parts != (flight.trajectory, flight.variant)[2 - len(parts) :]:
         raise InputError(
             "the record of one flight has the folder of another", where=source.inspect, got=flight.folder,
             expected=f"a folder that ends in {flight.trajectory}/{flight.variant}", fix="run cosfly inspect again",
         )  # fmt: skip
-    found = _place(source, Path(flight.folder))
-    return Place(found.run, folder.parent.parent.name, flight.trajectory, flight.variant)
+    return _place(source, Path(flight.folder))
 
 
 def _place(source: Source, folder: Path) -> Place:

@@ -120,6 +120,7 @@ def _write_parts(
     how = ShardPlan(
         num_frames=cfg.num_frames,
         window_frames=plan.window_frames,
+        uniform_stride=cfg.uniform_stride,
         files=cfg.modalities,
         depth=cfg.depth,
         row_group_bytes=cfg.row_group_bytes,

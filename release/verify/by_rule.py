@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.products.places import folder_name, town_folder
+from cosfly.products.segments import FOLLOW
 from cosfly.products.splits import town_family
 from cosfly.reading.tables import row_groups
 from cosfly.space.flight_metrics import accel_rms, jerk_rms
@@ -188,6 +189,15 @@ def check_drawn(flight: FlightRows, settings: dict[str, Any], findings: Findings
     look = settings.get("look")
     if look and row.get("look") and row["look"] != look:
         findings.error("settings", flight.where(0, "look"), row["look"], f"{look}, as render was told")
+
+
+def check_style(flight: FlightRows, settings: dict[str, Any], findings: Findings) -> None:
+    """What a flight is flown as is one of the styles that `plan` was told to draw from, or `follow`. settings: of the stage."""
+    shares = settings.get("styles")
+    drawn = {FOLLOW, *(name for name, share in shares.items() if share)} if isinstance(shares, dict) else None
+    for i, style in enumerate(flight.column("style")):
+        if drawn is not None and style is not None and style not in drawn:
+            findings.error("settings", flight.where(i, "style"), style, f"one of {sorted(drawn)}, as plan was told")
 
 
 def check_inspected(flight: FlightRows, settings: dict[str, Any], findings: Findings) -> None:

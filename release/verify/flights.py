@@ -12,7 +12,7 @@ from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.items import Item, Outcome
 from release.record import DepthCoding, DepthCodingName
 from release.verify.across import RowFiles, summary_of
-from release.verify.by_rule import check_drawn, check_inspected
+from release.verify.by_rule import check_drawn, check_inspected, check_style
 from release.verify.drawn_again import Drawn, check_draws
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
@@ -111,6 +111,7 @@ def check_flight(
         lambda: check_motion(flight, twin, told.of(flight, "render").get("perturbation", {}), findings),
         lambda: check_captions(flight, told.window_frames, findings),
         lambda: check_drawn(flight, told.of(flight, "render"), findings),
+        lambda: check_style(flight, told.of(flight, "plan"), findings),
         lambda: check_draws(flight, told.drawn_of(flight), findings),
         lambda: check_inspected(flight, {} if told.is_reviewed else told.of(flight, "inspect"), findings),
     ]

@@ -21,13 +21,15 @@ SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap che
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Yield the names of everything that is no folder, relative, without following links to folders."""
+    """Yield the names of everything that is no folder, and of empty folders, relative, without following links to folders."""
     for place, folders, names in os.walk(folder, onerror=None, followlinks=False):
         here = Path(place)
         relative = here.relative_to(folder)
         if not relative.parts:
             folders[:] = [name for name in folders if name not in ALLOWED]
             names = [name for name in names if name not in ALLOWED]
+        if relative.parts and not names and not folders:
+            yield f"{relative.as_posix()}/"
         for name in sorted([*names, *(name for name in folders if (here / name).is_symlink())]):
             yield (relative / name).as_posix()
         folders[:] = sorted(name for name in folders if not (here / name).is_symlink())
@@ -42,7 +44,12 @@ def check_names(folder: Path, expected: Mapping[str, int | None], findings: Find
     found: dict[str, int] = {}
     for name in files_below(folder):
         if name not in expected and name not in LICENCES:
-            findings.error("unexpected", name, "a file", "nothing: no record knows it")
+            findings.error(
+                "unexpected",
+                name,
+                "an empty folder" if name.endswith("/") else "a file",
+                "nothing that no record knows",
+            )
             continue
         size = _size(folder, name, findings)
         if size is not None and name in expected:

@@ -6,7 +6,6 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
@@ -19,12 +18,13 @@ from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.depth import SKY_MM
-from release.record import ReleaseRecord, content_digest, shard_path
+from release.record import DepthCoding, ReleaseRecord, content_digest, shard_path
 from release.rules import RULE, select_frames
 from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
 
-Numbers = dict[str, Any]
+HALF_STEP = 2.0**-11  # of float16, of a number
+MOST_FRAMES = 2**31  # of a flight: their indices are int32
 
 
 def check_record(record: ReleaseRecord, findings: Findings) -> None:
@@ -58,6 +58,14 @@ def _check_contract(record: ReleaseRecord, findings: Findings) -> None:
         }
         for name, value in told.items():
             _differ(findings, "depth_coding", f"depth.{name}", getattr(record.depth, name), value)
+        _check_coding_error(record.depth, findings)
+
+
+def _check_coding_error(depth: DepthCoding, findings: Findings) -> None:
+    """The error of a coding is at most its rounding: none of float32, half a step of millimetres, of float16 a share of the greatest depth."""
+    most_m = {"float32": 0.0, "millimetre_png": 0.5e-3, "float16": (depth.max_m or 0.0) * HALF_STEP}[depth.coding]
+    if not 0.0 <= depth.max_error_m <= most_m * (1.0 + 1e-3) + 1e-5 * bool(most_m):
+        findings.error("depth_coding", "release.json: depth.max_error_m", depth.max_error_m, f"at most {most_m:g} m")
 
 
 def _check_sums(record: ReleaseRecord, findings: Findings) -> None:
@@ -250,11 +258,12 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
         for key in ("split", "walk", "pair"):
             if getattr(entry, key) != getattr(flight, key):
                 findings.error("flight", f"{name}: {key}", getattr(flight, key), f"{getattr(entry, key)}, as in release.json")  # fmt: skip
-        try:
-            rule = select_frames(entry.frames_available, record.settings.num_frames, record.settings.window_frames)
-        except ValueError as error:
-            findings.error("frames", name, str(error), "a number of frames")
-            continue
-        if flight.frames_digest != frames_digest(rule) or flight.num_rows != entry.frames:
-            got = f"{flight.num_rows} frames, first {flight.first_frames}"
-            findings.error("frames", name, got, f"{len(rule)} frames by the rule of release.json")
+        asked, available = record.settings, entry.frames_available
+        wanted = available if asked.num_frames is None else min(available, asked.num_frames)
+        is_right = wanted == flight.num_rows == entry.frames and 0 < available <= MOST_FRAMES
+        if is_right:
+            rule = select_frames(available, asked.num_frames, asked.window_frames, asked.uniform_stride)
+            is_right = flight.frames_digest == frames_digest(rule)
+        if not is_right:
+            got = f"{flight.num_rows} of {available} frames, first {flight.first_frames}"
+            findings.error("frames", name, got, f"{wanted} frames by the rule of release.json")
